@@ -1,0 +1,1 @@
+"""One file per resource; `create_app(settings)` in app.py puts them together."""

@@ -1,0 +1,1 @@
+"""Records that both sides share: tables, blobs, job requests and results."""

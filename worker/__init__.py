@@ -1,0 +1,1 @@
+"""Everything a job does: the pipeline, the detectors, their training and evaluation."""

@@ -1,0 +1,1 @@
+"""A detector turns paired tiles into scores."""

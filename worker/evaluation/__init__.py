@@ -1,0 +1,1 @@
+"""Simulator, benchmark and figures."""

@@ -1,0 +1,1 @@
+"""Annotation-free training; torch and numpy only, so that it runs on any GPU machine."""
