@@ -1,0 +1,46 @@
+"""What a detector is: paired tiles in, three class probabilities a tile out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worker.detectors.card import Card
+from worker.pipeline.tiling import TilePairs, Tiles
+from worker.pipeline.values import Arrays
+from worker.progress import Progress, silent
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class TileScores:
+    """Class probabilities of every tile: no change, changed, different place (paper, Section 3.1)."""
+
+    probabilities: NDArray[np.float32]  #: (T, 3), rows sum to 1; NaN where the tile was not observed
+
+    @property
+    def change(self) -> NDArray[np.float32]:
+        """(T,) probability of class 1, the change score (paper, Section 3.9.2)."""
+        return self.probabilities[:, 1]
+
+
+class Detector(Protocol):
+    """A method of comparing tiles. It prepares its own input and says in its card what it needs.
+
+    A new detector is one class with this shape, one entry in `worker.detectors.store.DETECTORS`, and one
+    folder in `model_store/` with its card.
+    """
+
+    card: Card
+
+    def describe(self, tiles: Tiles, *, progress: Progress = silent) -> Arrays:
+        """What can be known of the reference alone, computed once when the map is built; {} if nothing."""
+        ...
+
+    def score(
+        self, pairs: TilePairs, *, description: Arrays | None = None, progress: Progress = silent
+    ) -> TileScores:
+        """Compare every observed pair; `description` is `describe(pairs.reference)` from the map, if kept."""
+        ...

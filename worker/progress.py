@@ -1,0 +1,19 @@
+"""How long work reports where it is, and how it is told to stop."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+
+class Progress(Protocol):
+    """Called between small steps with the stage's name and the share of it that is done.
+
+    `share` is 0..1 and never falls within a stage. An implementation may raise `worker.errors.Cancelled`;
+    the caller lets it pass.
+    """
+
+    def __call__(self, stage: str, share: float) -> None: ...
+
+
+def silent(stage: str, share: float) -> None:
+    """Report nothing."""
