@@ -1,0 +1,37 @@
+"""The steps of each kind of job: which function, on which queue, in which order.
+
+A job that a client sees is a chain of small steps; each takes the job's id alone, finds the rest in the
+catalog, and may be run twice. The workers run no function but these (design: allow-list).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+Queue = Literal["geometry", "inference"]
+JobKind = Literal["map", "survey"]
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Step:
+    """One function call of a job."""
+
+    name: str  #: unique within the job; the rq id is "{job_id}.{name}"
+    function: str  #: dotted name, called with the job's id
+    queue: Queue  #: geometry forks a process for each step, inference keeps the network warm
+
+
+STEPS: dict[JobKind, tuple[Step, ...]] = {
+    "map": (
+        Step(name="register", function="worker.jobs.register_map", queue="geometry"),
+        Step(name="describe", function="worker.jobs.describe_map", queue="inference"),
+    ),
+    "survey": (
+        Step(name="register", function="worker.jobs.register_survey", queue="geometry"),
+        Step(name="score", function="worker.jobs.score_survey", queue="inference"),
+        Step(name="export", function="worker.jobs.export_survey", queue="geometry"),
+    ),
+}
+
+ALLOWED_FUNCTIONS = frozenset(step.function for steps in STEPS.values() for step in steps)

@@ -1,0 +1,47 @@
+"""What can go wrong on the service's side, and the stable code of each. HTTP statuses are in api/problems.py.
+
+ServiceError
+├── NotFound             not_found            no such scan, map, survey, job, tile or model
+├── NotReady             not_ready            the map is still building, the survey still running
+├── Conflict             conflict             the id is taken, the scan is in use
+├── BadRequest           bad_request          a value that the schema admits and the service does not
+├── TooLarge             too_large            a body over the limit
+├── WrongMediaType       wrong_media_type     neither a scan nor JSON
+└── QueueUnavailable     queue_unavailable    Redis does not answer; nothing was recorded
+"""
+
+from __future__ import annotations
+
+
+class ServiceError(Exception):
+    """Base of every error that a client can see; `str()` says what is wrong and what to do."""
+
+    code = "service_error"
+
+
+class NotFound(ServiceError):
+    code = "not_found"
+
+
+class NotReady(ServiceError):
+    code = "not_ready"
+
+
+class Conflict(ServiceError):
+    code = "conflict"
+
+
+class BadRequest(ServiceError):
+    code = "bad_request"
+
+
+class TooLarge(ServiceError):
+    code = "too_large"
+
+
+class WrongMediaType(ServiceError):
+    code = "wrong_media_type"
+
+
+class QueueUnavailable(ServiceError):
+    code = "queue_unavailable"

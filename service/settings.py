@@ -1,0 +1,39 @@
+"""Settings of the whole service, from the environment (`SPICD_*`)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+from pydantic import Field
+from pydantic_settings import BaseSettings, SettingsConfigDict
+
+
+class Settings(BaseSettings):
+    """Read once where a process starts and passed on; nothing else reads the environment."""
+
+    model_config = SettingsConfigDict(env_prefix="SPICD_", extra="ignore")
+
+    host: str = Field("127.0.0.1", description="address that the API listens on")
+    port: int = Field(8000, ge=0, le=65535, description="port of the API; 0 takes a free one")
+    data_dir: Path = Field(Path("data"), description="everything that the embedded parts keep")
+    redis_url: str | None = Field(None, description="Redis or Valkey; unset: an embedded server in the data folder")
+    database_url: str | None = Field(None, description="SQLAlchemy URL; unset: SQLite in the data folder")
+    blob_url: str | None = Field(None, description="`file:///...` or `s3://bucket/prefix`; unset: data folder")
+    device: Literal["auto", "cpu", "cuda"] = Field("auto", description="where the network runs")
+    model_store: Path = Field(Path("model_store"), description="folder of the models and their cards")
+    model: str = Field("spicd-net/1", description="model used where a request names none")
+    geometry_workers: int = Field(1, ge=0, description="worker processes of the geometry queue")
+    inference_workers: int = Field(1, ge=0, description="worker processes of the inference queue")
+    max_upload_bytes: int = Field(2 * 1024**3, gt=0, description="largest body of one request")
+    max_scan_points: int = Field(50_000_000, gt=0, description="most points that one scan may declare")
+    job_timeout_s: int = Field(3600, gt=0, description="longest time of one step of a job")
+    log_level: Literal["debug", "info", "warning", "error"] = Field("info", description="of every process")
+
+    def resolved_database_url(self) -> str:
+        """The database that is used, embedded or not."""
+        return self.database_url or f"sqlite:///{(self.data_dir / 'spicd.sqlite').absolute()}"
+
+    def resolved_blob_url(self) -> str:
+        """The blob store that is used, embedded or not."""
+        return self.blob_url or (self.data_dir / "blobs").absolute().as_uri()
