@@ -1,1 +1,1 @@
-"""Records that both sides share: tables, blobs, job requests and results."""
+"""Records that both sides share: tables, blobs, job requests and results; `open_catalog` in catalog.py opens them."""

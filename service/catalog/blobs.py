@@ -1,0 +1,119 @@
+"""Blobs: files by key, in a local folder or in S3, through obstore.
+
+A key is seen only when its bytes are complete: obstore writes aside and renames (or completes a multipart upload).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import shutil
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from urllib.parse import unquote, urlsplit
+
+import obstore
+from obstore.store import LocalStore, ObjectStore, from_url
+
+CHUNK = 1 << 20  #: bytes handed on at a time
+_PARTS_AT_ONCE = 2  #: obstore holds 12 parts of 5 MB by default, more than an upload may cost
+
+
+class Blobs:
+    """A key-value store of files; keys come from `service.catalog.keys`."""
+
+    def __init__(self, url: str) -> None:
+        """`url` is `file:///folder` (made when absent) or anything that obstore opens, such as `s3://bucket/prefix`."""
+        parts = urlsplit(url)
+        self._store: ObjectStore
+        if parts.scheme == "file":
+            self._root: Path | None = Path(unquote(parts.path))
+            self._root.mkdir(parents=True, exist_ok=True)
+            self._store = LocalStore(self._root)
+        else:
+            self._root = None
+            self._store = from_url(url)
+
+    def put_bytes(self, key: str, data: bytes) -> None:
+        """Write `data` under `key`, replacing what was there."""
+        obstore.put(self._store, key, data, max_concurrency=_PARTS_AT_ONCE)
+
+    def put_file(self, key: str, path: Path, *, move: bool = False) -> None:
+        """Write the file at `path` under `key`; with `move` it is renamed there if it lies on the same disk."""
+        if move and self._root is not None and _renamed(path, self._root / key):
+            return
+        obstore.put(self._store, key, path, max_concurrency=_PARTS_AT_ONCE)
+        if move:
+            path.unlink(missing_ok=True)
+
+    def get_bytes(self, key: str) -> bytes:
+        """The bytes under `key`. Raises FileNotFoundError."""
+        return bytes(obstore.get(self._store, key).bytes())
+
+    def exists(self, key: str) -> bool:
+        """Whether something complete lies under `key`."""
+        try:
+            obstore.head(self._store, key)
+        except FileNotFoundError:
+            return False
+        return True
+
+    def path(self, key: str) -> Path | None:
+        """Where the blob lies on this machine, or None when it is elsewhere. Raises FileNotFoundError."""
+        if self._root is None:
+            return None
+        found = self._root / key
+        if not found.is_file():
+            raise FileNotFoundError(key)
+        return found
+
+    @contextlib.contextmanager
+    def local(self, key: str) -> Iterator[Path]:
+        """A path to read the blob from: the file itself in a local folder, else a copy that goes at the end.
+
+        Raises FileNotFoundError.
+        """
+        found = self.path(key)
+        if found is not None:
+            yield found
+            return
+        with tempfile.TemporaryDirectory(prefix="spicd-blob-") as folder:
+            copy = Path(folder) / key.rsplit("/", 1)[-1]
+            with copy.open("wb") as out:
+                for chunk in self.stream(key):
+                    out.write(chunk)
+            yield copy
+
+    def stream(self, key: str) -> Iterator[bytes]:
+        """The bytes under `key` in pieces of about 1 MiB. Raises FileNotFoundError at the call, not later."""
+        result = obstore.get(self._store, key)
+        return (bytes(chunk) for chunk in result.stream(min_chunk_size=CHUNK))
+
+    def size(self, key: str) -> int:
+        """Bytes under `key`. Raises FileNotFoundError."""
+        return int(obstore.head(self._store, key)["size"])
+
+    def delete_prefix(self, prefix: str) -> None:
+        """Remove every blob whose key starts with the folder `prefix`; none is fine."""
+        if self._root is not None:
+            shutil.rmtree(self._root / prefix, ignore_errors=True)
+            return
+        for page in obstore.list(self._store, prefix):
+            obstore.delete(self._store, [str(entry["path"]) for entry in page])
+
+    def ping(self) -> None:
+        """Write and remove a small blob, as an upload would. Raises what the store raises."""
+        self.put_bytes("health/ping", b"ping")
+        obstore.delete(self._store, "health/ping")
+
+
+def _renamed(source: Path, target: Path) -> bool:
+    target.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        source.replace(target)
+    except OSError as error:
+        if error.errno == errno.EXDEV:
+            return False
+        raise
+    return True

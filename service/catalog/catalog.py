@@ -1,0 +1,51 @@
+"""The catalog: everything that is recorded, opened once where a process (or a forked job) starts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from service.catalog.blobs import Blobs
+from service.catalog.changes import Changes
+from service.catalog.database import Database
+from service.catalog.jobs import Jobs
+from service.catalog.maps import Maps
+from service.catalog.scans import Scans
+from service.catalog.surveys import Surveys
+from service.settings import Settings
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Catalog:
+    """The database and the blobs, and the nouns that are kept in them."""
+
+    database: Database
+    blobs: Blobs
+    scans: Scans
+    maps: Maps
+    surveys: Surveys
+    changes: Changes
+    jobs: Jobs
+
+    def close(self) -> None:
+        """Let go of every connection."""
+        self.database.close()
+
+
+def open_catalog(settings: Settings, *, migrate: bool = True) -> Catalog:
+    """Open the catalog that `settings` name; `migrate` brings its tables up to date first.
+
+    A process that forks opens the catalog in the child: a connection to PostgreSQL does not survive a fork.
+    """
+    database = Database(settings.resolved_database_url())
+    if migrate:
+        database.upgrade()
+    blobs = Blobs(settings.resolved_blob_url())
+    return Catalog(
+        database=database,
+        blobs=blobs,
+        scans=Scans(database, blobs),
+        maps=Maps(database, blobs),
+        surveys=Surveys(database, blobs),
+        changes=Changes(database),
+        jobs=Jobs(database),
+    )

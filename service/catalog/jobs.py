@@ -1,0 +1,170 @@
+"""Jobs: what a client follows. Every change of state is one guarded UPDATE, so a terminal state is never left.
+
+accepted -> running -> successful | failed | dismissed, and accepted -> failed | dismissed
+"""
+
+from __future__ import annotations
+
+from typing import Any, cast
+
+from sqlalchemy import CursorResult, func, select, update
+from sqlalchemy.orm import Session
+
+from service.catalog import tables
+from service.catalog.clock import new_id, now
+from service.catalog.database import Database
+from service.catalog.page import Page, Position, newest_first, page_of
+from service.catalog.records import TERMINAL, JobRecord, JobStatus, Problem
+from service.catalog.steps import JobKind
+from service.errors import Conflict, NotFound
+
+_OPEN = tables.Job.status.in_(("accepted", "running"))
+
+
+class Jobs:
+    """The jobs of the catalog. What the workers call may be called twice, and after the job has ended or gone."""
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+
+    def get(self, job_id: str) -> JobRecord:
+        """One job. Raises NotFound."""
+        with self._database.read() as session:
+            return job_record(_row(session, job_id))
+
+    def page(
+        self,
+        *,
+        status: JobStatus | None = None,
+        map_id: str | None = None,
+        after: Position | None = None,
+        limit: int = 100,
+    ) -> Page[JobRecord]:
+        """Jobs, newest first."""
+        query = select(tables.Job)
+        if status is not None:
+            query = query.where(tables.Job.status == status)
+        if map_id is not None:
+            query = query.where(tables.Job.map_id == map_id)
+        query = newest_first(query, tables.Job.created, tables.Job.id, after=after, limit=limit)
+        with self._database.read() as session:
+            return page_of([job_record(row) for row in session.scalars(query)], limit)
+
+    def counts(self) -> dict[str, int]:
+        """How many jobs are in each state; states without a job are left out."""
+        query = select(tables.Job.status, func.count()).group_by(tables.Job.status)
+        with self._database.read() as session:
+            return dict(session.execute(query).tuples().all())
+
+    def start(self, job_id: str) -> bool:
+        """The job runs from now on; False when it has ended or gone, and the step has nothing to do."""
+        instant = now()
+        started = func.coalesce(tables.Job.started, instant)
+        return self._advance(job_id, status="running", started=started, updated=instant)
+
+    def report(self, job_id: str, *, message: str, progress: float) -> bool:
+        """Say the stage and the share (0..1) of the whole job; False when the work should stop.
+
+        The share never falls: a step that runs again reports from where the job already was.
+        """
+        percent = round(100 * min(max(progress, 0.0), 1.0))
+        largest = func.greatest if self._database.engine.dialect.name == "postgresql" else func.max
+        return self._advance(
+            job_id, message=message, progress=largest(tables.Job.progress, percent), updated=now()
+        )
+
+    def is_dismissed(self, job_id: str) -> bool:
+        """Whether the work should stop: the job was dismissed, or deleted with its map."""
+        with self._database.read() as session:
+            status = session.scalar(select(tables.Job.status).where(tables.Job.id == job_id))
+        return status is None or status == "dismissed"
+
+    def succeed(self, job_id: str) -> bool:
+        """The job is done and its map or survey ready; False when it had ended or gone before."""
+        return self._end(job_id, "successful", message="done", progress=100)
+
+    def fail(self, job_id: str, problem: Problem) -> bool:
+        """The job and its map or survey failed; False when it had ended or gone before."""
+        return self._end(job_id, "failed", message=problem.detail, problem=problem.model_dump())
+
+    def dismiss(self, job_id: str) -> JobRecord:
+        """Stop the job for good; once more changes nothing. Raises NotFound, and Conflict when it ended by itself."""
+        problem = Problem(code="dismissed", detail="the job was dismissed")
+        dismissed = self._end(job_id, "dismissed", message=problem.detail, problem=problem.model_dump())
+        found = self.get(job_id)
+        if not dismissed and found.status != "dismissed":
+            raise Conflict(f"job {job_id!r} is already {found.status}; delete its map or survey instead")
+        return found
+
+    def _advance(self, job_id: str, **values: Any) -> bool:
+        with self._database.write() as session:
+            return _changed(session, job_id, values)
+
+    def _end(self, job_id: str, status: JobStatus, **values: Any) -> bool:
+        instant = now()
+        with self._database.write() as session:
+            if not _changed(
+                session, job_id, {**values, "status": status, "finished": instant, "updated": instant}
+            ):
+                return False
+            job = _row(session, job_id)
+            subject: tables.Map | tables.Survey | None = (
+                session.get(tables.Map, job.map_id)
+                if job.survey_id is None
+                else session.get(tables.Survey, job.survey_id)
+            )
+            if subject is not None:
+                subject.status = "ready" if status == "successful" else "failed"
+                subject.updated = instant
+            return True
+
+
+def new_job(kind: JobKind, map_id: str, survey_id: str | None = None) -> tables.Job:
+    """A job that waits; the caller records it in the transaction of its map or survey."""
+    instant = now()
+    return tables.Job(
+        id=new_id("job"),
+        kind=kind,
+        map_id=map_id,
+        survey_id=survey_id,
+        status="accepted",
+        message="waiting",
+        progress=0,
+        created=instant,
+        updated=instant,
+    )
+
+
+def is_terminal(status: JobStatus) -> bool:
+    """Whether a job in this state stays in it."""
+    return status in TERMINAL
+
+
+def job_record(row: tables.Job) -> JobRecord:
+    """The record of a row."""
+    return JobRecord(
+        job_id=row.id,
+        kind=row.kind,
+        map_id=row.map_id,
+        survey_id=row.survey_id,
+        status=row.status,
+        message=row.message,
+        progress=row.progress,
+        problem=None if row.problem is None else Problem.model_validate(row.problem),
+        created=row.created,
+        started=row.started,
+        finished=row.finished,
+        updated=row.updated,
+    )
+
+
+def _row(session: Session, job_id: str) -> tables.Job:
+    row = session.get(tables.Job, job_id)
+    if row is None:
+        raise NotFound(f"no job {job_id!r}; GET /jobs lists those there are")
+    return row
+
+
+def _changed(session: Session, job_id: str, values: dict[str, Any]) -> bool:
+    statement = update(tables.Job).where(tables.Job.id == job_id, _OPEN).values(values)
+    return cast("CursorResult[Any]", session.execute(statement)).rowcount == 1

@@ -1,0 +1,91 @@
+"""The names of blobs: every key that is written or read is spelled here and nowhere else."""
+
+from __future__ import annotations
+
+import re
+
+_UNSAFE = re.compile(r"[^A-Za-z0-9._-]+")
+
+
+def safe_name(filename: str) -> str:
+    """The last part of a client's file name, with nothing left in it that a path or a shell would read.
+
+    Never empty, never hidden, at most 100 characters; the suffix is kept when the name is cut.
+    """
+    name = _UNSAFE.sub("_", filename.replace("\\", "/").rsplit("/", 1)[-1]).lstrip(".")
+    return name[-100:].lstrip(".") or "scan"
+
+
+def scan_folder(scan_id: str) -> str:
+    """The prefix of everything kept for a scan."""
+    return f"scans/{scan_id}/"
+
+
+def scan_file(scan_id: str, filename: str) -> str:
+    """The uploaded bytes, as they came."""
+    return scan_folder(scan_id) + safe_name(filename)
+
+
+def map_folder(map_id: str) -> str:
+    """The prefix of everything kept for a map."""
+    return f"maps/{map_id}/"
+
+
+def map_cloud(map_id: str) -> str:
+    """The fused reference map, PLY."""
+    return map_folder(map_id) + "cloud.ply"
+
+
+def map_reference(map_id: str) -> str:
+    """What surveys are registered to: points and normals of the reference map."""
+    return map_folder(map_id) + "reference.npz"
+
+
+def map_tiles(map_id: str) -> str:
+    """The dense points of the map's tiles."""
+    return map_folder(map_id) + "tiles.npz"
+
+
+def map_description(map_id: str, model: str) -> str:
+    """What one model computed of the reference alone; `model` is `name/version`."""
+    return f"{map_folder(map_id)}description-{safe_name(model.replace('/', '-'))}.npz"
+
+
+def map_manifest(map_id: str) -> str:
+    """The tile manifest (paper, Table A1), JSON."""
+    return map_folder(map_id) + "manifest.json"
+
+
+def map_scan(map_id: str, scan_id: str) -> str:
+    """The points, pose and sensor origin of one accepted scan of the map."""
+    return f"{map_folder(map_id)}scans/{scan_id}.npz"
+
+
+def survey_folder(survey_id: str) -> str:
+    """The prefix of everything kept for a survey."""
+    return f"surveys/{survey_id}/"
+
+
+def survey_pairs(survey_id: str) -> str:
+    """The survey's tiles beside those of the map."""
+    return survey_folder(survey_id) + "pairs.npz"
+
+
+def survey_scores(survey_id: str) -> str:
+    """The class probabilities of every tile."""
+    return survey_folder(survey_id) + "scores.npz"
+
+
+def survey_cloud(survey_id: str) -> str:
+    """The current map coloured by result, PLY."""
+    return survey_folder(survey_id) + "cloud.ply"
+
+
+def survey_picture(survey_id: str) -> str:
+    """The top view with tiles by state, PNG."""
+    return survey_folder(survey_id) + "picture.png"
+
+
+def survey_scan(survey_id: str, scan_id: str) -> str:
+    """The points, pose and sensor origin of one accepted scan of the survey."""
+    return f"{survey_folder(survey_id)}scans/{scan_id}.npz"

@@ -1,0 +1,161 @@
+"""What the catalog takes and gives: frozen values, the same for the API and for the workers."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Any, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from service.catalog.steps import JobKind
+
+JobStatus = Literal["accepted", "running", "successful", "failed", "dismissed"]
+MapStatus = Literal["building", "ready", "failed"]
+SurveyStatus = Literal["running", "ready", "failed"]
+TileState = Literal["unchanged", "changed", "inconsistent", "unobserved"]
+ScanFormat = Literal["ply", "pcd"]
+Vector3 = tuple[float, float, float]
+Row4 = tuple[float, float, float, float]
+Matrix = tuple[Row4, Row4, Row4, Row4]  #: (4, 4) row-major, rigid, target_from_source
+
+TERMINAL: frozenset[JobStatus] = frozenset({"successful", "failed", "dismissed"})
+
+
+class Record(BaseModel):
+    """Base of every record: frozen, strict about names, and free of NaN and infinity."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class Problem(Record):
+    """Why a job failed, as data; api/problems.py turns it into RFC 9457."""
+
+    code: str  #: stable, from the error trees of service/errors.py and worker/errors.py
+    detail: str  #: one sentence with the numbers
+
+    @classmethod
+    def of(cls, error: BaseException) -> Self:
+        """The problem of an error that carries a `code`; any other shows its type alone, for its text may tell too much."""
+        code = getattr(error, "code", None)
+        if isinstance(code, str):
+            return cls(code=code, detail=str(error))
+        return cls(
+            code="internal",
+            detail=f"the job stopped on an unexpected {type(error).__name__}; see the worker's log",
+        )
+
+
+class ScanRecord(Record):
+    """One uploaded file, unread."""
+
+    scan_id: str
+    filename: str  #: as the client named it
+    format: ScanFormat  #: by the first bytes of the file
+    size: int  #: bytes
+    sha256: str
+    device_id: str | None
+    captured_at: datetime | None
+    pose: Matrix | None  #: map_from_sensor, the client's guess
+    key: str  #: of the blob
+    created: datetime
+
+
+class ScanOutcome(Record):
+    """What became of one scan in a map or a survey; all but the id is None until registration has run."""
+
+    scan_id: str
+    accepted: bool | None = None
+    fitness: float | None = None  #: inlier fraction, 0..1
+    rmse: float | None = None  #: metres, over the inliers
+    map_from_scan: Matrix | None = None
+    reason: str | None = None  #: why it was left out
+
+
+class Bounds(Record):
+    """An axis-aligned box in the map frame, metres."""
+
+    min: Vector3
+    max: Vector3
+
+
+class TileRecord(Record):
+    """The result of one tile of a survey."""
+
+    tile_id: str  #: `tile_III_JJJ_KKK` (paper, Table A1)
+    tile_index: tuple[int, int, int]
+    bounds: Bounds
+    state: TileState
+    score: float | None = None  #: probability of change; None where the tile was not observed
+    probabilities: Vector3 | None = None  #: unchanged, changed, different place
+    n_reference: int  #: points of the reference in the tile
+    n_current: int  #: points of the survey in the tile
+
+    @model_validator(mode="after")
+    def _scored_where_observed(self) -> Self:
+        unscored = self.score is None or self.probabilities is None
+        if unscored != (self.state == "unobserved"):
+            raise ValueError(f"{self.tile_id}: a tile has a score exactly where it was observed")
+        return self
+
+
+class MapRecord(Record):
+    """A reference map; `bounds` and `counts` are empty until it is built."""
+
+    map_id: str
+    name: str | None
+    status: MapStatus
+    model: str  #: `name/version`, whose card gives voxel and tile size
+    settings: dict[str, Any]
+    scans: tuple[ScanOutcome, ...]  #: in the order of the request
+    bounds: Bounds | None
+    counts: dict[str, int]
+    job_id: str
+    problem: Problem | None
+    created: datetime
+    updated: datetime
+
+
+class SurveyRecord(Record):
+    """A later visit compared with a map; `counts` is empty until it is done."""
+
+    survey_id: str
+    map_id: str
+    status: SurveyStatus
+    model: str  #: `name/version`
+    threshold: float | None  #: asked for, then the one that was used
+    device_id: str | None
+    captured_at: datetime  #: given, else the latest of its scans, else the time of the request
+    scans: tuple[ScanOutcome, ...]  #: in the order of the request
+    counts: dict[str, int]
+    job_id: str
+    problem: Problem | None
+    created: datetime
+    updated: datetime
+
+
+class JobRecord(Record):
+    """A job as clients see it."""
+
+    job_id: str
+    kind: JobKind
+    map_id: str
+    survey_id: str | None
+    status: JobStatus
+    message: str  #: the stage
+    progress: int = Field(ge=0, le=100)
+    problem: Problem | None
+    created: datetime
+    started: datetime | None
+    finished: datetime | None
+    updated: datetime
+
+
+class ChangeRecord(Record):
+    """A tile of a survey with what a client needs beside it."""
+
+    tile: TileRecord
+    map_id: str
+    survey_id: str
+    model: str
+    threshold: float | None
+    captured_at: datetime

@@ -1,0 +1,194 @@
+"""The tables, as migrations/ makes them (a test compares the two)."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from typing import Any
+
+from sqlalchemy import JSON, BigInteger, DateTime, ForeignKey, Index, MetaData, String, TypeDecorator
+from sqlalchemy.engine import Dialect
+from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column, relationship
+
+NAMING = {
+    "ix": "ix_%(table_name)s_%(column_0_N_name)s",
+    "uq": "uq_%(table_name)s_%(column_0_N_name)s",
+    "fk": "fk_%(table_name)s_%(column_0_N_name)s",
+    "pk": "pk_%(table_name)s",
+}
+
+
+class UtcDateTime(TypeDecorator[datetime]):
+    """An instant; kept in UTC, and given back with its zone, which SQLite forgets."""
+
+    impl = DateTime(timezone=True)
+    cache_ok = True
+
+    def process_bind_param(self, value: datetime | None, dialect: Dialect) -> datetime | None:  # noqa: ARG002
+        """To UTC; a time without a zone is a mistake of ours."""
+        if value is None:
+            return None
+        if value.tzinfo is None:
+            raise ValueError(f"{value.isoformat()} has no time zone")
+        return value.astimezone(UTC)
+
+    def process_result_value(self, value: datetime | None, dialect: Dialect) -> datetime | None:  # noqa: ARG002
+        """From UTC."""
+        if value is None:
+            return None
+        return value.replace(tzinfo=UTC) if value.tzinfo is None else value.astimezone(UTC)
+
+
+class Base(DeclarativeBase):
+    """Base of every table."""
+
+    metadata = MetaData(naming_convention=NAMING)
+    type_annotation_map = {  # noqa: RUF012 - read by SQLAlchemy
+        datetime: UtcDateTime(),
+        dict[str, Any]: JSON(none_as_null=True),
+        dict[str, int]: JSON(none_as_null=True),
+        list[list[float]]: JSON(none_as_null=True),
+        str: String(),
+    }
+
+
+class Scan(Base):
+    """An uploaded file."""
+
+    __tablename__ = "scans"
+
+    id: Mapped[str] = mapped_column(primary_key=True)
+    filename: Mapped[str]
+    format: Mapped[str]
+    size: Mapped[int] = mapped_column(BigInteger)
+    sha256: Mapped[str]
+    device_id: Mapped[str | None]
+    captured_at: Mapped[datetime | None]
+    pose: Mapped[list[list[float]] | None]
+    key: Mapped[str]
+    created: Mapped[datetime]
+
+    __table_args__ = (Index(None, "created", "id"),)
+
+
+class Outcome:
+    """The columns that `map_scans` and `survey_scans` share."""
+
+    ordinal: Mapped[int]
+    accepted: Mapped[bool | None]
+    fitness: Mapped[float | None]
+    rmse: Mapped[float | None]
+    map_from_scan: Mapped[list[list[float]] | None]
+    reason: Mapped[str | None]
+
+
+class MapScan(Outcome, Base):
+    """A scan of a map."""
+
+    __tablename__ = "map_scans"
+
+    map_id: Mapped[str] = mapped_column(ForeignKey("maps.id", ondelete="CASCADE"), primary_key=True)
+    scan_id: Mapped[str] = mapped_column(ForeignKey("scans.id"), primary_key=True, index=True)
+
+
+class SurveyScan(Outcome, Base):
+    """A scan of a survey."""
+
+    __tablename__ = "survey_scans"
+
+    survey_id: Mapped[str] = mapped_column(ForeignKey("surveys.id", ondelete="CASCADE"), primary_key=True)
+    scan_id: Mapped[str] = mapped_column(ForeignKey("scans.id"), primary_key=True, index=True)
+
+
+class Map(Base):
+    """A reference map."""
+
+    __tablename__ = "maps"
+
+    id: Mapped[str] = mapped_column(primary_key=True)
+    name: Mapped[str | None]
+    status: Mapped[str]
+    model: Mapped[str]
+    settings: Mapped[dict[str, Any]]
+    bounds: Mapped[dict[str, Any] | None]
+    counts: Mapped[dict[str, int]]
+    job_id: Mapped[str]
+    created: Mapped[datetime]
+    updated: Mapped[datetime]
+
+    scans: Mapped[list[MapScan]] = relationship(
+        order_by=MapScan.ordinal, cascade="all, delete-orphan", passive_deletes=True
+    )
+
+    __table_args__ = (Index(None, "created", "id"),)
+
+
+class Survey(Base):
+    """A visit compared with a map."""
+
+    __tablename__ = "surveys"
+
+    id: Mapped[str] = mapped_column(primary_key=True)
+    map_id: Mapped[str] = mapped_column(ForeignKey("maps.id", ondelete="CASCADE"))
+    status: Mapped[str]
+    model: Mapped[str]
+    threshold: Mapped[float | None]
+    device_id: Mapped[str | None]
+    captured_at: Mapped[datetime]
+    counts: Mapped[dict[str, int]]
+    job_id: Mapped[str]
+    created: Mapped[datetime]
+    updated: Mapped[datetime]
+
+    scans: Mapped[list[SurveyScan]] = relationship(
+        order_by=SurveyScan.ordinal, cascade="all, delete-orphan", passive_deletes=True
+    )
+
+    __table_args__ = (Index(None, "map_id", "captured_at", "id"), Index(None, "map_id", "created", "id"))
+
+
+class SurveyTile(Base):
+    """The result of one tile of a survey."""
+
+    __tablename__ = "survey_tiles"
+
+    survey_id: Mapped[str] = mapped_column(ForeignKey("surveys.id", ondelete="CASCADE"), primary_key=True)
+    tile_id: Mapped[str] = mapped_column(primary_key=True)
+    i: Mapped[int]
+    j: Mapped[int]
+    k: Mapped[int]
+    min_x: Mapped[float]
+    min_y: Mapped[float]
+    min_z: Mapped[float]
+    max_x: Mapped[float]
+    max_y: Mapped[float]
+    max_z: Mapped[float]
+    state: Mapped[str]
+    score: Mapped[float | None]
+    p_unchanged: Mapped[float | None]
+    p_changed: Mapped[float | None]
+    p_different: Mapped[float | None]
+    n_reference: Mapped[int]
+    n_current: Mapped[int]
+
+    __table_args__ = (Index(None, "survey_id", "state", "score"),)
+
+
+class Job(Base):
+    """A job as clients see it; the queue's own record is never asked."""
+
+    __tablename__ = "jobs"
+
+    id: Mapped[str] = mapped_column(primary_key=True)
+    kind: Mapped[str]
+    map_id: Mapped[str] = mapped_column(ForeignKey("maps.id", ondelete="CASCADE"), index=True)
+    survey_id: Mapped[str | None] = mapped_column(ForeignKey("surveys.id", ondelete="CASCADE"), index=True)
+    status: Mapped[str] = mapped_column(index=True)
+    message: Mapped[str]
+    progress: Mapped[int]
+    problem: Mapped[dict[str, Any] | None]
+    created: Mapped[datetime]
+    started: Mapped[datetime | None]
+    finished: Mapped[datetime | None]
+    updated: Mapped[datetime]
+
+    __table_args__ = (Index(None, "created", "id"),)
