@@ -83,8 +83,8 @@ class Changes:
             return tuple(_record(tile, survey) for tile, survey in session.execute(query))
 
 
-def _matching(wanted: ChangeFilter) -> Select[Any]:
-    query: Select[Any] = (
+def _matching(wanted: ChangeFilter) -> Select[tables.SurveyTile, tables.Survey]:
+    query = (
         select(_TILE, _SURVEY)
         .join(_SURVEY, _SURVEY.id == _TILE.survey_id)
         .where(_SURVEY.map_id == wanted.map_id, _SURVEY.status == "ready", _TILE.state == "changed")
