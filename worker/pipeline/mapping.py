@@ -1,0 +1,65 @@
+"""Maps: registered scans fused to one cloud at the voxel size (paper, Section 3.3.3)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from worker.errors import MapFailed
+from worker.pipeline.icp import Surface
+from worker.pipeline.registration import RegisteredScan, RegistrationSettings, surface_of
+from worker.pipeline.values import Colors, Normals, Points
+from worker.pipeline.voxels import Voxels
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ReferenceMap:
+    """What surveys are registered to and compared with."""
+
+    points: Points  #: (M, 3) float32, metres, map frame, one a voxel
+    normals: Normals  #: (M, 3) float32, sign arbitrary
+    colors: Colors | None  #: (M, 3) uint8
+    voxel_size: float  #: metres
+
+    def surface(self) -> Surface:
+        """The map as a target of ICP; builds a tree (about 10 ms for 100,000 points)."""
+        return Surface.of(self.points, self.normals)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class CurrentMap:
+    """What a survey saw, in the frame and at the spacing of the map."""
+
+    points: Points  #: (M, 3) float32, metres, map frame, one a voxel
+    colors: Colors | None  #: (M, 3) uint8
+
+
+def fuse(scans: Iterable[RegisteredScan], *, voxel_size: float) -> Voxels:
+    """Average the points of all scans in each voxel of the map frame; one scan in memory at a time.
+
+    Raises MapFailed where there is no scan.
+    """
+    fused: Voxels | None = None
+    for scan in scans:
+        voxels = Voxels.of(scan.points, size=voxel_size, colors=scan.colors)
+        fused = voxels if fused is None else fused.merged(voxels)
+    if fused is None:
+        raise MapFailed("no scan is left to fuse; see the reasons listed with the scans")
+    return fused
+
+
+def reference_map(fused: Voxels, *, settings: RegistrationSettings) -> ReferenceMap:
+    """The fused cloud with the normals that surveys will need, computed once."""
+    surface = surface_of(fused.points, settings)
+    return ReferenceMap(
+        points=fused.points,
+        normals=surface.normals.astype("float32"),
+        colors=fused.colors,
+        voxel_size=fused.size,
+    )
+
+
+def current_map(scans: Iterable[RegisteredScan], *, voxel_size: float) -> CurrentMap:
+    """The survey's scans fused like the map was (paper, Section 3.9.1)."""
+    fused = fuse(scans, voxel_size=voxel_size)
+    return CurrentMap(points=fused.points, colors=fused.colors)
