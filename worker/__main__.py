@@ -1,0 +1,88 @@
+"""Starts one worker: `python -m worker geometry` or `python -m worker inference`."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import logging
+import sys
+
+from redis import Redis
+
+from service.catalog.database import Database
+from service.catalog.jobs import Jobs
+from service.catalog.records import Problem
+from service.catalog.steps import ALLOWED_FUNCTIONS
+from service.lifetime import end_with_parent
+from service.settings import Settings
+from worker.rq_workers import GeometryWorker, InferenceWorker, OnDeath
+
+LOG_FORMAT = "%(asctime)s %(levelname)-7s %(name)s[%(process)d] %(message)s"
+# Imported before the first fork, so that no step pays for it. Importing is all that may happen here: native work in
+# the parent starts threads, and a fork among threads that hold locks deadlocks.
+WARM_MODULES = {"geometry": ("open3d", "torch", "worker.jobs"), "inference": ("torch", "worker.jobs")}
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Work until told to stop; returns the exit status."""
+    options = _parse(arguments)
+    if options.parent:
+        end_with_parent(options.parent)
+    settings = Settings()
+    set_up_logging(settings.log_level)
+    if settings.redis_url is None:
+        print(
+            "no queue to work on: set SPICD_REDIS_URL, or start everything with `spicd up`", file=sys.stderr
+        )
+        return 2
+    for module in WARM_MODULES[options.queue]:
+        importlib.import_module(module)
+    kind = GeometryWorker if options.queue == "geometry" else InferenceWorker
+    kind(
+        options.queue,
+        Redis.from_url(settings.redis_url),
+        allowed=ALLOWED_FUNCTIONS,
+        on_death=_recorder(settings),
+        grace_s=options.grace,
+    ).work()
+    return 0
+
+
+def set_up_logging(level: str) -> None:
+    """One line an event on stderr; rq, which narrates its maintenance every few seconds, from warnings on."""
+    logging.basicConfig(level=level.upper(), format=LOG_FORMAT)
+    logging.getLogger("rq").setLevel(logging.WARNING)
+    for name in ("rq.worker", "rq.job", "rq.queue", "rq.registry"):
+        logging.getLogger(name).setLevel(logging.DEBUG if level == "debug" else logging.WARNING)
+
+
+def _recorder(settings: Settings) -> OnDeath:
+    """Writes a death to the catalog, first writer wins: what the step itself recorded stands.
+
+    The database alone is opened, and closed again: the blob store starts threads, and this process forks.
+    """
+
+    def record(job_id: str, code: str, sentence: str) -> None:
+        database = Database(settings.resolved_database_url())
+        try:
+            Jobs(database).fail(job_id, Problem(code=code, detail=sentence))
+        finally:
+            database.close()
+
+    return record
+
+
+def _parse(arguments: list[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(prog="python -m worker", description=__doc__)
+    parser.add_argument("queue", choices=sorted(WARM_MODULES))
+    parser.add_argument(
+        "--grace", type=float, default=8.0, help="seconds that a running step has after SIGTERM"
+    )
+    parser.add_argument(
+        "--parent", type=int, default=0, help="end when the process with this id, the parent, ends"
+    )
+    return parser.parse_args(arguments)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

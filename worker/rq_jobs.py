@@ -1,0 +1,65 @@
+"""A step as the workers accept it: one of the allowed functions, called with its job's id, and nothing else.
+
+A JSON serializer alone does not help: a job names its function, and rq imports whatever stands there. Whoever can
+write to Redis must not be able to run code, so everything else that an rq job may name is switched off as well:
+callbacks, bound instances, webhooks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from rq.job import Job
+
+
+class FunctionRefused(Exception):
+    """The queue holds a call that this worker does not make."""
+
+
+class StepJob(Job):  # type: ignore[misc]  # rq is untyped here
+    """An rq job that calls allowed functions only; the base allows none, `step_job` makes one that does."""
+
+    allowed: frozenset[str] = frozenset()
+
+    @property
+    def func(self) -> Callable[..., Any]:
+        """The function to call; refused before its module is imported."""
+        name = self.func_name
+        if name not in self.allowed:
+            raise FunctionRefused(f"step {self.id}: {str(name)[:100]!r} is not a function of this service")
+        if (
+            self.instance is not None
+            or self.kwargs
+            or not (len(self.args) == 1 and isinstance(self.args[0], str))
+        ):
+            raise FunctionRefused(f"step {self.id}: {name} takes the id of its job and nothing else")
+        return super().func  # type: ignore[no-any-return]
+
+    @property
+    def success_callback(self) -> None:
+        """None: a callback is a function name too."""
+
+    @property
+    def failure_callback(self) -> None:
+        """None, see `success_callback`."""
+
+    @property
+    def stopped_callback(self) -> None:
+        """None, see `success_callback`."""
+
+    def send_webhooks(self, *_: Any, **__: Any) -> None:
+        """Send nothing: a job must not make the worker call an address."""
+
+    @property
+    def catalog_id(self) -> str | None:
+        """Id of the job in the catalog; None where the call is not one of ours."""
+        try:
+            return str(self.args[0])
+        except Exception:  # the payload comes from outside and may be anything
+            return None
+
+
+def step_job(allowed: frozenset[str]) -> type[StepJob]:
+    """The job class that calls these dotted names only. rq takes a class, not an instance."""
+    return type("AllowedStepJob", (StepJob,), {"allowed": allowed})

@@ -1,0 +1,226 @@
+"""The two kinds of worker process.
+
+`GeometryWorker` forks a process for each step, so that a crash in C++ or a lack of memory ends one step and not the
+worker. `InferenceWorker` keeps the network in its own memory and never forks (CUDA does not survive one).
+
+Both tell `on_death` when a step ended without having said why; what the step itself recorded stands.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Any
+
+from redis import Redis
+from redis.exceptions import RedisError
+from rq import Queue, SimpleWorker, Worker
+from rq.exceptions import AbandonedJobError, NoSuchJobError
+from rq.serializers import JSONSerializer
+from rq.timeouts import JobTimeoutException
+from rq.worker.base import BaseWorker
+
+from service.lifetime import end_with_parent
+from worker.errors import PipelineError
+from worker.rq_jobs import FunctionRefused, StepJob, step_job
+
+log = logging.getLogger("worker")
+
+# With rq's defaults a job of a dead worker is found after 7 minutes. Here the worker's claim on a step ends 65 s
+# after its last sign of life (interval + 60, in rq), and an idle worker looks every 5 s.
+WORKER_TTL_S = 20
+HEARTBEAT_S = 5
+
+OnDeath = Callable[[str, str, str], None]  #: job id, problem code, one sentence
+
+
+class WorkerStopped(BaseException):
+    """The worker was told to end and its time is up. Not an `Exception`, so that no step swallows it."""
+
+
+class _StepWorker(BaseWorker):  # type: ignore[misc]  # rq is untyped here
+    """What both kinds have in common: the allow-list, the end of a step, and the end of the worker."""
+
+    def __init__(
+        self, queue: str, connection: Redis, *, allowed: frozenset[str], on_death: OnDeath, grace_s: float
+    ) -> None:
+        super().__init__(
+            [queue],
+            connection=connection,
+            job_class=step_job(allowed),
+            serializer=JSONSerializer,
+            worker_ttl=WORKER_TTL_S,
+            job_monitoring_interval=HEARTBEAT_S,
+            maintenance_interval=HEARTBEAT_S,
+            exception_handlers=[self._record],
+        )
+        self._on_death = on_death
+        self._grace_s = grace_s
+        self._grace_over = False
+
+    def execute_job(self, job: StepJob, queue: Queue) -> None:
+        begun = time.monotonic()
+        log.info("%s: %s started", self.queues[0].name, job.id)
+        super().execute_job(job, queue)
+        log.info("%s: %s ended after %.1f s", self.queues[0].name, job.id, time.monotonic() - begun)
+
+    def handle_exception(self, job: StepJob, *exc_info: Any) -> None:
+        """Log a user's error in one line and ours with its traceback, then record it."""
+        expected = isinstance(exc_info[1], PipelineError | FunctionRefused)
+        log.error("%s failed: %s", job.id, exc_info[1], exc_info=None if expected else exc_info)
+        self._record(job, *exc_info)
+
+    def handle_job_failure(self, job: StepJob, queue: Queue, *args: Any, **kwargs: Any) -> None:
+        """Forget the steps behind a failed one: rq does not run them, and would keep them for ever."""
+        _drop_dependents(job)
+        super().handle_job_failure(job, queue, *args, **kwargs)
+
+    def handle_warm_shutdown_request(self) -> None:
+        """The first SIGTERM: the running step has `grace_s` seconds to end by itself."""
+        log.info("%s: stopping", self.queues[0].name)
+        timer = threading.Timer(self._grace_s, self._end_grace)
+        timer.daemon = True
+        timer.start()
+
+    def _end_grace(self) -> None:
+        raise NotImplementedError
+
+    def _record(self, job: StepJob, kind: type[BaseException], error: BaseException, *_: Any) -> None:
+        """Handler of rq for a step that raised, and for one whose worker went away."""
+        if kind is AbandonedJobError:
+            _drop_dependents(job)
+        self._tell(job, *_problem(error, job))
+
+    def _tell(self, job: StepJob, code: str, sentence: str) -> None:
+        """Record the failure; a catalog that does not answer must not take the worker down."""
+        if job.catalog_id is None:
+            return
+        try:
+            self._on_death(job.catalog_id, code, sentence)
+        except Exception:
+            log.exception("%s: the catalog did not take the failure", job.id)
+
+
+class GeometryWorker(_StepWorker, Worker):  # type: ignore[misc]
+    """One forked process for each step."""
+
+    def main_work_horse(self, job: StepJob, queue: Queue) -> None:
+        """First thing in the forked process: end with the worker, whatever ends that."""
+        end_with_parent(self.pid)
+        super().main_work_horse(job, queue)
+
+    def kill_horse(self, sig: signal.Signals = signal.SIGKILL) -> None:
+        """Kill the step's process group, and never another: rq asks for the group of pid 0 once the step is over."""
+        pid = self.horse_pid
+        if not pid:
+            return
+        with suppress(ProcessLookupError):
+            if os.getpgid(pid) == pid:
+                os.killpg(pid, sig)
+            else:  # it has not made its own group yet
+                os.kill(pid, sig)
+
+    def handle_work_horse_killed(
+        self,
+        job: StepJob,
+        pid: int | None,  # noqa: ARG002  (rq's signature)
+        status: int | None,
+        usage: Any,  # noqa: ARG002
+    ) -> None:
+        """A step's process ended without a word: a crash, no memory, or this worker's end."""
+        if self._grace_over:
+            self._tell(job, *_problem(WorkerStopped(), job))
+        elif status is None:
+            self._tell(job, *_problem(JobTimeoutException(), job))
+        else:
+            self._tell(
+                job,
+                "worker_died",
+                f"the process of step {job.id} ended {_ending(status)}; submit the job again",
+            )
+
+    def _end_grace(self) -> None:
+        self._grace_over = True
+        self.kill_horse()
+
+
+class InferenceWorker(_StepWorker, SimpleWorker):  # type: ignore[misc]
+    """One process that stays warm; a thread keeps its claim alive while it works."""
+
+    _working: threading.Event | None = None  #: set when the running step is over
+
+    def get_heartbeat_ttl(self, job: StepJob) -> int:
+        """The forking worker's claim, not `SimpleWorker`'s, which lasts as long as the step may take."""
+        return int(BaseWorker.get_heartbeat_ttl(self, job))
+
+    def perform_job(self, job: StepJob, queue: Queue) -> bool:
+        self._working = threading.Event()
+        threading.Thread(target=self._beat, args=(job, self._working), daemon=True).start()
+        try:
+            return bool(super().perform_job(job, queue))
+        finally:
+            self._working.set()
+
+    def handle_execution_ended(self, job: StepJob, queue: Queue, heartbeat_ttl: int) -> None:
+        """The work is done and rq is about to remove its claim: no sign of life may come after that."""
+        if self._working is not None:
+            self._working.set()
+        super().handle_execution_ended(job, queue, heartbeat_ttl)
+
+    def request_force_stop(self, *_: Any) -> None:
+        """Time is up: leave the step from wherever it is."""
+        raise WorkerStopped
+
+    def _beat(self, job: StepJob, over: threading.Event) -> None:
+        while not over.wait(HEARTBEAT_S):
+            with suppress(RedisError, AttributeError):  # Redis is away; the claim was removed just now
+                self.maintain_heartbeats(job)
+
+    def _end_grace(self) -> None:
+        """Signals reach the main thread, which runs the step; the handler is `request_force_stop` by now."""
+        os.kill(os.getpid(), signal.SIGTERM)
+
+
+def _problem(error: BaseException, job: StepJob) -> tuple[str, str]:
+    """Code and sentence for an error that left a step."""
+    match error:
+        case PipelineError():
+            return error.code, str(error)
+        case FunctionRefused():
+            return "function_refused", str(error)
+        case JobTimeoutException():
+            return "timed_out", f"step {job.id} took longer than {job.timeout} s; send fewer or smaller scans"
+        case AbandonedJobError():
+            return "worker_died", f"the worker of step {job.id} went away; submit the job again"
+        case WorkerStopped():
+            return "worker_stopped", f"the service was stopped while step {job.id} ran; submit the job again"
+        case _:
+            return (
+                "internal",
+                f"step {job.id} stopped on an unexpected {type(error).__name__}; see the worker's log",
+            )
+
+
+def _ending(status: int) -> str:
+    """How a process ended, from its wait status."""
+    if not os.WIFSIGNALED(status):
+        return f"with exit status {os.waitstatus_to_exitcode(status)}"
+    number = os.WTERMSIG(status)
+    why = " (often: out of memory)" if number == signal.SIGKILL else ""
+    return f"by signal {signal.Signals(number).name}{why}"
+
+
+def _drop_dependents(job: StepJob) -> None:
+    """Delete the steps that wait for this one, and those that wait for them."""
+    waiting = job.dependent_ids
+    job.connection.delete(job.dependents_key)  # before the descent: a forged circle ends too
+    for name in waiting:
+        with suppress(NoSuchJobError):
+            dependent = type(job).fetch(name, connection=job.connection, serializer=JSONSerializer)
+            _drop_dependents(dependent)
+            dependent.delete()
