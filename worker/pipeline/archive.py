@@ -1,0 +1,136 @@
+"""Stage values on disk: what one job's process hands to the next, and what a map keeps for its surveys.
+
+Plain `.npz`, arrays only (no pickle), written aside and renamed, so that a reader never sees half a file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from worker.detectors.detector import TileScores
+from worker.pipeline.mapping import CurrentMap, ReferenceMap
+from worker.pipeline.registration import RegisteredScan
+from worker.pipeline.tiling import TileGrid, TilePairs, Tiles
+from worker.pipeline.values import Arrays, Points
+
+
+def save_arrays(path: Path, arrays: Arrays) -> None:
+    """Write named arrays."""
+    aside = path.with_name(path.name + ".tmp")
+    with aside.open("wb") as file:
+        np.savez(file, **arrays)  # type: ignore[arg-type]
+    aside.replace(path)
+
+
+def load_arrays(path: Path) -> Arrays:
+    """Read what `save_arrays` wrote; raises ValueError on anything else."""
+    with np.load(path, allow_pickle=False) as archive:
+        return dict(archive)
+
+
+def save_reference(path: Path, reference: ReferenceMap) -> None:
+    """Keep the map with its normals."""
+    arrays: Arrays = {
+        "points": reference.points,
+        "normals": reference.normals,
+        "voxel_size": np.array([reference.voxel_size]),
+    }
+    if reference.colors is not None:
+        arrays["colors"] = reference.colors
+    save_arrays(path, arrays)
+
+
+def load_reference(path: Path) -> ReferenceMap:
+    """Read what `save_reference` wrote."""
+    arrays = load_arrays(path)
+    return ReferenceMap(
+        points=arrays["points"],
+        normals=arrays["normals"],
+        colors=arrays.get("colors"),
+        voxel_size=float(arrays["voxel_size"][0]),
+    )
+
+
+def save_current(path: Path, current: CurrentMap) -> None:
+    """Keep the survey's fused cloud."""
+    colors: Arrays = {} if current.colors is None else {"colors": current.colors}
+    save_arrays(path, {"points": current.points, **colors})
+
+
+def load_current(path: Path) -> CurrentMap:
+    """Read what `save_current` wrote."""
+    arrays = load_arrays(path)
+    return CurrentMap(points=arrays["points"], colors=arrays.get("colors"))
+
+
+def save_scan(path: Path, scan: RegisteredScan) -> None:
+    """Keep an accepted scan's points, pose and sensor origin: detectors that follow rays need them."""
+    colors: Arrays = {} if scan.colors is None else {"colors": scan.colors}
+    pose = {"map_from_scan": scan.map_from_scan, "sensor_origin": scan.sensor_origin}
+    save_arrays(path, {"points": scan.points, **pose, **colors})
+
+
+def save_tiles(path: Path, tiles: Tiles) -> None:
+    """Keep the grid and every tile's points."""
+    save_arrays(path, {**_grid_arrays(tiles), **_ragged("reference", tiles.points)})
+
+
+def load_tiles(path: Path) -> Tiles:
+    """Read what `save_tiles` or `save_pairs` wrote."""
+    return _tiles(load_arrays(path))
+
+
+def save_pairs(path: Path, pairs: TilePairs) -> None:
+    """Keep the tiles of both sides."""
+    arrays = _grid_arrays(pairs.reference) | _ragged("reference", pairs.reference.points)
+    save_arrays(path, arrays | _ragged("current", pairs.current) | {"observed": pairs.observed})
+
+
+def load_pairs(path: Path) -> TilePairs:
+    """Read what `save_pairs` wrote."""
+    arrays = load_arrays(path)
+    return TilePairs(
+        reference=_tiles(arrays), current=_unragged("current", arrays), observed=arrays["observed"]
+    )
+
+
+def save_scores(path: Path, scores: TileScores) -> None:
+    """Keep the probabilities."""
+    save_arrays(path, {"probabilities": scores.probabilities})
+
+
+def load_scores(path: Path) -> TileScores:
+    """Read what `save_scores` wrote."""
+    return TileScores(probabilities=load_arrays(path)["probabilities"])
+
+
+def _grid_arrays(tiles: Tiles) -> Arrays:
+    grid = tiles.grid
+    return {
+        "origin": grid.origin,
+        "size": grid.size,
+        "shape": np.array(grid.shape, np.int64),
+        "indices": tiles.indices,
+    }
+
+
+def _tiles(arrays: Arrays) -> Tiles:
+    i, j, k = (int(count) for count in arrays["shape"])
+    grid = TileGrid(origin=arrays["origin"], size=arrays["size"], shape=(i, j, k))
+    return Tiles(grid=grid, indices=arrays["indices"], points=_unragged("reference", arrays))
+
+
+def _ragged(name: str, parts: Sequence[Points]) -> Arrays:
+    """Arrays of different lengths as one array and the place where each ends."""
+    points = np.concatenate(parts) if parts else np.empty((0, 3), np.float32)
+    return {
+        f"{name}_points": points,
+        f"{name}_ends": np.cumsum([len(part) for part in parts], dtype=np.int64),
+    }
+
+
+def _unragged(name: str, arrays: Arrays) -> tuple[Points, ...]:
+    return tuple(np.split(arrays[f"{name}_points"], arrays[f"{name}_ends"][:-1]))

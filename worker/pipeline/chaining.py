@@ -1,0 +1,110 @@
+"""Chaining: several scans placed in one frame, one after the other (Stage 1, the plain form).
+
+Each scan is registered to what is fused so far, starting from its pose prior; the paper's pose graph
+(Section 3.3.2) is a later step and takes this file's place.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from worker.errors import RegistrationFailed
+from worker.pipeline.icp import Surface
+from worker.pipeline.poses import inverse
+from worker.pipeline.registration import (
+    RegisteredScan,
+    RegistrationSettings,
+    as_reference,
+    register,
+    surface_of,
+)
+from worker.pipeline.scan import Scan, read_scan
+from worker.pipeline.values import Matrix4
+from worker.pipeline.voxels import Voxels
+from worker.progress import Progress, silent
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ScanFile:
+    """A scan, to be read when it is needed."""
+
+    name: str  #: what messages call it
+    path: Path
+    pose: Matrix4 | None = None  #: (4, 4) map_from_sensor as the client believes it, e.g. by odometry
+
+    def read(self, *, max_points: int) -> Scan:
+        """Raises ScanError, whose message names the file."""
+        return read_scan(self.path, name=self.name, max_points=max_points)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Outcome:
+    """What became of one scan: placed, or left out with a reason."""
+
+    name: str
+    scan: RegisteredScan | None
+    reason: str | None = None
+
+
+def place(
+    file: ScanFile,
+    target: Surface,
+    *,
+    settings: RegistrationSettings,
+    max_points: int,
+    tick: Callable[[], None] = lambda: None,
+) -> Outcome:
+    """Read a scan and register it to the target; raises ScanError only."""
+    scan = file.read(max_points=max_points)
+    try:
+        found = register(scan, target, start=_start(file, scan), settings=settings, tick=tick)
+    except RegistrationFailed as error:
+        return Outcome(name=file.name, scan=None, reason=str(error))
+    return Outcome(name=file.name, scan=found)
+
+
+def chain(
+    files: Sequence[ScanFile],
+    *,
+    settings: RegistrationSettings,
+    max_points: int,
+    progress: Progress = silent,
+) -> tuple[tuple[Outcome, ...], Voxels]:
+    """Place every scan in the frame of the first, and fuse them on the way.
+
+    The first scan stands at its pose prior, or at identity. A scan that finds no place gets a second try when
+    all others are in. Returns the outcomes in the order given, and the fused voxels; raises ScanError.
+    """
+    first = files[0].read(max_points=max_points)
+    placed = as_reference(first, _start(files[0], first))
+    outcomes = {0: Outcome(name=files[0].name, scan=placed)}
+    fused = Voxels.of(placed.points, size=settings.voxel_size, colors=placed.colors)
+    tries = list(range(1, len(files)))
+    for attempt in (1, 2):
+        for done, at in enumerate(tries, start=len(files) - len(tries)):
+            target = surface_of(fused.points, settings)
+            share = done / len(files)
+
+            def tick(share: float = share) -> None:
+                progress("registering", share)
+
+            outcome = place(files[at], target, settings=settings, max_points=max_points, tick=tick)
+            outcomes[at] = outcome
+            if outcome.scan:
+                scan = outcome.scan
+                fused = fused.merged(Voxels.of(scan.points, size=settings.voxel_size, colors=scan.colors))
+        tries = [at for at in tries if outcomes[at].scan is None] if attempt == 1 else []
+    progress("registering", 1.0)
+    return tuple(outcomes[at] for at in range(len(files))), fused
+
+
+def _start(file: ScanFile, scan: Scan) -> Matrix4:
+    """map_from_scan to begin with: the prior speaks of the sensor, the file may know where that stood."""
+    if file.pose is None:
+        return np.eye(4)
+    map_from_scan: Matrix4 = file.pose @ inverse(scan.sensor_pose)
+    return map_from_scan
