@@ -1,0 +1,18 @@
+"""Buildings made of parametric parts, and edits of them."""
+
+from worker.evaluation.scenes.buildings import corridor, random_room, small_office
+from worker.evaluation.scenes.mesh import Mesh, rigid
+from worker.evaluation.scenes.scene import Change, ChangeKind, Room, Scene, SceneObject
+
+__all__ = [
+    "Change",
+    "ChangeKind",
+    "Mesh",
+    "Room",
+    "Scene",
+    "SceneObject",
+    "corridor",
+    "random_room",
+    "rigid",
+    "small_office",
+]
