@@ -71,6 +71,11 @@ def survey_pairs(survey_id: str) -> str:
     return survey_folder(survey_id) + "pairs.npz"
 
 
+def survey_current(survey_id: str) -> str:
+    """The survey's scans fused in the map frame."""
+    return survey_folder(survey_id) + "current.npz"
+
+
 def survey_scores(survey_id: str) -> str:
     """The class probabilities of every tile."""
     return survey_folder(survey_id) + "scores.npz"

@@ -12,12 +12,12 @@ from pathlib import Path
 
 import numpy as np
 
-from worker.errors import RegistrationFailed
 from worker.pipeline.icp import Surface
 from worker.pipeline.poses import inverse
 from worker.pipeline.registration import (
     RegisteredScan,
     RegistrationSettings,
+    ScanRejected,
     as_reference,
     register,
     surface_of,
@@ -48,6 +48,8 @@ class Outcome:
     name: str
     scan: RegisteredScan | None
     reason: str | None = None
+    fitness: float | None = None  #: 0..1, the best reached; None before ICP
+    inlier_rmse: float | None = None  #: metres
 
 
 def place(
@@ -62,9 +64,15 @@ def place(
     scan = file.read(max_points=max_points)
     try:
         found = register(scan, target, start=_start(file, scan), settings=settings, tick=tick)
-    except RegistrationFailed as error:
-        return Outcome(name=file.name, scan=None, reason=str(error))
-    return Outcome(name=file.name, scan=found)
+    except ScanRejected as error:
+        return Outcome(
+            name=file.name,
+            scan=None,
+            reason=str(error),
+            fitness=error.fitness,
+            inlier_rmse=error.inlier_rmse,
+        )
+    return _accepted(file, found)
 
 
 def chain(
@@ -81,7 +89,7 @@ def chain(
     """
     first = files[0].read(max_points=max_points)
     placed = as_reference(first, _start(files[0], first))
-    outcomes = {0: Outcome(name=files[0].name, scan=placed)}
+    outcomes = {0: _accepted(files[0], placed)}
     fused = Voxels.of(placed.points, size=settings.voxel_size, colors=placed.colors)
     tries = list(range(1, len(files)))
     for attempt in (1, 2):
@@ -108,3 +116,7 @@ def _start(file: ScanFile, scan: Scan) -> Matrix4:
         return np.eye(4)
     map_from_scan: Matrix4 = file.pose @ inverse(scan.sensor_pose)
     return map_from_scan
+
+
+def _accepted(file: ScanFile, scan: RegisteredScan) -> Outcome:
+    return Outcome(name=file.name, scan=scan, fitness=scan.fitness, inlier_rmse=scan.inlier_rmse)

@@ -19,6 +19,19 @@ from worker.pipeline.scan import Scan
 from worker.pipeline.values import Floats, Matrix4, Points
 from worker.pipeline.voxels import Voxels
 
+REACH = 0.3  #: metres; farther from the map than this, a point is where the map has nothing to say
+
+
+class ScanRejected(RegistrationFailed):
+    """One scan found no place; the best numbers that were reached stand beside the reason, None before ICP."""
+
+    def __init__(
+        self, reason: str, *, fitness: float | None = None, inlier_rmse: float | None = None
+    ) -> None:
+        super().__init__(reason)
+        self.fitness = fitness  #: 0..1
+        self.inlier_rmse = inlier_rmse  #: metres
+
 
 class RegistrationSettings(BaseModel):
     """Table 1 of the paper, and what we add to it."""
@@ -84,7 +97,7 @@ def register(
     Accepted is what passes Table 1 (fitness and inlier RMSE), or, because fitness falls with the spacing of
     the points, what lies on common surfaces from both sides (`min_agreement`, `min_overlap`).
 
-    Raises RegistrationFailed with the best numbers reached, or where the scene cannot hold a pose.
+    Raises ScanRejected with the best numbers reached, or where the scene cannot hold a pose.
     """
     source = _source_surface(scan, settings)
     begin = np.eye(4) if start is None else start
@@ -97,8 +110,8 @@ def register(
             if best.searched and _is_accepted(best, settings):
                 break
     if not _is_accepted(best, settings):
-        raise RegistrationFailed(_why_not(scan.name, best, settings))
-    _require_held(scan.name, source, target, best.found.target_from_source, settings)
+        raise _rejected(scan.name, best, _why_not(best, settings))
+    _require_held(scan.name, source, target, best, settings)
     return _placed(scan, best)
 
 
@@ -113,13 +126,13 @@ def surface_of(points: Points, settings: RegistrationSettings) -> Surface:
 def _source_surface(scan: Scan, settings: RegistrationSettings) -> Surface:
     points = Voxels.of(scan.points, size=settings.voxel_size).points
     if len(points) < settings.min_points:
-        raise RegistrationFailed(
+        raise ScanRejected(
             f"scan {scan.name}: {len(points)} voxels of {settings.voxel_size:g} m are left, "
             f"{settings.min_points} are needed; scan for longer"
         )
     held = constraint(points)
     if held < settings.min_constraint:
-        raise RegistrationFailed(
+        raise ScanRejected(
             f"scan {scan.name}: its surfaces leave a motion free (constraint {held:.4f}, at least "
             f"{settings.min_constraint:g} is needed), as a bare plane does; scan a place with more structure"
         )
@@ -167,9 +180,6 @@ def _refined(
     return _Candidate(found=found, seen=seen, searched=searched)
 
 
-REACH = 0.3  #: metres; farther from the map than this, a point is where the map has nothing to say
-
-
 def _passes_table_1(found: IcpResult, settings: RegistrationSettings) -> bool:
     return found.fitness > settings.min_fitness and found.inlier_rmse < settings.max_inlier_rmse
 
@@ -182,9 +192,18 @@ def _is_accepted(candidate: _Candidate, settings: RegistrationSettings) -> bool:
     )
 
 
-def _why_not(name: str, best: _Candidate, settings: RegistrationSettings) -> str:
+def _rejected(name: str, best: _Candidate, reason: str) -> ScanRejected:
+    rmse = best.found.inlier_rmse
+    return ScanRejected(
+        f"scan {name}: {reason}",
+        fitness=best.found.fitness,
+        inlier_rmse=rmse if np.isfinite(rmse) else None,
+    )
+
+
+def _why_not(best: _Candidate, settings: RegistrationSettings) -> str:
     return (
-        f"scan {name}: fitness {best.found.fitness:.2f} (over {settings.min_fitness:g} is accepted), "
+        f"fitness {best.found.fitness:.2f} (over {settings.min_fitness:g} is accepted), "
         f"inlier RMSE {best.found.inlier_rmse * 100:.1f} cm, agreement {best.seen.mutual:.2f} "
         f"(at least {settings.min_agreement:g}) over {best.seen.overlap:.0%} of the scan; "
         "give an initial pose, or check that the place is in the map"
@@ -192,16 +211,17 @@ def _why_not(name: str, best: _Candidate, settings: RegistrationSettings) -> str
 
 
 def _require_held(
-    name: str, source: Surface, target: Surface, pose: Matrix4, settings: RegistrationSettings
+    name: str, source: Surface, target: Surface, best: _Candidate, settings: RegistrationSettings
 ) -> None:
     """A scan may be rich and yet share only a plane with the map."""
-    distance, _ = target.nearest(transformed(source.points, pose), within=REACH)
+    distance, _ = target.nearest(transformed(source.points, best.found.target_from_source), within=REACH)
     held = constraint(source.points[np.isfinite(distance)])
     if held < settings.min_constraint:
-        raise RegistrationFailed(
-            f"scan {name}: what it shares with the map leaves a motion free (constraint {held:.4f}, at least "
+        reason = (
+            f"what it shares with the map leaves a motion free (constraint {held:.4f}, at least "
             f"{settings.min_constraint:g} is needed); scan more of the mapped place"
         )
+        raise _rejected(name, best, reason)
 
 
 def _placed(scan: Scan, best: _Candidate) -> RegisteredScan:

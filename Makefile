@@ -1,0 +1,44 @@
+# Every target makes what it needs; `make demo` and `make test` each work on a fresh clone.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+INSTALLED := $(VENV)/.installed
+
+.PHONY: help demo up test check format bench openapi clean
+help: ## this list
+	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
+
+demo: $(INSTALLED) ## simulate a building, run the whole service on it, show what changed
+	$(BIN)/spicd-worker demo
+
+up: $(INSTALLED) ## start the service to stay: API, workers, embedded Redis
+	$(BIN)/spicd up
+
+test: $(INSTALLED) ## every test
+	$(BIN)/pytest
+
+check: $(INSTALLED) ## ruff and mypy
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+format: $(INSTALLED) ## let ruff put the code in shape
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+bench: $(INSTALLED) ## seconds in each stage on a simulated corridor, saved under bench/
+	$(BIN)/spicd-worker bench
+
+openapi: $(INSTALLED) ## write openapi/openapi.json anew
+	$(BIN)/python -m service.api.schema
+
+clean: ## remove the environment and everything made
+	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache *.egg-info build demo bench
+
+$(INSTALLED): pyproject.toml docker/constraints.txt docker/system-libraries.sh
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "SPICD needs Python 3.11 or later; name one: make PYTHON=python3.12")'
+	@echo "Making $(VENV) and installing (about 1 GB on disk; a few minutes the first time) ..."
+	@$(PYTHON) -m venv $(VENV)
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -c docker/constraints.txt -e '.[worker,dev]'
+	@PYTHON=$(BIN)/python sh docker/system-libraries.sh
+	@touch $@
