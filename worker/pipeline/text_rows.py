@@ -14,7 +14,7 @@ from worker.errors import ScanError
 from worker.pipeline.records import Columns, Field, chosen_fields
 
 LINE_LIMIT = 1024 * 1024  #: bytes of one line
-_ROWS_AT_ONCE = 65_536  #: lines decoded together, which bounds the memory of the columns nobody wants
+_NUMBERS_AT_ONCE = 1_000_000  #: decoded together, which bounds the memory of the columns nobody wants
 
 
 def from_text(fields: Sequence[Field], lines: Iterator[bytes], *, n: int, size: int) -> Columns:
@@ -30,12 +30,14 @@ def from_text(fields: Sequence[Field], lines: Iterator[bytes], *, n: int, size: 
     firsts = np.cumsum([0, *(field.count for field in fields)])
     chosen = chosen_fields(fields)
     columns = {name: np.empty(n, fields[i].dtype) for name, i in chosen.items()}
-    for start in range(0, n, _ROWS_AT_ONCE):
-        chunk = list(islice(lines, min(_ROWS_AT_ONCE, n - start)))
+    step = max(1, _NUMBERS_AT_ONCE // width)
+    for start in range(0, n, step):
+        rows = min(step, n - start)
+        chunk = list(islice(lines, rows))
         numbers = _decode(chunk, width, start=start, n=n)
         for name, i in chosen.items():
             columns[name][start : start + len(chunk)] = _cast(numbers[:, firsts[i]], fields[i])
-        if start + len(chunk) < min(start + _ROWS_AT_ONCE, n):
+        if len(chunk) < rows:
             raise ScanError(
                 f"truncated: header declares {n} points, file holds {start + len(chunk)}; upload it again"
             )
