@@ -11,6 +11,8 @@ from worker.evaluation.scenes.scene import Scene
 from worker.pipeline.values import Floats, Matrix4, Points
 
 TURN = 360.0  #: degrees
+LEAST_GAP = 0.03  #: metres between two surfaces that a beam can mix
+NOWHERE = 1000.0  #: metres, the range of a ray that meets nothing: beyond every limit, and finite
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -91,8 +93,8 @@ def scan(
     both = np.concatenate([fired, edge]) @ world_from_sensor[:3, :3].T  # (2N, 3) world frame
     hit = scene.caster.cast(world_from_sensor[:3, 3], both)
     count = len(reported)
-    first = hit.ranges[:count]
-    mixed = _mixed(first, hit.ranges[count:], hit.cosines[:count], sensor, rng)
+    first, other = np.split(np.minimum(hit.ranges, NOWHERE), 2)
+    mixed = _mixed(first, other, hit.cosines[:count], sensor, rng)
     kept = _returned(first, hit.cosines[:count], sensor, rng)
     noisy = mixed + rng.normal(0.0, sensor.bias_sigma) + rng.normal(0.0, sensor.range_sigma, count)
     if sensor.range_step > 0:
@@ -139,13 +141,13 @@ def _mixed(
     first: Floats, other: Floats, cosines: Floats, sensor: SensorModel, rng: np.random.Generator
 ) -> Floats:
     """(N,) ranges; where the beam straddles an edge, some lie between both surfaces."""
-    gap = np.where(np.isfinite(first) & np.isfinite(other), np.abs(other - first), 0.0)
+    gap = np.abs(other - first)
     # On one plane the range changes by about r * angle * tan(incidence) across the beam: that is no edge.
-    tangents = np.sqrt(1 - np.clip(cosines, 0.05, 1.0) ** 2) / np.clip(cosines, 0.05, 1.0)
-    plane = np.where(np.isfinite(first), first, 0.0) * np.radians(3 * sensor.beam_deg) * tangents
-    edge = (gap > 0.03 + plane) & (gap < sensor.mixing_depth) & (rng.random(len(first)) < sensor.mixing)
-    share = rng.random(len(first))
-    return np.where(edge, first + share * (np.where(edge, other, 0.0) - np.where(edge, first, 0.0)), first)
+    cosines = np.clip(cosines, 0.05, 1.0)
+    plane = first * np.radians(3 * sensor.beam_deg) * np.sqrt(1 - cosines**2) / cosines
+    edge = (gap > LEAST_GAP + plane) & (gap < sensor.mixing_depth) & (rng.random(len(first)) < sensor.mixing)
+    between = first + rng.random(len(first)) * (other - first)
+    return np.where(edge, between, first)
 
 
 def _returned(
@@ -157,5 +159,5 @@ def _returned(
     grazing = np.cos(np.radians(sensor.grazing_deg))
     flat = np.clip(cosines / grazing, 0.0, 1.0) if grazing > 1e-6 else 1.0
     chance = far * flat * (1 - sensor.loss)
-    arrived: NDArray[np.bool_] = np.isfinite(ranges) & (rng.random(len(ranges)) < chance)
+    arrived: NDArray[np.bool_] = rng.random(len(ranges)) < chance
     return arrived
