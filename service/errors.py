@@ -5,6 +5,7 @@ ServiceError
 ├── NotReady             not_ready            the map is still building, the survey still running
 ├── Conflict             conflict             the id is taken, the scan is in use
 ├── BadRequest           bad_request          a value that the schema admits and the service does not
+├── ScanUnreadable       scan_unreadable      an uploaded file that is neither PLY nor PCD
 ├── TooLarge             too_large            a body over the limit
 ├── WrongMediaType       wrong_media_type     neither a scan nor JSON
 └── QueueUnavailable     queue_unavailable    Redis does not answer; nothing was recorded
@@ -33,6 +34,10 @@ class Conflict(ServiceError):
 
 class BadRequest(ServiceError):
     code = "bad_request"
+
+
+class ScanUnreadable(ServiceError):
+    code = "scan_unreadable"
 
 
 class TooLarge(ServiceError):

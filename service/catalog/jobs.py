@@ -50,6 +50,12 @@ class Jobs:
         with self._database.read() as session:
             return page_of([job_record(row) for row in session.scalars(query)], limit)
 
+    def open_of(self, map_id: str) -> tuple[JobRecord, ...]:
+        """The jobs of a map and of its surveys that have not ended."""
+        query = select(tables.Job).where(tables.Job.map_id == map_id, _OPEN)
+        with self._database.read() as session:
+            return tuple(job_record(row) for row in session.scalars(query))
+
     def counts(self) -> dict[str, int]:
         """How many jobs are in each state; states without a job are left out."""
         query = select(tables.Job.status, func.count()).group_by(tables.Job.status)

@@ -1,0 +1,77 @@
+"""The app: routes, problems and metrics put together; nothing is opened before it starts."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import AsyncIterator
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any
+
+from fastapi import FastAPI
+from fastapi.concurrency import run_in_threadpool
+
+from service.api import changes, health, jobs, maps, models, problems, scans, surveys
+from service.api.cards import Cards
+from service.api.metrics import Metrics, MetricsMiddleware
+from service.api.schema import describe
+from service.api.services import Queue, Services
+from service.catalog.catalog import open_catalog
+from service.queue import JobQueue
+from service.settings import Settings
+
+DESCRIPTION = """\
+Upload LiDAR scans of a building, build a reference map of them, and ask, tile by tile, what a later visit found changed.
+
+A map and a survey are built by jobs: the answer to the POST names the job, and `GET /jobs/{id}` says how far it is.
+Every error is a problem document (RFC 9457) with a stable `type`.
+"""
+
+
+class Api(FastAPI):
+    """FastAPI with our own description of itself."""
+
+    def openapi(self) -> dict[str, Any]:
+        """The OpenAPI document."""
+        return describe(self)
+
+
+def create_app(settings: Settings, *, queue: Queue | None = None) -> FastAPI:
+    """The API under `settings`. `queue` is the one to submit to; left out, it is made from `settings.redis_url`."""
+    app = Api(
+        title="SPICD",
+        version=_version(),
+        summary="LiDAR scans in, changed tiles and a coloured cloud out",
+        description=DESCRIPTION,
+        lifespan=_lifespan(settings, queue),
+    )
+    app.state.metrics = Metrics()
+    app.add_middleware(MetricsMiddleware, metrics=app.state.metrics)
+    problems.add_handlers(app)
+    for part in (scans, maps, surveys, changes, jobs, models, health):
+        app.include_router(part.router)
+    return app
+
+
+def _lifespan(settings: Settings, queue: Queue | None) -> Any:
+    @contextlib.asynccontextmanager
+    async def lifespan(app: FastAPI) -> AsyncIterator[None]:
+        if queue is None and settings.redis_url is None:
+            raise ValueError("no SPICD_REDIS_URL: `spicd up` starts an embedded server and sets it")
+        used = queue or JobQueue(settings.redis_url or "", timeout_s=settings.job_timeout_s)
+        catalog = await run_in_threadpool(open_catalog, settings)
+        app.state.services = Services(
+            settings=settings, catalog=catalog, queue=used, cards=Cards(settings.model_store)
+        )
+        try:
+            yield
+        finally:
+            catalog.close()
+
+    return lifespan
+
+
+def _version() -> str:
+    try:
+        return version("spicd")
+    except PackageNotFoundError:  # run from a checkout
+        return "0"

@@ -1,0 +1,136 @@
+"""/maps/{id}/changes: what a dashboard asks, over all visits to a map."""
+
+from __future__ import annotations
+
+import math
+import sys
+from datetime import datetime
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Path, Query
+from fastapi import Request as HttpRequest
+from pydantic import BeforeValidator, Field, WithJsonSchema
+
+from service.api import features
+from service.api.documents import Link, link
+from service.api.features import FeatureResponse, feature_response
+from service.api.paging import Cursor, change_cursor, change_position, next_link
+from service.api.problems import documented
+from service.api.requests import Request
+from service.api.services import Provided
+from service.api.values import Id, instant
+from service.catalog.changes import ChangeFilter
+from service.catalog.records import Bounds
+from service.errors import NotFound
+
+router = APIRouter(tags=["changes"])
+
+Span = tuple[datetime | None, datetime | None]  #: first and last instant, None where open
+
+
+def bbox(value: Any) -> Any:
+    """Four numbers (x and y) or six (x, y and z): the minimum corner, then the maximum."""
+    if not isinstance(value, str):
+        return value
+    try:
+        numbers = [float(part) for part in value.split(",")]
+    except ValueError:
+        numbers = []
+    if len(numbers) not in (4, 6) or not all(math.isfinite(number) for number in numbers):
+        raise ValueError("give four or six numbers: minimum x,y[,z] then maximum x,y[,z], in metres")
+    half = len(numbers) // 2
+    low, high = numbers[:half], numbers[half:]
+    if any(a > b for a, b in zip(low, high, strict=True)):
+        raise ValueError("the minimum corner comes first, then the maximum")
+    if half == 2:
+        low, high = [*low, -sys.float_info.max], [*high, sys.float_info.max]
+    return Bounds(min=(low[0], low[1], low[2]), max=(high[0], high[1], high[2]))
+
+
+def span(value: Any) -> Any:
+    """An instant, or an interval with `..` (or nothing) for an open end (OGC API - Features, `datetime`)."""
+    if not isinstance(value, str):
+        return value
+    parts = value.split("/")
+    if len(parts) > 2:
+        raise ValueError("give an instant or an interval start/end")
+    if len(parts) == 1:
+        return (instant(value),) * 2
+    since, until = (None if part in ("", "..") else instant(part) for part in parts)
+    if since is None and until is None:
+        raise ValueError("an interval has at least one end; leave datetime out to take all")
+    if since is not None and until is not None and since > until:
+        raise ValueError("the interval ends before it starts")
+    return since, until
+
+
+_BBOX = {"type": "string", "example": "0,0,7.5,4.5"}
+_DATETIME = {"type": "string", "example": "2026-03-01T00:00:00Z/.."}
+
+
+class ChangesRequest(Request):
+    """Which changed tiles."""
+
+    survey: Annotated[Id | None, Field(description="of this survey only")] = None
+    bbox: Annotated[
+        Bounds | None,
+        BeforeValidator(bbox),
+        WithJsonSchema(_BBOX),
+        Field(description="map frame, metres; tiles whose box meets it"),
+    ] = None
+    datetime: Annotated[
+        Span | None,
+        BeforeValidator(span),
+        WithJsonSchema(_DATETIME),
+        Field(description="of the visit: RFC 3339 instant, or interval with `..` for an open end"),
+    ] = None
+    min_score: Annotated[float | None, Field(ge=0, le=1, description="probability of change")] = None
+    limit: Annotated[int, Field(ge=1, le=10000, description="most features in one answer")] = 100
+    cursor: Cursor = None
+
+
+@router.get(
+    "/maps/{map_id}/changes",
+    summary="What changed",
+    response_class=FeatureResponse,
+    response_model=None,
+    responses={
+        **features.documented(),
+        **documented("not_found", "not_ready", "invalid_request", "bad_request"),
+    },
+)
+def get_changes(
+    request: HttpRequest,
+    services: Provided,
+    map_id: Annotated[Id, Path()],
+    asked: Annotated[ChangesRequest, Query()],
+) -> FeatureResponse:
+    """The changed tiles of every finished survey: newest visit first, most certain first within a visit.
+
+    A survey that still runs or failed has no say here; asked for by name it answers 409 and not an empty list,
+    for nothing found is not the same as no change.
+    """
+    catalog = services.catalog
+    catalog.maps.ready(map_id)
+    if asked.survey is not None and catalog.surveys.ready(asked.survey).map_id != map_id:
+        raise NotFound(f"survey {asked.survey!r} is not of map {map_id!r}")
+    since, until = asked.datetime or (None, None)
+    page = catalog.changes.page(
+        ChangeFilter(
+            map_id=map_id,
+            survey_id=asked.survey,
+            bounds=asked.bbox,
+            since=since,
+            until=until,
+            min_score=asked.min_score,
+        ),
+        after=change_position(asked.cursor),
+        limit=asked.limit,
+    )
+    links = [
+        Link(href=str(request.url.replace(scheme="", netloc="")), rel="self", type=features.MEDIA_TYPE),
+        link(request, f"/maps/{map_id}", "map"),
+    ]
+    if page.following is not None:
+        links.append(next_link(request, change_cursor(page.following), features.MEDIA_TYPE))
+    return feature_response(page.items, matched=page.matched, links=links)

@@ -1,0 +1,151 @@
+"""Tiles as features: OGC Features and Geometries JSON 1.0 (JSON-FG, OGC 21-045r1), which is GeoJSON as well.
+
+A tile is a Prism in the map's own frame: metres, z up, origin unknown to the Earth. GeoJSON's `geometry`
+admits WGS 84 alone and so is null.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any, Literal
+
+from fastapi.responses import Response
+from pydantic import Field
+
+from service.api.documents import Document, Link
+from service.catalog.clock import now, rfc3339
+from service.catalog.records import ChangeRecord, TileState, Vector3
+
+MEDIA_TYPE = "application/geo+json"
+CONFORMS_TO = (
+    "http://www.opengis.net/spec/json-fg-1/1.0/conf/core",
+    "http://www.opengis.net/spec/json-fg-1/1.0/conf/prisms",
+)
+FEATURE_TYPE = "spicd-tile"
+#: OGC's name for a local Cartesian frame of three axes in metres, z up (JSON-FG repository, core/crs).
+MAP_FRAME = "http://www.opengis.net/def/crs/OGC/0/Engineering3D"
+
+Position2 = tuple[float, float]
+
+
+class Polygon(Document):
+    """The footprint, counter-clockwise and closed."""
+
+    type: Literal["Polygon"] = "Polygon"
+    coordinates: tuple[tuple[Position2, ...]] = Field(
+        examples=[[[[6.0, 3.0], [7.5, 3.0], [7.5, 4.5], [6.0, 4.5], [6.0, 3.0]]]]
+    )
+
+
+class Prism(Document):
+    """A box over its footprint, metres, map frame."""
+
+    type: Literal["Prism"] = "Prism"
+    base: Polygon
+    lower: float = Field(examples=[0.0])
+    upper: float = Field(examples=[1.0])
+
+
+class Time(Document):
+    """When the visit was."""
+
+    timestamp: str = Field(examples=["2026-03-01T12:00:00Z"])
+
+
+class TileProperties(Document):
+    """What is said of a tile."""
+
+    tile_id: str = Field(examples=["tile_004_002_000"])
+    tile_index: tuple[int, int, int] = Field(examples=[[4, 2, 0]])
+    center: Vector3 = Field(description="metres, map frame", examples=[[6.75, 3.75, 0.5]])
+    state: TileState = Field(examples=["changed"])
+    score: float | None = Field(description="probability of change; null where unobserved", examples=[0.93])
+    probabilities: Vector3 | None = Field(
+        description="unchanged, changed, different place", examples=[[0.05, 0.93, 0.02]]
+    )
+    threshold: float | None = Field(description="changed above this score", examples=[0.5])
+    n_reference: int = Field(description="points of the map in the tile", examples=[1904])
+    n_current: int = Field(description="points of the survey in the tile", examples=[2210])
+    map_id: str = Field(examples=["lobby"])
+    survey_id: str = Field(examples=["survey-91c4"])
+    model: str = Field(examples=["spicd-net/1"])
+    captured_at: str = Field(examples=["2026-03-01T12:00:00Z"])
+
+
+class TileFeature(Document):
+    """One tile."""
+
+    type: Literal["Feature"] = "Feature"
+    id: str = Field(examples=["survey-91c4.tile_004_002_000"])
+    geometry: None = None
+    place: Prism
+    time: Time
+    properties: TileProperties
+
+
+class TileCollection(Document):
+    """Tiles; the members that hold for all stand on the root, as the standard has it."""
+
+    type: Literal["FeatureCollection"] = "FeatureCollection"
+    conformsTo: tuple[str, ...] = CONFORMS_TO  # noqa: N815 - the standard's name
+    featureType: str = FEATURE_TYPE  # noqa: N815
+    coordRefSys: str = MAP_FRAME  # noqa: N815
+    timeStamp: str = Field(examples=["2026-03-01T12:05:00Z"])  # noqa: N815
+    numberMatched: int = Field(examples=[1])  # noqa: N815
+    numberReturned: int = Field(examples=[1])  # noqa: N815
+    links: list[Link]
+    features: list[TileFeature]
+
+
+class FeatureResponse(Response):
+    """Features."""
+
+    media_type = MEDIA_TYPE
+
+
+def feature_response(
+    changes: Iterable[ChangeRecord], *, matched: int, links: Iterable[Link]
+) -> FeatureResponse:
+    """A collection of tiles; `matched` counts those of every page."""
+    features = [feature(change) for change in changes]
+    collection = TileCollection(
+        timeStamp=rfc3339(now()),
+        numberMatched=matched,
+        numberReturned=len(features),
+        links=list(links),
+        features=features,
+    )
+    return FeatureResponse(collection.model_dump_json())
+
+
+def feature(change: ChangeRecord) -> TileFeature:
+    """One tile of a survey."""
+    tile, captured_at = change.tile, rfc3339(change.captured_at)
+    (x0, y0, z0), (x1, y1, z1) = tile.bounds.min, tile.bounds.max
+    footprint = ((x0, y0), (x1, y0), (x1, y1), (x0, y1), (x0, y0))
+    return TileFeature(
+        id=f"{change.survey_id}.{tile.tile_id}",
+        place=Prism(base=Polygon(coordinates=(footprint,)), lower=z0, upper=z1),
+        time=Time(timestamp=captured_at),
+        properties=TileProperties(
+            tile_id=tile.tile_id,
+            tile_index=tile.tile_index,
+            center=((x0 + x1) / 2, (y0 + y1) / 2, (z0 + z1) / 2),
+            state=tile.state,
+            score=tile.score,
+            probabilities=tile.probabilities,
+            threshold=change.threshold,
+            n_reference=tile.n_reference,
+            n_current=tile.n_current,
+            map_id=change.map_id,
+            survey_id=change.survey_id,
+            model=change.model,
+            captured_at=captured_at,
+        ),
+    )
+
+
+def documented() -> dict[int | str, dict[str, Any]]:
+    """The 200 of a route that answers with features, for the generated API description."""
+    schema = {"$ref": f"#/components/schemas/{TileCollection.__name__}"}
+    return {200: {"description": "A JSON-FG FeatureCollection", "content": {MEDIA_TYPE: {"schema": schema}}}}

@@ -1,0 +1,82 @@
+"""Files on their way in: written to disk in pieces, hashed on the way, and never parsed.
+
+Only the first bytes are looked at: they tell PLY from PCD.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+from uuid import uuid4
+
+from service.catalog.records import ScanFormat
+from service.errors import ScanUnreadable
+
+_HEAD = 64  #: bytes that are enough to tell the format
+_PCD = (b"# .PCD", b"#.PCD", b"VERSION")
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Upload:
+    """One file that arrived whole."""
+
+    path: Path  #: goes with the request, unless it was moved
+    filename: str
+    format: ScanFormat
+    size: int  #: bytes
+    sha256: str
+
+
+class Incoming:
+    """A file being written. Used as a context: what was not moved away by its end is removed."""
+
+    def __init__(self, folder: Path, filename: str) -> None:
+        """`folder` exists; `filename` is the client's, and is not used as a path."""
+        self.filename = filename
+        self._path = folder / f"{uuid4().hex}.part"
+        self._file = self._path.open("wb")
+        self._sha256 = hashlib.sha256()
+        self._head = b""
+        self._size = 0
+
+    def write(self, data: bytes | memoryview) -> None:
+        """Take the next piece."""
+        if len(self._head) < _HEAD:
+            self._head += bytes(data[: _HEAD - len(self._head)])
+        self._file.write(data)
+        self._sha256.update(data)
+        self._size += len(data)
+
+    def finish(self) -> Upload:
+        """The whole file. Raises ScanUnreadable when it is neither PLY nor PCD."""
+        self._file.close()
+        return Upload(
+            path=self._path,
+            filename=self.filename,
+            format=self._format(),
+            size=self._size,
+            sha256=self._sha256.hexdigest(),
+        )
+
+    def _format(self) -> ScanFormat:
+        if not self._head:
+            raise ScanUnreadable(f"{self.filename}: the file is empty; send a PLY or PCD")
+        if self._head[:4] in (b"ply\n", b"ply\r"):
+            return "ply"
+        if self._head.lstrip().startswith(_PCD):
+            return "pcd"
+        raise ScanUnreadable(
+            f"{self.filename}: neither PLY nor PCD, it starts with {self._head[:12]!r}; send the scan as one of the two"
+        )
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._file.close()
+        self._path.unlink(missing_ok=True)

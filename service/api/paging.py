@@ -1,0 +1,88 @@
+"""Pages of lists: a limit, and an opaque cursor that says behind which row to go on."""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Callable, Sequence
+from datetime import datetime
+from typing import Annotated, Any, TypeVar
+
+from fastapi import Request as HttpRequest
+from pydantic import Field
+
+from service.api.documents import Document, Link, link
+from service.api.requests import Request
+from service.catalog.changes import ChangePosition
+from service.catalog.clock import rfc3339
+from service.catalog.page import Page, Position
+from service.errors import BadRequest
+
+T = TypeVar("T")
+D = TypeVar("D", bound=Document)
+
+Limit = Annotated[int, Field(ge=1, le=1000, description="most items in one answer")]
+Cursor = Annotated[str | None, Field(max_length=1000, description="from a `next` link; opaque")]
+
+
+class PageRequest(Request):
+    """Which part of a list."""
+
+    limit: Limit = 100
+    cursor: Cursor = None
+
+    def after(self) -> Position | None:
+        """Where to go on. Raises BadRequest."""
+        if self.cursor is None:
+            return None
+        created, key = _decoded(self.cursor, datetime.fromisoformat, str)
+        return created, key
+
+
+def list_links(request: HttpRequest, page: Page[Any], position: Callable[[Any], Position]) -> list[Link]:
+    """`self`, and `next` while there is more."""
+    links = [Link(href=_here(request), rel="self")]
+    if page.more:
+        created, key = position(page.items[-1])
+        links.append(next_link(request, encoded(rfc3339(created), key)))
+    return links
+
+
+def next_link(request: HttpRequest, cursor: str, media_type: str = "application/json") -> Link:
+    """The same request, further on."""
+    url = request.url.include_query_params(cursor=cursor)
+    return link(request, f"{_path(request)}?{url.query}", "next", media_type)
+
+
+def change_cursor(position: ChangePosition) -> str:
+    """The cursor behind a change."""
+    return encoded(rfc3339(position.captured_at), position.survey_id, position.score.hex(), position.tile_id)
+
+
+def change_position(cursor: str | None) -> ChangePosition | None:
+    """Where to go on. Raises BadRequest."""
+    if cursor is None:
+        return None
+    captured_at, survey_id, score, tile_id = _decoded(cursor, datetime.fromisoformat, str, float.fromhex, str)
+    return ChangePosition(captured_at=captured_at, survey_id=survey_id, score=score, tile_id=tile_id)
+
+
+def encoded(*parts: str) -> str:
+    """An opaque cursor of these parts."""
+    return base64.urlsafe_b64encode(json.dumps(parts).encode()).decode().rstrip("=")
+
+
+def _decoded(cursor: str, *readers: Callable[[str], Any]) -> Sequence[Any]:
+    try:
+        parts = json.loads(base64.urlsafe_b64decode(cursor + "=" * (-len(cursor) % 4)))
+        return [read(part) for read, part in zip(readers, parts, strict=True)]
+    except (ValueError, TypeError, RecursionError) as error:
+        raise BadRequest(f"cursor {cursor[:40]!r} is none of ours; follow a `next` link") from error
+
+
+def _path(request: HttpRequest) -> str:
+    return request.url.path.removeprefix(request.scope.get("root_path", ""))
+
+
+def _here(request: HttpRequest) -> str:
+    return request.url.path + (f"?{request.url.query}" if request.url.query else "")

@@ -1,0 +1,161 @@
+"""Errors as clients see them: RFC 9457 problem documents, every code in one table."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from typing import Any
+from uuid import uuid4
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse, Response
+from pydantic import BaseModel, Field
+from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect
+
+from service.catalog.records import Problem
+from service.errors import ServiceError
+
+log = logging.getLogger(__name__)
+
+MEDIA_TYPE = "application/problem+json"
+
+#: code -> (HTTP status, title). A status of None is that of a failed job, which no request answers with.
+PROBLEMS: dict[str, tuple[int | None, str]] = {
+    "not_found": (404, "There is no such thing"),
+    "not_ready": (409, "It is not ready yet"),
+    "conflict": (409, "It is in the way of something else"),
+    "bad_request": (422, "A value cannot be used"),
+    "invalid_request": (422, "The request does not match the API"),
+    "scan_unreadable": (422, "The file is no sound scan"),
+    "too_large": (413, "The body is too large"),
+    "wrong_media_type": (415, "The media type is not taken here"),
+    "queue_unavailable": (503, "The job queue does not answer"),
+    "unhealthy": (503, "A part of the service does not answer"),
+    "method_not_allowed": (405, "The method is not allowed here"),
+    "incomplete_body": (400, "The body ended early"),
+    "internal": (500, "The service failed"),
+    "scan_too_large": (None, "The scan has too many points"),
+    "scan_units": (None, "The scan is not in metres"),
+    "registration_failed": (None, "No scan could be registered"),
+    "map_failed": (None, "The scans do not make a map"),
+    "detector_unavailable": (None, "The model cannot be used"),
+    "pipeline_error": (None, "The job failed"),
+    "dismissed": (None, "The job was dismissed"),
+}
+
+
+class InvalidValue(BaseModel):
+    """One value that does not match, and where it stands."""
+
+    place: str = Field(examples=["query.limit"])
+    value: Any = Field(examples=[0])
+    detail: str = Field(examples=["Input should be greater than or equal to 1"])
+
+
+class ProblemDocument(BaseModel):
+    """RFC 9457, Section 3. `type` is stable; `errors` lists the values that do not match."""
+
+    type: str = Field(examples=["urn:spicd:problem:not_found"])
+    title: str = Field(examples=["There is no such thing"])
+    status: int | None = Field(default=None, examples=[404])
+    detail: str = Field(examples=["no map 'lobby'; GET /maps lists those there are"])
+    instance: str | None = None
+    errors: list[InvalidValue] | None = None
+
+
+def problem_of(problem: Problem) -> ProblemDocument:
+    """The document of a failed job's problem; an unknown code keeps its type under a general title."""
+    status, title = PROBLEMS.get(problem.code, PROBLEMS["pipeline_error"])
+    return ProblemDocument(type=_type(problem.code), title=title, status=status, detail=problem.detail)
+
+
+def response(
+    code: str, detail: str, *, headers: dict[str, str] | None = None, **members: Any
+) -> JSONResponse:
+    """The answer to a request that ended in `code`; `members` extend the document (RFC 9457, Section 3.2)."""
+    status, title = PROBLEMS[code]
+    status = 500 if status is None else status
+    content = {"type": _type(code), "title": title, "status": status, "detail": detail, **members}
+    return JSONResponse(content, status, headers=headers, media_type=MEDIA_TYPE)
+
+
+def documented(*codes: str) -> dict[int | str, dict[str, Any]]:
+    """The `responses` of a route that may end in these codes, for the generated API description."""
+    answers: dict[int | str, dict[str, Any]] = {}
+    for code in codes:
+        status, title = PROBLEMS[code]
+        if status is None:
+            raise ValueError(f"{code} is the problem of a job, not of a request")
+        told = f"{title} (`{_type(code)}`)"
+        known = answers.get(status)
+        answers[status] = {
+            "description": told if known is None else f"{known['description']}; {told}",
+            "content": {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/ProblemDocument"}}},
+        }
+    return answers
+
+
+def add_handlers(app: FastAPI) -> None:
+    """Make every error of `app` a problem document."""
+    app.add_exception_handler(ServiceError, _service_error)
+    app.add_exception_handler(RequestValidationError, _invalid)
+    app.add_exception_handler(HTTPException, _http_error)
+    app.add_exception_handler(ClientDisconnect, _disconnected)
+    app.add_exception_handler(Exception, _unexpected)
+
+
+def _type(code: str) -> str:
+    return f"urn:spicd:problem:{code}"
+
+
+def _service_error(_request: Request, error: Exception) -> Response:
+    code = error.code if isinstance(error, ServiceError) and error.code in PROBLEMS else "internal"
+    return response(code, str(error))
+
+
+def _invalid(_request: Request, error: Exception) -> Response:
+    found: Sequence[Any] = error.errors() if isinstance(error, RequestValidationError) else ()
+    errors = [_invalid_value(entry) for entry in found]
+    first = errors[0] if errors else {"place": "request", "detail": "it does not match"}
+    return response("invalid_request", f"{first['place']}: {first['detail']}", errors=errors)
+
+
+def _invalid_value(entry: dict[str, Any]) -> dict[str, Any]:
+    value = entry.get("input")
+    shown = value if isinstance(value, str | int | float | bool | None) else repr(value)
+    if isinstance(shown, float) and not abs(shown) < float("inf"):
+        shown = repr(shown)
+    if isinstance(shown, str) and len(shown) > 200:
+        shown = shown[:200] + "..."
+    place = ".".join(str(part) for part in entry.get("loc", ()))
+    detail = str(entry.get("msg", "")).removeprefix("Value error, ")
+    return {"place": place, "value": shown, "detail": detail}
+
+
+def _http_error(request: Request, error: Exception) -> Response:
+    status = error.status_code if isinstance(error, HTTPException) else 500
+    headers = dict(error.headers or {}) if isinstance(error, HTTPException) else None
+    if status == 404:
+        return response("not_found", f"no such path: {request.url.path}; GET /docs shows those there are")
+    if status == 405:
+        return response("method_not_allowed", f"{request.method} is not allowed here", headers=headers)
+    if status < 500:
+        detail = error.detail if isinstance(error, HTTPException) else "the request cannot be read"
+        return response("bad_request", str(detail), headers=headers)
+    return _unexpected(request, error)
+
+
+def _disconnected(_request: Request, _error: Exception) -> Response:
+    return response("incomplete_body", "the connection ended within the body; nothing was kept")
+
+
+def _unexpected(request: Request, error: Exception) -> Response:
+    instance = uuid4().urn
+    log.error("%s %s failed, %s", request.method, request.url.path, instance, exc_info=error)
+    return response(
+        "internal",
+        "the service failed on this request; its log says why under this instance",
+        instance=instance,
+    )

@@ -1,0 +1,89 @@
+"""What clients send, as checked values; files travel beside them."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, TypeVar
+
+from fastapi.exceptions import RequestValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+
+from service.api.values import DeviceId, Id, Instant, Model, Pose, from_text, names_from_text
+
+R = TypeVar("R", bound=BaseModel)
+
+
+class Request(BaseModel):
+    """Base of every request: a name that is not known is a mistake worth telling."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class ScanRequest(Request):
+    """What may be said of one scan."""
+
+    filename: Annotated[
+        str | None,
+        Field(max_length=255, description="shown again, and names the file in errors", examples=["hall.pcd"]),
+    ] = None
+    captured_at: Annotated[Instant | None, Field(description="RFC 3339")] = None
+    device_id: DeviceId | None = None
+    pose: Annotated[
+        Pose | None, Field(description="4x4 row-major, map_from_sensor; a start for the registration")
+    ] = None
+
+
+class RegistrationRequest(Request):
+    """Limits of the registration; what is left out keeps its default (paper, Table 1)."""
+
+    max_correspondence_distance: Annotated[float | None, Field(gt=0, le=1, description="metres")] = None
+    min_fitness: Annotated[float | None, Field(ge=0, le=1, description="inlier fraction")] = None
+    max_inlier_rmse: Annotated[float | None, Field(gt=0, le=1, description="metres")] = None
+    max_iterations: Annotated[int | None, Field(ge=1, le=1000, description="of ICP at each gate")] = None
+    min_overlap: Annotated[
+        float | None, Field(ge=0, le=1, description="share of the scan that the map covers")
+    ] = None
+    min_agreement: Annotated[
+        float | None, Field(ge=0, le=1, description="share of the overlap on a common surface")
+    ] = None
+
+
+class MapSettings(Request):
+    """What of a map can be set. Voxel and tile size belong to the model, and so to its card."""
+
+    registration: RegistrationRequest = RegistrationRequest()
+
+
+class MapRequest(Request):
+    """A map of scans that were uploaded before, or come with the request."""
+
+    id: Annotated[Id | None, Field(description="left out: the service chooses one")] = None
+    name: Annotated[str | None, Field(max_length=200, examples=["Lobby, ground floor"])] = None
+    scan_ids: Annotated[tuple[Id, ...], BeforeValidator(names_from_text), Field(max_length=1000)] = ()
+    settings: Annotated[MapSettings, BeforeValidator(from_text)] = MapSettings()
+    model: Annotated[Model | None, Field(description="left out: the service's default")] = None
+    captured_at: Annotated[Instant | None, Field(description="of the files in this request")] = None
+    device_id: Annotated[DeviceId | None, Field(description="of the files in this request")] = None
+
+
+class SurveyRequest(Request):
+    """A visit to compare with a map, of scans that were uploaded before, or come with the request."""
+
+    scan_ids: Annotated[tuple[Id, ...], BeforeValidator(names_from_text), Field(max_length=1000)] = ()
+    captured_at: Annotated[Instant | None, Field(description="left out: the latest of its scans")] = None
+    device_id: DeviceId | None = None
+    model: Annotated[Model | None, Field(description="left out: the model of the map")] = None
+    threshold: Annotated[
+        float | None, Field(ge=0, le=1, description="probability of change; left out: the model's own")
+    ] = None
+
+
+def checked(kind: type[R], fields: dict[str, Any]) -> R:
+    """The request in a body's fields. Raises RequestValidationError, which the API answers as for any other body."""
+    try:
+        return kind.model_validate(fields)
+    except ValidationError as error:
+        errors = [
+            {**entry, "loc": ("body", *entry["loc"])}
+            for entry in error.errors(include_url=False, include_context=False)
+        ]
+        raise RequestValidationError(errors) from error

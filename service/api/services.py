@@ -1,0 +1,43 @@
+"""What the routes work with: opened when the app starts, never at import."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, Protocol, cast
+
+from fastapi import Depends, Request
+
+from service.api.cards import Cards
+from service.catalog.catalog import Catalog
+from service.catalog.steps import JobKind
+from service.settings import Settings
+
+
+class Queue(Protocol):
+    """What the API asks of the job queue (`service.queue.JobQueue`)."""
+
+    def submit(self, job_id: str, kind: JobKind) -> None:
+        """Hand a job to the workers. Raises QueueUnavailable."""
+
+    def dismiss(self, job_id: str, kind: JobKind) -> None:
+        """Stop a job that waits or runs. Raises QueueUnavailable."""
+
+    def ping(self) -> None:
+        """Raises QueueUnavailable."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Services:
+    """One of each, for the life of the app."""
+
+    settings: Settings
+    catalog: Catalog
+    queue: Queue
+    cards: Cards
+
+
+def _services(request: Request) -> Services:
+    return cast("Services", request.app.state.services)
+
+
+Provided = Annotated[Services, Depends(_services)]

@@ -1,0 +1,82 @@
+"""From a request to a job: keep the files, record, submit; and when the queue is down, keep nothing."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+from collections.abc import Callable, Iterator, Sequence
+from datetime import datetime
+
+from service.api.incoming import Upload
+from service.api.services import Services
+from service.catalog.catalog import Catalog
+from service.catalog.records import JobRecord
+from service.errors import Conflict, NotFound, QueueUnavailable, ServiceError
+
+log = logging.getLogger(__name__)
+
+
+@contextlib.contextmanager
+def kept_scans(
+    catalog: Catalog,
+    uploads: Sequence[Upload],
+    scan_ids: Sequence[str],
+    *,
+    device_id: str | None,
+    captured_at: datetime | None,
+) -> Iterator[tuple[str, ...]]:
+    """The ids of the scans of a request: those named, then the files it brought, each once.
+
+    When the block raises, files that were new are forgotten again.
+    """
+    new: list[str] = []
+    ids = list(scan_ids)
+    try:
+        for upload in uploads:
+            scan, is_new = catalog.scans.add(
+                upload.path,
+                filename=upload.filename,
+                format=upload.format,
+                size=upload.size,
+                sha256=upload.sha256,
+                device_id=device_id,
+                captured_at=captured_at,
+            )
+            if is_new:
+                new.append(scan.scan_id)
+            if scan.scan_id not in ids:
+                ids.append(scan.scan_id)
+        yield tuple(ids)
+    except BaseException:
+        for scan_id in new:
+            with contextlib.suppress(Conflict, NotFound):  # another request took it up meanwhile
+                catalog.scans.delete(scan_id)
+        raise
+
+
+def submit(services: Services, job: JobRecord, *, forget: Callable[[], None]) -> None:
+    """Hand a recorded job to the queue. Raises QueueUnavailable after `forget` has taken the record back."""
+    try:
+        services.queue.submit(job.job_id, job.kind)
+    except BaseException:
+        forget()
+        raise
+
+
+def dismiss(services: Services, job_id: str) -> JobRecord:
+    """Dismiss a job for good, then tell the workers. Raises NotFound and Conflict.
+
+    Without a queue the dismissal still stands: a worker asks the catalog before each step and within it.
+    """
+    job = services.catalog.jobs.dismiss(job_id)
+    try:
+        services.queue.dismiss(job.job_id, job.kind)
+    except QueueUnavailable as error:
+        log.warning("job %s is dismissed, but the queue was not told: %s", job_id, error)
+    return job
+
+
+def stop_if_open(services: Services, job_id: str) -> None:
+    """Dismiss a job whose map or survey is going to be deleted, unless it has ended."""
+    with contextlib.suppress(ServiceError):
+        dismiss(services, job_id)

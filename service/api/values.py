@@ -1,0 +1,82 @@
+"""Values that requests carry in more than one place, with their checks."""
+
+from __future__ import annotations
+
+import json
+import re
+from datetime import datetime
+from typing import Annotated, Any
+
+from pydantic import AfterValidator, BeforeValidator, Field, WithJsonSchema
+
+from service.catalog.records import Matrix
+
+RIGID_TOLERANCE = 1e-3  #: of R Rᵀ against the identity; poses written with four decimals pass
+LARGEST_SHIFT = 1e6  #: metres
+
+_RFC3339 = re.compile(r"\d{4}-\d\d-\d\d[Tt ]\d\d:\d\d:\d\d(\.\d+)?([Zz]|[+-]\d\d:\d\d)")
+
+
+def instant(value: Any) -> Any:
+    """An RFC 3339 date and time, zone included: a time without a zone is nobody's."""
+    if isinstance(value, datetime):
+        return value
+    if not isinstance(value, str) or not _RFC3339.fullmatch(value):
+        raise ValueError("give an RFC 3339 date and time with its zone, such as 2026-03-01T12:00:00Z")
+    return datetime.fromisoformat(value.upper())
+
+
+def from_text(value: Any) -> Any:
+    """A form field or query parameter that holds JSON; other values pass."""
+    if not isinstance(value, str):
+        return value
+    try:
+        return json.loads(value)
+    except ValueError as error:
+        raise ValueError(f"this is not JSON: {error}") from error
+
+
+def names_from_text(value: Any) -> Any:
+    """A list of names in a form: repeated fields, a JSON list, or names with commas between."""
+    if not isinstance(value, str):
+        return value
+    if value.lstrip().startswith("["):
+        return from_text(value)
+    return [name.strip() for name in value.split(",") if name.strip()]
+
+
+def rigid(matrix: Matrix) -> Matrix:
+    """A rotation and a shift. Raises ValueError with the number that is off."""
+    if any(abs(a - b) > 1e-6 for a, b in zip(matrix[3], (0, 0, 0, 1), strict=True)):
+        raise ValueError("the last row of a pose is 0, 0, 0, 1; the matrix is row-major")
+    rows = [row[:3] for row in matrix[:3]]
+    for i, a in enumerate(rows):
+        for j, b in enumerate(rows):
+            dot = sum(x * y for x, y in zip(a, b, strict=True))
+            if abs(dot - (i == j)) > RIGID_TOLERANCE:
+                raise ValueError(f"the pose is not rigid: rows {i} and {j} have the dot product {dot:.4f}")
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = rows
+    if xx * (yy * zz - yz * zy) - xy * (yx * zz - yz * zx) + xz * (yx * zy - yy * zx) < 0:
+        raise ValueError("the pose mirrors: its determinant is negative")
+    if any(abs(row[3]) > LARGEST_SHIFT for row in matrix[:3]):
+        raise ValueError(f"the pose shifts by more than {LARGEST_SHIFT:.0f} m")
+    return matrix
+
+
+_MATRIX_SCHEMA = {
+    "type": "array",
+    "minItems": 4,
+    "maxItems": 4,
+    "items": {"type": "array", "minItems": 4, "maxItems": 4, "items": {"type": "number"}},
+    "example": [[1, 0, 0, 2.5], [0, 1, 0, 0], [0, 0, 1, 0.35], [0, 0, 0, 1]],
+}
+
+Id = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{1,64}$", examples=["lobby"])]
+Instant = Annotated[
+    datetime,
+    BeforeValidator(instant),
+    WithJsonSchema({"type": "string", "format": "date-time", "example": "2026-03-01T12:00:00Z"}),
+]
+Pose = Annotated[Matrix, BeforeValidator(from_text), AfterValidator(rigid), WithJsonSchema(_MATRIX_SCHEMA)]
+DeviceId = Annotated[str, Field(min_length=1, max_length=128, examples=["robot-7"])]
+Model = Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]+/[A-Za-z0-9_.-]+$", examples=["spicd-net/1"])]
