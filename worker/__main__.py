@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import importlib
-import logging
 import sys
 
 from redis import Redis
@@ -14,10 +13,10 @@ from service.catalog.jobs import Jobs
 from service.catalog.records import Problem
 from service.catalog.steps import ALLOWED_FUNCTIONS
 from service.lifetime import end_with_parent
+from service.logs import set_up_logging
 from service.settings import Settings
 from worker.rq_workers import GeometryWorker, InferenceWorker, OnDeath
 
-LOG_FORMAT = "%(asctime)s %(levelname)-7s %(name)s[%(process)d] %(message)s"
 # Imported before the first fork, so that no step pays for it. Importing is all that may happen here: native work in
 # the parent starts threads, and a fork among threads that hold locks deadlocks.
 WARM_MODULES = {"geometry": ("open3d", "torch", "worker.jobs"), "inference": ("torch", "worker.jobs")}
@@ -46,14 +45,6 @@ def main(arguments: list[str] | None = None) -> int:
         grace_s=options.grace,
     ).work()
     return 0
-
-
-def set_up_logging(level: str) -> None:
-    """One line an event on stderr; rq, which narrates its maintenance every few seconds, from warnings on."""
-    logging.basicConfig(level=level.upper(), format=LOG_FORMAT)
-    logging.getLogger("rq").setLevel(logging.WARNING)
-    for name in ("rq.worker", "rq.job", "rq.queue", "rq.registry"):
-        logging.getLogger(name).setLevel(logging.DEBUG if level == "debug" else logging.WARNING)
 
 
 def _recorder(settings: Settings) -> OnDeath:

@@ -14,7 +14,7 @@ from pathlib import Path
 from redis import Redis
 
 from service.lifetime import end_with_parent
-from worker.__main__ import set_up_logging
+from service.logs import set_up_logging
 from worker.errors import RegistrationFailed
 from worker.rq_workers import GeometryWorker, InferenceWorker
 

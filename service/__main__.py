@@ -1,0 +1,5 @@
+"""`python -m service` is `spicd`."""
+
+from service.cli import main
+
+main()

@@ -1,0 +1,67 @@
+"""`spicd`: its commands, its global options, and how it says that something went wrong."""
+
+from __future__ import annotations
+
+import sys
+from typing import Annotated
+
+import typer
+
+from service.cli import jobs, maps, scans, surveys, up
+from service.cli.terminal import Terminal
+from service.client import DEFAULT_URL, ClientError
+from service.embedded_redis import LaunchFailed
+
+_GLOBAL_FLAGS = ("--json",)
+_GLOBAL_OPTIONS = ("--url",)
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run one command; ends the process with status 0, 1 where it failed, 2 where it was called wrongly."""
+    words = _hoisted(sys.argv[1:] if arguments is None else arguments)
+    try:
+        _commands()(args=words, prog_name="spicd")
+    except (ClientError, LaunchFailed) as error:
+        Terminal(url="", as_json=False).err.print(str(error), style="bold red", highlight=False, markup=False)
+        raise SystemExit(1) from None
+
+
+def _commands() -> typer.Typer:
+    commands = typer.Typer(
+        name="spicd",
+        no_args_is_help=True,
+        add_completion=False,
+        pretty_exceptions_enable=False,
+        help="Says what changed in a building: LiDAR scans in, changed tiles out.",
+    )
+    commands.callback()(_options)
+    for part in (up, scans, maps, surveys, jobs):
+        part.register(commands)
+    return commands
+
+
+def _options(
+    ctx: typer.Context,
+    url: Annotated[str, typer.Option(envvar="SPICD_URL", help="Address of the service.")] = DEFAULT_URL,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Results as JSON on stdout, nothing else there.")
+    ] = False,
+) -> None:
+    ctx.obj = Terminal(url=url, as_json=as_json)
+
+
+def _hoisted(words: list[str]) -> list[str]:
+    """The same words with the global options first, so that `spicd maps list --json` works as well."""
+    first: list[str] = []
+    rest: list[str] = []
+    waiting = iter(words)
+    for word in waiting:
+        if word == "--":
+            rest += [word, *waiting]
+        elif word in _GLOBAL_FLAGS or word.startswith(tuple(f"{name}=" for name in _GLOBAL_OPTIONS)):
+            first.append(word)
+        elif word in _GLOBAL_OPTIONS:
+            first += [word, *([value] if (value := next(waiting, None)) is not None else [])]
+        else:
+            rest.append(word)
+    return first + rest

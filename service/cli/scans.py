@@ -1,0 +1,53 @@
+"""`spicd scans`: files on their way in."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.table import Table
+
+from service.cli.terminal import Terminal, read_pose
+from service.client import ClientError, Document
+
+Captured = Annotated[str | None, typer.Option("--captured-at", help="RFC 3339, with its zone.")]
+Device = Annotated[str | None, typer.Option("--device-id", help="Which robot or scanner.")]
+
+
+def register(commands: typer.Typer) -> None:
+    """Add `scans` to the command line."""
+    group = typer.Typer(no_args_is_help=True, help="Upload scans.")
+    group.command("add")(add)
+    commands.add_typer(group, name="scans")
+
+
+def add(
+    ctx: typer.Context,
+    files: Annotated[list[Path], typer.Argument(exists=True, dir_okay=False, help="PLY or PCD.")],
+    device_id: Device = None,
+    captured_at: Captured = None,
+    pose: Annotated[
+        Path | None, typer.Option(help="File with a 4x4 map_from_sensor pose, JSON or sixteen numbers.")
+    ] = None,
+) -> None:
+    """Upload scans; the same bytes from the same device are one scan."""
+    terminal: Terminal = ctx.obj
+    if pose is not None and len(files) > 1:
+        raise ClientError("one pose belongs to one scan; add the files one at a time")
+    start = read_pose(pose) if pose else None
+    with terminal.client() as client:
+        found = [
+            terminal.upload(client, file, device_id=device_id, captured_at=captured_at, pose=start)
+            for file in files
+        ]
+    terminal.show(found, lambda: _table(found))
+
+
+def _table(scans: list[Document]) -> Table:
+    table = Table("scan", "file", "bytes", "sha256")
+    for scan in scans:
+        table.add_row(
+            scan["scan_id"], scan.get("filename", ""), f"{scan.get('size', 0):,}", scan["sha256"][:16]
+        )
+    return table

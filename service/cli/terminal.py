@@ -1,0 +1,119 @@
+"""What every command has: the client, a place for results, and one for everything else.
+
+Results go to stdout, as a table or, with `--json`, as JSON and nothing else. Progress, notes and errors go to stderr.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import typer
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    DownloadColumn,
+    Progress,
+    TaskProgressColumn,
+    TextColumn,
+    TimeElapsedColumn,
+)
+
+from service.client import Client, ClientError, Document, JobFailed, OnProgress, Pose
+
+_ID = re.compile(r"[A-Za-z0-9_-]{1,64}")
+
+
+@dataclass(kw_only=True, slots=True)
+class Terminal:
+    """The global options and the two consoles; a command finds it as `ctx.obj`."""
+
+    url: str
+    as_json: bool
+    out: Console = field(default_factory=lambda: Console(soft_wrap=not sys.stdout.isatty()))
+    err: Console = field(default_factory=lambda: Console(stderr=True))
+
+    @contextmanager
+    def client(self) -> Iterator[Client]:
+        """The API, for the length of a command."""
+        with Client(self.url) as client:
+            yield client
+
+    def show(self, document: Any, table: Callable[[], Any]) -> None:
+        """Print a result: the document itself with `--json`, otherwise what `table` makes of it."""
+        if self.as_json:
+            sys.stdout.write(json.dumps(document, indent=2, ensure_ascii=False) + "\n")
+        else:
+            self.out.print(table())
+
+    def note(self, text: str) -> None:
+        """Tell a person something that is no result."""
+        self.err.print(text, highlight=False)
+
+    def upload(self, client: Client, path: Path, **about: Any) -> Document:
+        """Send one file under a progress bar."""
+        with self._bar(TextColumn("[bold]{task.description}"), BarColumn(), DownloadColumn()) as bar:
+            task = bar.add_task(path.name, total=path.stat().st_size)
+            return client.upload_scan(path, on_sent=lambda sent, _: bar.update(task, completed=sent), **about)
+
+    def scan_ids(self, client: Client, names: Sequence[str], **about: Any) -> list[str]:
+        """Ids of the named scans: files are uploaded first, other names are taken as ids."""
+        wrong = [name for name in names if not Path(name).is_file() and not _ID.fullmatch(name)]
+        if wrong:
+            raise ClientError(f"{', '.join(wrong)}: no such file, and not the id of a scan")
+        return [
+            self.upload(client, Path(name), **about)["scan_id"] if Path(name).is_file() else name
+            for name in names
+        ]
+
+    def wait(self, client: Client, job_id: str) -> Document:
+        """Follow a job under a progress bar; Ctrl-C stops the looking, not the job."""
+        columns = (
+            TextColumn("[bold]{task.description}"),
+            BarColumn(),
+            TaskProgressColumn(),
+            TimeElapsedColumn(),
+        )
+        try:
+            with self._bar(*columns) as bar:
+                return client.wait(job_id, _advance(bar))
+        except JobFailed:
+            raise
+        except KeyboardInterrupt:
+            self.note(f"job {job_id} goes on; `spicd jobs {job_id}` shows it, `--cancel` stops it")
+            raise typer.Exit(130) from None
+
+    def _bar(self, *columns: Any) -> Progress:
+        hidden = self.as_json or not self.err.is_terminal
+        return Progress(*columns, console=self.err, transient=True, disable=hidden)
+
+
+def _advance(bar: Progress) -> OnProgress:
+    task = bar.add_task("waiting", total=100)
+
+    def advance(job: Document) -> None:
+        bar.update(task, description=job.get("message") or job["status"], completed=job.get("progress") or 0)
+
+    return advance
+
+
+def read_pose(path: Path) -> Pose:
+    """A pose from a file: a JSON 4x4, or sixteen numbers with spaces, row by row. Raises `ClientError`."""
+    try:
+        text = path.read_text()
+        if text.lstrip().startswith("["):
+            rows = [[float(number) for number in row] for row in json.loads(text)]
+        else:
+            numbers = [float(word) for word in text.replace(",", " ").split()]
+            rows = [numbers[start : start + 4] for start in range(0, len(numbers), 4)]
+    except (OSError, ValueError, TypeError) as error:
+        raise ClientError(f"{path}: the pose cannot be read: {error}") from error
+    if len(rows) != 4 or any(len(row) != 4 for row in rows):
+        raise ClientError(f"{path}: a pose is four rows of four numbers, row-major, metres")
+    return rows

@@ -1,0 +1,90 @@
+"""`spicd up`: the whole service as one command."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from pydantic import ValidationError
+from rich.table import Table
+
+from service.cli.terminal import Terminal
+from service.embedded_redis import LaunchFailed
+from service.settings import Settings
+
+
+def register(commands: typer.Typer) -> None:
+    """Add `up` to the command line."""
+    commands.command("up")(up)
+
+
+def up(
+    ctx: typer.Context,
+    host: Annotated[str | None, typer.Option(help="Address to listen on.")] = None,
+    port: Annotated[int | None, typer.Option(help="Port; 0 takes a free one.")] = None,
+    data_dir: Annotated[Path | None, typer.Option("--data-dir", help="Everything that is kept.")] = None,
+    geometry_workers: Annotated[int | None, typer.Option("--geometry-workers")] = None,
+    inference_workers: Annotated[int | None, typer.Option("--inference-workers")] = None,
+    ready_file: Annotated[
+        Path | None, typer.Option("--ready-file", help="JSON with address and process ids, once it is up.")
+    ] = None,
+    end_with_parent: Annotated[
+        bool, typer.Option("--end-with-parent", help="End when the starting process ends, however it does.")
+    ] = False,
+) -> None:
+    """Start API, workers and Redis, and stay; Ctrl-C ends all. What is left out comes from SPICD_* or defaults."""
+    # The API and uvicorn are of no use to the other commands, which start the faster without.
+    from service.launcher import Running  # noqa: PLC0415
+    from service.launcher import up as launch  # noqa: PLC0415
+    from service.lifetime import end_with_parent as end  # noqa: PLC0415
+    from service.logs import set_up_logging  # noqa: PLC0415
+
+    if end_with_parent:
+        end(os.getppid())
+    terminal: Terminal = ctx.obj
+    given = {
+        "host": host,
+        "port": port,
+        "data_dir": data_dir,
+        "geometry_workers": geometry_workers,
+        "inference_workers": inference_workers,
+    }
+    settings = _settings({name: value for name, value in given.items() if value is not None})
+    set_up_logging(settings.log_level)
+
+    def ready(running: Running) -> None:
+        if ready_file is not None:
+            running.write(ready_file)
+        if terminal.as_json:
+            sys.stdout.write(
+                json.dumps(running.document()) + "\n"
+            )  # one line: who reads it does not wait for more
+            sys.stdout.flush()
+        else:
+            terminal.out.print(_table(running.document()))
+
+    launch(settings, on_ready=ready)
+
+
+def _settings(given: dict[str, Any]) -> Settings:
+    try:
+        return Settings(**given)
+    except ValidationError as error:
+        first = error.errors()[0]
+        name = "SPICD_" + "_".join(str(part) for part in first["loc"]).upper().removeprefix("SPICD_")
+        raise LaunchFailed(f"{name}: {first['msg']} (it is {first['input']!r})") from error
+
+
+def _table(running: dict[str, Any]) -> Table:
+    table = Table(title="SPICD is up", show_header=False, caption="Ctrl-C ends it")
+    queues = [worker["queue"] for worker in running["workers"]]
+    workers = ", ".join(f"{queues.count(queue)} {queue}" for queue in dict.fromkeys(queues))
+    table.add_row("service", running["url"])
+    table.add_row("documentation", running["docs"])
+    table.add_row("data folder", running["data_dir"])
+    table.add_row("workers", workers or "none: jobs wait")
+    return table

@@ -1,0 +1,284 @@
+"""The API from Python: what the command line, the demo and a robot's script use.
+
+ClientError                  base; `str()` is one sentence
+├── Unreachable              nothing answers at the address
+├── RequestRefused           the service said no; `problem` is its RFC 9457 document
+└── JobFailed                the job ended `failed` or `dismissed`; `job` is its document
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, BinaryIO, Self
+from urllib.parse import quote
+
+import httpx
+
+DEFAULT_URL = "http://127.0.0.1:8000"
+PIECE = 1 << 20  #: bytes sent at a time
+
+Document = dict[str, Any]  #: a JSON object as the API gave it
+Pose = Sequence[Sequence[float]]  #: (4, 4) row-major, map_from_sensor
+OnSent = Callable[[int, int], None]  #: bytes sent, bytes in all
+OnProgress = Callable[[Document], None]  #: the job's document after each look
+
+
+class ClientError(Exception):
+    """Base of what a call can end in."""
+
+
+class Unreachable(ClientError):
+    """Nothing answers, or the connection broke."""
+
+
+class RequestRefused(ClientError):
+    """The service answered with a problem."""
+
+    def __init__(self, problem: Document, status: int) -> None:
+        super().__init__(sentence(problem))
+        self.problem = problem
+        self.status = status
+
+
+class JobFailed(ClientError):
+    """The job ended without a result."""
+
+    def __init__(self, job: Document) -> None:
+        super().__init__(sentence(job.get("problem") or {"title": f"the job was {job.get('status')}"}))
+        self.job = job
+
+
+def sentence(problem: Document) -> str:
+    """A problem document as one sentence."""
+    title, detail = problem.get("title"), problem.get("detail")
+    return f"{title}: {detail}" if title and detail else str(detail or title or "the service gave no reason")
+
+
+class Client:
+    """Calls of the API; a context manager. Every method raises `ClientError` and returns the API's JSON."""
+
+    def __init__(self, url: str = DEFAULT_URL, *, transport: httpx.BaseTransport | None = None) -> None:
+        self.url = url.rstrip("/")
+        timeout = httpx.Timeout(60, connect=5)
+        self._http = httpx.Client(base_url=self.url, timeout=timeout, transport=transport)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Give the connections back."""
+        self._http.close()
+
+    # scans
+
+    def upload_scan(
+        self,
+        source: Path | bytes,
+        *,
+        filename: str | None = None,
+        device_id: str | None = None,
+        captured_at: str | None = None,
+        pose: Pose | None = None,
+        on_sent: OnSent | None = None,
+    ) -> Document:
+        """Send one PLY or PCD, streamed from disk; `captured_at` is RFC 3339, `pose` map_from_sensor in metres."""
+        query = {
+            "filename": filename or (source.name if isinstance(source, Path) else "scan"),
+            "device_id": device_id,
+            "captured_at": captured_at,
+            "pose": None if pose is None else json.dumps([list(row) for row in pose]),
+        }
+        size = source.stat().st_size if isinstance(source, Path) else len(source)
+        headers = {"Content-Type": "application/octet-stream", "Content-Length": str(size)}
+        content = _pieces(source, size, on_sent)
+        return self._json("POST", "/scans", params=_given(query), headers=headers, content=content)
+
+    # maps
+
+    def create_map(
+        self,
+        scan_ids: Sequence[str],
+        *,
+        map_id: str | None = None,
+        name: str | None = None,
+        model: str | None = None,
+        settings: Document | None = None,
+    ) -> Document:
+        """Build a reference map; returns `map_id` and `job_id`."""
+        body = {"id": map_id, "name": name, "model": model, "settings": settings, "scan_ids": list(scan_ids)}
+        return self._json("POST", "/maps", json=_given(body))
+
+    def maps(self) -> list[Document]:
+        """Every map."""
+        return self._all("/maps", "maps")
+
+    def map(self, map_id: str) -> Document:
+        """One map with its scans."""
+        return self._json("GET", f"/maps/{_quoted(map_id)}")
+
+    def delete_map(self, map_id: str) -> None:
+        """Remove a map with its surveys."""
+        self._send("DELETE", f"/maps/{_quoted(map_id)}")
+
+    # surveys
+
+    def submit_survey(
+        self,
+        map_id: str,
+        scan_ids: Sequence[str],
+        *,
+        captured_at: str | None = None,
+        device_id: str | None = None,
+        model: str | None = None,
+        threshold: float | None = None,
+    ) -> Document:
+        """Compare scans with a map; returns `survey_id` and `job_id`."""
+        body = {
+            "scan_ids": list(scan_ids),
+            "captured_at": captured_at,
+            "device_id": device_id,
+            "model": model,
+            "threshold": threshold,
+        }
+        return self._json("POST", f"/maps/{_quoted(map_id)}/surveys", json=_given(body))
+
+    def surveys(self, map_id: str) -> list[Document]:
+        """Every survey of a map."""
+        return self._all(f"/maps/{_quoted(map_id)}/surveys", "surveys")
+
+    def survey(self, survey_id: str) -> Document:
+        """One survey with its scans and counts."""
+        return self._json("GET", f"/surveys/{_quoted(survey_id)}")
+
+    def tiles(self, survey_id: str) -> Document:
+        """Every tile of a survey, a FeatureCollection."""
+        return self._json("GET", f"/surveys/{_quoted(survey_id)}/tiles")
+
+    def changes(self, map_id: str, **filters: Any) -> Document:
+        """One page of changed tiles; filters are those of the API: `survey bbox datetime min_score limit`."""
+        return self._json("GET", f"/maps/{_quoted(map_id)}/changes", params=_given(filters))
+
+    # jobs and models
+
+    def jobs(self) -> list[Document]:
+        """Every job, newest first."""
+        return self._all("/jobs", "jobs")
+
+    def job(self, job_id: str) -> Document:
+        """One job."""
+        return self._json("GET", f"/jobs/{_quoted(job_id)}")
+
+    def dismiss(self, job_id: str) -> Document:
+        """Stop a job for good."""
+        return self._json("DELETE", f"/jobs/{_quoted(job_id)}")
+
+    def wait(self, job_id: str, on_progress: OnProgress | None = None, *, every_s: float = 0.3) -> Document:
+        """The job's document once it was successful; raises `JobFailed` when it ended otherwise."""
+        while True:
+            job = self.job(job_id)
+            if on_progress is not None:
+                on_progress(job)
+            if job["status"] == "successful":
+                return job
+            if job["status"] in ("failed", "dismissed"):
+                raise JobFailed(job)
+            time.sleep(every_s)
+
+    def models(self) -> list[Document]:
+        """The cards of the models."""
+        return self._all("/models", "models")
+
+    # files
+
+    def download(self, path: str, to: Path) -> Path:
+        """Write an answer such as `/surveys/{id}/cloud.ply` to a file, streamed; nothing is left when it fails."""
+        aside = to.with_name(to.name + ".part")
+        try:
+            with self._http.stream("GET", path) as answer:
+                if not answer.is_success:
+                    answer.read()
+                    raise _refused(answer)
+                with aside.open("wb") as file:
+                    file.writelines(answer.iter_bytes())
+            return aside.replace(to)
+        except httpx.TransportError as error:
+            raise self._unreachable(error) from error
+        finally:
+            aside.unlink(missing_ok=True)
+
+    def _send(self, method: str, path: str, **request: Any) -> httpx.Response:
+        try:
+            answer = self._http.request(method, path, **request)
+        except httpx.TransportError as error:
+            raise self._unreachable(error) from error
+        if not answer.is_success:
+            raise _refused(answer)
+        return answer
+
+    def _json(self, method: str, path: str, **request: Any) -> Document:
+        document = self._send(method, path, **request).json()
+        if not isinstance(document, dict):
+            raise ClientError(f"{self.url}{path} did not answer with a JSON object; is this the service?")
+        return document
+
+    def _all(self, path: str, name: str) -> list[Document]:
+        """The list `name` of a document and of the pages that follow it."""
+        found: list[Document] = []
+        following: str | None = path
+        while following:
+            page = self._json("GET", following)
+            found += page[name]
+            links = page.get("links", [])
+            following = next((link["href"] for link in links if link.get("rel") == "next"), None)
+        return found
+
+    def _unreachable(self, error: httpx.TransportError) -> Unreachable:
+        if isinstance(error, httpx.ConnectError | httpx.ConnectTimeout):
+            return Unreachable(
+                f"nothing answers at {self.url}; start the service with `spicd up`, or name its address with --url"
+            )
+        return Unreachable(f"the connection to {self.url} broke ({type(error).__name__}); try again")
+
+
+def _given(values: dict[str, Any]) -> dict[str, Any]:
+    """What was given, without what was left out."""
+    return {name: value for name, value in values.items() if value is not None}
+
+
+def _quoted(name: str) -> str:
+    """An id as one segment of a path, whatever was typed."""
+    return quote(name, safe="")
+
+
+def _pieces(source: Path | bytes, size: int, on_sent: OnSent | None) -> Iterator[bytes]:
+    if isinstance(source, bytes):
+        yield source
+        return
+    sent = 0
+    with source.open("rb") as file:
+        for piece in _read(file):
+            yield piece
+            sent += len(piece)
+            if on_sent is not None:
+                on_sent(sent, size)
+
+
+def _read(file: BinaryIO) -> Iterator[bytes]:
+    while piece := file.read(PIECE):
+        yield piece
+
+
+def _refused(answer: httpx.Response) -> RequestRefused:
+    try:
+        problem = answer.json()
+    except ValueError:
+        problem = None
+    if not isinstance(problem, dict):
+        problem = {"title": f"the service answered {answer.status_code}", "detail": answer.text[:200]}
+    return RequestRefused(problem, answer.status_code)

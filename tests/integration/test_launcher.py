@@ -1,0 +1,190 @@
+"""`spicd up` as a process: what it starts, and that nothing of it is left."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+
+from service.children import WorkerPool
+from service.embedded_redis import LaunchFailed
+from service.launcher import environment_of, up
+from service.settings import Settings
+
+LAUNCH = Path(__file__).parent / "launch.py"
+ROOT = Path(__file__).parents[2]
+
+# A worker that ends by itself, and one that does not listen to SIGTERM.
+SHORT = "import sys; sys.exit(3)"
+STUBBORN = """
+import signal, sys, time
+signal.signal(signal.SIGTERM, signal.SIG_IGN)
+open(sys.argv[1], "w").close()
+time.sleep(60)
+"""
+
+
+def until(condition: Callable[[], object], seconds: float = 30) -> None:
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "waited too long"
+        time.sleep(0.02)
+
+
+def stat(pid: int) -> list[str]:
+    """State, parent and the rest of /proc/PID/stat; a process that is gone is a zombie of nobody."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    except (FileNotFoundError, ProcessLookupError):
+        return ["Z", "0"]
+
+
+def alive(pid: int) -> bool:
+    return stat(pid)[0] != "Z"
+
+
+def descendants(pid: int) -> list[int]:
+    every = [int(path.name) for path in Path("/proc").iterdir() if path.name.isdigit()]
+    children = [other for other in every if stat(other)[1] == str(pid)]
+    return children + [deeper for child in children for deeper in descendants(child)]
+
+
+class Launched:
+    """A running `spicd up`, everything it said, and every process it started."""
+
+    def __init__(self, folder: Path, workers: int) -> None:
+        ready = folder / "ready.json"
+        command = [sys.executable, str(LAUNCH), str(folder / "data"), str(ready), str(workers)]
+        environment = {key: value for key, value in os.environ.items() if not key.startswith("SPICD_")}
+        self.process = subprocess.Popen(command, cwd=ROOT, env={**environment, "PYTHONPATH": str(ROOT)})
+        until(lambda: ready.exists() or self.process.poll() is not None)
+        self.ready: dict[str, Any] = json.loads(ready.read_text())
+
+    def pids(self) -> list[int]:
+        return descendants(self.process.pid)
+
+
+@pytest.fixture
+def launched(tmp_path: Path) -> Iterator[Launched]:
+    launched = Launched(tmp_path, workers=1)
+    yield launched
+    launched.process.kill()
+    launched.process.wait()
+
+
+linux = pytest.mark.skipif(
+    sys.platform != "linux", reason="reads /proc, and the kernel's parent-death signal"
+)
+
+
+@linux
+def test_the_ready_file_names_what_answers(launched: Launched) -> None:
+    assert httpx.get(launched.ready["url"] + "/settings").json() == {
+        "redis_url": launched.ready["redis_url"],
+        "database_url": launched.ready["database_url"],
+        "blob_url": launched.ready["blob_url"],
+    }
+    assert launched.ready["pid"] == launched.process.pid
+    assert [worker["queue"] for worker in launched.ready["workers"]] == ["geometry", "inference"]
+    assert launched.ready["redis_pid"] in launched.pids()
+
+
+@linux
+@pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGINT])
+def test_asked_to_end_it_leaves_no_process_behind(launched: Launched, how: signal.Signals) -> None:
+    pids = launched.pids()
+    assert len(pids) >= 3
+    launched.process.send_signal(how)
+    assert launched.process.wait(20) == 0
+    assert not [pid for pid in pids if alive(pid)]
+
+
+@linux
+def test_killed_it_leaves_no_process_behind(launched: Launched) -> None:
+    pids = launched.pids()
+    launched.process.kill()
+    until(lambda: not [pid for pid in pids if alive(pid)])
+
+
+def test_a_second_one_on_the_same_folder_is_refused_in_one_line(launched: Launched, tmp_path: Path) -> None:
+    settings = Settings(data_dir=tmp_path / "data", port=0, geometry_workers=0, inference_workers=0)
+    with pytest.raises(LaunchFailed, match=f"process {launched.process.pid}"):
+        up(settings, on_ready=lambda running: None)
+
+
+def test_a_dead_redis_is_started_again_with_what_it_held(launched: Launched) -> None:
+    from redis import Redis
+
+    client = Redis.from_url(launched.ready["redis_url"])
+    client.set("kept", "yes")
+    os.kill(launched.ready["redis_pid"], signal.SIGTERM)
+    until(lambda: not alive(launched.ready["redis_pid"]))
+
+    def kept() -> bool:
+        try:
+            return client.get("kept") == b"yes"
+        except Exception:
+            return False
+
+    until(kept)
+    client.close()
+
+
+def test_a_taken_port_is_told_before_anything_starts(tmp_path: Path) -> None:
+    import socket
+
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        settings = Settings(data_dir=tmp_path / "data", port=taken.getsockname()[1], geometry_workers=0)
+        with pytest.raises(LaunchFailed, match="--port"):
+            up(settings, on_ready=lambda running: None)
+    assert not (tmp_path / "data").exists()
+
+
+def test_missing_worker_packages_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None if name == "open3d" else object())
+    with pytest.raises(LaunchFailed, match=r"open3d not installed.*spicd\[worker\]"):
+        up(Settings(data_dir=tmp_path), on_ready=lambda running: None)
+
+
+def test_the_workers_environment_spells_every_setting_out(tmp_path: Path) -> None:
+    environment = environment_of(Settings(data_dir=tmp_path, redis_url="unix:///r", job_timeout_s=7))
+    assert environment["SPICD_REDIS_URL"] == "unix:///r"
+    assert environment["SPICD_DATA_DIR"] == str(tmp_path)
+    assert environment["SPICD_JOB_TIMEOUT_S"] == "7"
+    assert "SPICD_BLOB_URL" not in environment
+
+
+def test_a_dying_worker_is_started_again_and_each_time_later() -> None:
+    pool = WorkerPool(geometry=1, inference=0, environment=os.environ, program=(sys.executable, "-c", SHORT))
+    place = pool.workers[0]
+    pids = set()
+    with pool:
+        for wait in (1, 3, 7):
+            pids.add(place.pid)
+            until(lambda: place.process is not None and place.process.poll() == 3)
+            before = time.monotonic()
+            pool.check()
+            assert place.process is None
+            assert place.due >= before + wait
+            place.due = 0.0  # as if the wait were over
+            pool.check()
+    assert len(pids) == 3
+
+
+def test_a_worker_that_ignores_the_request_is_killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("service.children.GRACE_S", -1.9)
+    program = (sys.executable, "-c", STUBBORN, str(tmp_path / "up"))
+    with WorkerPool(geometry=1, inference=0, environment=os.environ, program=program) as pool:
+        until((tmp_path / "up").exists)
+        process = pool.workers[0].process
+    assert process is not None
+    assert process.returncode == -signal.SIGKILL

@@ -1,0 +1,293 @@
+"""`spicd` against a service that is a table of answers; every request it made is looked at."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+
+from service.cli import main, terminal
+from service.client import Client
+
+Answer = Callable[[httpx.Request], httpx.Response]
+
+SCAN = {"scan_id": "scan-1", "filename": "hall.pcd", "size": 9, "sha256": "ab" * 32}
+MAP = {
+    "map_id": "lobby",
+    "name": "Lobby",
+    "status": "ready",
+    "model": "spicd-net/1",
+    "counts": {"tiles": 172},
+    "scans": [{"scan_id": "scan-1", "accepted": True, "fitness": 0.91, "rmse": 0.0213, "reason": None}],
+    "created": "2026-03-01T12:00:00Z",
+}
+SURVEY = {
+    "survey_id": "survey-1",
+    "map_id": "lobby",
+    "status": "ready",
+    "captured_at": "2026-03-02T12:00:00Z",
+    "counts": {"changed": 9, "unchanged": 150},
+    "scans": [
+        {"scan_id": "scan-2", "accepted": False, "fitness": 0.1, "rmse": None, "reason": "too little overlap"}
+    ],
+}
+CHANGES = {
+    "type": "FeatureCollection",
+    "numberMatched": 7,
+    "features": [
+        {
+            "properties": {
+                "tile_id": "tile_001_002_003",
+                "state": "changed",
+                "score": 0.934,
+                "center": [1.5, 2.25, 0.5],
+                "survey_id": "survey-1",
+            }
+        }
+    ],
+}
+
+
+def job(status: str, progress: int, **more: Any) -> dict[str, Any]:
+    return {
+        "jobID": "job-1",
+        "processID": "map",
+        "status": status,
+        "progress": progress,
+        "message": "tiling",
+        **more,
+    }
+
+
+class Service:
+    """Answers by method and path; a list is given out one at a time, its last for good."""
+
+    def __init__(self) -> None:
+        self.answers: dict[str, list[tuple[int, Any]]] = {}
+        self.requests: list[httpx.Request] = []
+
+    def on(self, call: str, *documents: Any, status: int = 200) -> None:
+        self.answers[call] = [(status, document) for document in documents]
+
+    def __call__(self, request: httpx.Request) -> httpx.Response:
+        request.read()
+        self.requests.append(request)
+        waiting = self.answers[f"{request.method} {request.url.path}"]
+        status, document = waiting.pop(0) if len(waiting) > 1 else waiting[0]
+        return httpx.Response(status, json=document) if document is not None else httpx.Response(status)
+
+    def body(self, number: int = -1) -> Any:
+        return json.loads(self.requests[number].content)
+
+
+@pytest.fixture
+def service(monkeypatch: pytest.MonkeyPatch) -> Service:
+    service = Service()
+    monkeypatch.delenv("SPICD_URL", raising=False)
+    monkeypatch.setenv("COLUMNS", "200")
+    monkeypatch.setattr(terminal, "Client", lambda url: Client(url, transport=httpx.MockTransport(service)))
+    monkeypatch.setattr("service.client.time.sleep", lambda seconds: None)
+    return service
+
+
+def spicd(*words: str) -> int:
+    with pytest.raises(SystemExit) as ended:
+        main(list(words))
+    return int(ended.value.code or 0)
+
+
+def test_scans_add_streams_the_file_with_what_is_said_of_it(
+    service: Service, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    service.on("POST /scans", SCAN, status=201)
+    (tmp_path / "hall.pcd").write_bytes(b"# .PCD v.7")
+    (tmp_path / "pose.txt").write_text("1 0 0 2.5\n0 1 0 0\n0 0 1 0\n0 0 0 1\n")
+    pose = ["--pose", str(tmp_path / "pose.txt")]
+    assert spicd("scans", "add", str(tmp_path / "hall.pcd"), "--device-id", "robot-7", *pose) == 0
+    request = service.requests[0]
+    assert request.content == b"# .PCD v.7"
+    assert request.headers["content-length"] == "10"
+    assert "transfer-encoding" not in request.headers
+    query = dict(request.url.params)
+    assert json.loads(query.pop("pose")) == [[1, 0, 0, 2.5], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+    assert query == {"filename": "hall.pcd", "device_id": "robot-7"}
+    assert "scan-1" in capsys.readouterr().out
+
+
+def test_maps_create_uploads_files_and_takes_other_names_as_ids(
+    service: Service, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    service.on("POST /scans", SCAN, status=201)
+    service.on("POST /maps", {"map_id": "lobby", "job_id": "job-1"}, status=202)
+    (tmp_path / "hall.ply").write_bytes(b"ply\n")
+    assert spicd("maps", "create", "scan-0", str(tmp_path / "hall.ply"), "--id", "lobby", "--json") == 0
+    assert service.body() == {"id": "lobby", "scan_ids": ["scan-0", "scan-1"]}
+    assert json.loads(capsys.readouterr().out) == {"map_id": "lobby", "job_id": "job-1"}
+
+
+def test_a_name_that_is_neither_file_nor_id_sends_nothing(
+    service: Service, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert spicd("maps", "create", "scan-0", "hall.pcd") == 1
+    assert service.requests == []
+    assert "hall.pcd" in capsys.readouterr().err
+
+
+def test_waiting_follows_the_job_and_shows_the_map(
+    service: Service, capsys: pytest.CaptureFixture[str]
+) -> None:
+    service.on("POST /maps", {"map_id": "lobby", "job_id": "job-1"}, status=202)
+    service.on("GET /jobs/job-1", job("accepted", 0), job("running", 40), job("successful", 100))
+    service.on("GET /maps/lobby", MAP)
+    assert spicd("maps", "create", "scan-0", "--wait") == 0
+    assert [request.url.path for request in service.requests].count("/jobs/job-1") == 3
+    shown = capsys.readouterr().out
+    assert "tiles 172" in shown
+    assert "0.91" in shown
+    assert "0.021" in shown
+
+
+def test_a_failed_job_is_one_sentence_on_stderr_and_status_1(
+    service: Service, capsys: pytest.CaptureFixture[str]
+) -> None:
+    problem = {"title": "No scan could be registered", "detail": "scan 1: fitness 0.10 is below 0.30"}
+    service.on("POST /maps/lobby/surveys", {"survey_id": "survey-1", "job_id": "job-1"}, status=202)
+    service.on("GET /jobs/job-1", job("failed", 30, problem=problem))
+    assert spicd("surveys", "submit", "lobby", "scan-2", "--wait", "--threshold", "0.4", "--json") == 1
+    assert json.loads(service.requests[0].content) == {"scan_ids": ["scan-2"], "threshold": 0.4}
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert said.err.split() == f"{problem['title']}: {problem['detail']}".split()
+
+
+def test_surveys_submit_waits_and_shows_what_was_left_out(
+    service: Service, capsys: pytest.CaptureFixture[str]
+) -> None:
+    service.on("POST /maps/lobby/surveys", {"survey_id": "survey-1", "job_id": "job-1"}, status=202)
+    service.on("GET /jobs/job-1", job("successful", 100))
+    service.on("GET /surveys/survey-1", SURVEY)
+    assert spicd("surveys", "submit", "lobby", "scan-2", "--wait") == 0
+    shown = capsys.readouterr().out
+    assert "changed 9, unchanged 150" in shown
+    assert "too little overlap" in shown
+    assert "http://127.0.0.1:8000/surveys/survey-1/cloud.ply" in shown
+
+
+def test_changes_passes_its_filters_on_and_lists_the_tiles(
+    service: Service, capsys: pytest.CaptureFixture[str]
+) -> None:
+    service.on("GET /maps/lobby/changes", CHANGES)
+    assert (
+        spicd(
+            "changes",
+            "lobby",
+            "--bbox",
+            "0,0,3,3",
+            "--min-score",
+            "0.5",
+            "--datetime",
+            "2026-03-01T00:00:00Z/..",
+        )
+        == 0
+    )
+    assert dict(service.requests[0].url.params) == {
+        "bbox": "0,0,3,3",
+        "min_score": "0.5",
+        "datetime": "2026-03-01T00:00:00Z/..",
+        "limit": "100",
+    }
+    shown = capsys.readouterr().out
+    assert "tile_001_002_003" in shown
+    assert "1.50, 2.25, 0.50" in shown
+    assert "1 of 7" in shown
+
+
+@pytest.mark.parametrize("place", ["before", "after"])
+def test_json_is_the_document_and_nothing_else_wherever_the_option_stands(
+    service: Service, capsys: pytest.CaptureFixture[str], place: str
+) -> None:
+    service.on("GET /maps/lobby/changes", CHANGES)
+    words = ["changes", "lobby"]
+    assert spicd(*(["--json", *words] if place == "before" else [*words, "--json"])) == 0
+    assert json.loads(capsys.readouterr().out) == CHANGES
+
+
+def test_maps_list_follows_the_pages(service: Service, capsys: pytest.CaptureFixture[str]) -> None:
+    following = {"rel": "next", "href": "/maps?cursor=abc"}
+    service.on(
+        "GET /maps", {"maps": [MAP], "links": [following]}, {"maps": [{**MAP, "map_id": "hall"}], "links": []}
+    )
+    assert spicd("maps", "list", "--json") == 0
+    assert [one["map_id"] for one in json.loads(capsys.readouterr().out)] == ["lobby", "hall"]
+    assert dict(service.requests[1].url.params) == {"cursor": "abc"}
+
+
+def test_jobs_cancel_dismisses(service: Service, capsys: pytest.CaptureFixture[str]) -> None:
+    service.on("DELETE /jobs/job-1", job("dismissed", 30))
+    assert spicd("jobs", "job-1", "--cancel") == 0
+    assert "dismissed" in capsys.readouterr().out
+
+
+def test_jobs_lists_and_models_lists(service: Service, capsys: pytest.CaptureFixture[str]) -> None:
+    service.on("GET /jobs", {"jobs": [job("running", 40)], "links": []})
+    service.on("GET /models", {"models": [{"name": "spicd-net", "version": "1", "threshold": 0.5}]})
+    assert spicd("jobs") == 0
+    assert "40 %" in capsys.readouterr().out
+    assert spicd("models") == 0
+    assert "spicd-net/1" in capsys.readouterr().out
+
+
+def test_maps_delete_says_so(service: Service, capsys: pytest.CaptureFixture[str]) -> None:
+    service.on("DELETE /maps/lobby", None, status=204)
+    assert spicd("maps", "delete", "lobby") == 0
+    assert "lobby" in capsys.readouterr().out
+
+
+def test_a_problem_is_told_with_its_title_and_detail(
+    service: Service, capsys: pytest.CaptureFixture[str]
+) -> None:
+    problem = {
+        "type": "urn:spicd:problem:not_found",
+        "title": "There is no such thing",
+        "detail": "no map 'attic'",
+    }
+    service.on("GET /maps/attic", problem, status=404)
+    assert spicd("maps", "show", "attic") == 1
+    assert capsys.readouterr().err.strip() == "There is no such thing: no map 'attic'"
+
+
+def test_a_service_that_is_not_there_is_told_with_what_to_do(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def refuse(request: httpx.Request) -> httpx.Response:
+        raise httpx.ConnectError("refused")
+
+    monkeypatch.setattr(terminal, "Client", lambda url: Client(url, transport=httpx.MockTransport(refuse)))
+    monkeypatch.setenv("COLUMNS", "200")
+    assert spicd("--url", "http://there:1", "jobs") == 1
+    said = capsys.readouterr().err
+    assert "http://there:1" in said
+    assert "spicd up" in said
+
+
+def test_a_download_that_breaks_leaves_no_file(tmp_path: Path) -> None:
+    def broken(request: httpx.Request) -> httpx.Response:
+        return httpx.Response(404, json={"title": "There is no such thing", "detail": "no survey"})
+
+    with (
+        Client("http://there", transport=httpx.MockTransport(broken)) as client,
+        pytest.raises(Exception, match="no survey"),
+    ):
+        client.download("/surveys/x/cloud.ply", tmp_path / "cloud.ply")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_download_is_written_whole(tmp_path: Path) -> None:
+    transport = httpx.MockTransport(lambda request: httpx.Response(200, content=b"ply\n" * 1000))
+    with Client("http://there", transport=transport) as client:
+        path = client.download("/surveys/x/cloud.ply", tmp_path / "cloud.ply")
+    assert path.read_bytes() == b"ply\n" * 1000
