@@ -23,6 +23,7 @@ from worker.pipeline.records import RawCloud, colors_of
 from worker.pipeline.values import Colors, Matrix4, Points
 
 LONGEST_SITE = 500.0  #: metres along one axis; an indoor scan that is longer is not in metres
+SHORTEST_ROOM = 3.0  #: metres; what another unit would make of the extent has to be a room
 FARTHEST = 10_000.0  #: metres from the origin; there a float32 steps by 1 mm
 _SAMPLE = 100_000  #: points that the extent is measured on
 
@@ -98,8 +99,8 @@ def check_units(positions: NDArray[np.floating[Any]]) -> None:
     if extent <= LONGEST_SITE:
         return
     found = f"it spans {extent:.6g} along one axis, over {LONGEST_SITE:g} m"
-    for unit, factor, shortest in (("millimetres", 0.001, 2.0), ("centimetres", 0.01, 2.0)):
-        if shortest <= extent * factor <= LONGEST_SITE:
+    for unit, factor in (("millimetres", 0.001), ("centimetres", 0.01)):  # the commoner one first
+        if SHORTEST_ROOM <= extent * factor <= LONGEST_SITE:
             raise ScanUnits(f"{found}: looks like {unit}; multiply by {factor} to get metres")
     raise ScanUnits(f"{found}: not a scan of a building in metres; check its units")
 

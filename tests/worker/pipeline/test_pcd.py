@@ -172,6 +172,12 @@ def test_a_header_that_cannot_be_right_is_refused_with_its_numbers(read, header,
     assert str(caught.value).startswith("scan.pcd: ")
 
 
+@pytest.mark.parametrize("line", ["POINTS 4", "NORMALS 1"])
+def test_a_header_line_that_is_unknown_or_stands_twice_is_refused(read, line):
+    with pytest.raises(ScanError, match=f"'{line.split()[0]}' is unknown or stands twice"):
+        read(pcd().replace(b"DATA", f"{line}\nDATA".encode()))
+
+
 def test_more_points_than_the_limit_are_too_large(read):
     with pytest.raises(ScanTooLarge, match="declares 4 points, the limit is 3"):
         read(pcd(), max_points=3)

@@ -43,9 +43,15 @@ def test_both_byte_orders_and_line_ends_give_the_same_points(read, encoding, ord
 
 
 def test_lists_before_the_points_are_walked_by_their_own_lengths(read):
-    face, strip = struct.pack(">B3iH", 3, 0, 1, 2, 7), struct.pack(">B5iH", 5, 0, 1, 2, 3, 1, 7)
-    lines = ("element face 3", "property list uchar int vertex_indices", "property ushort part", *VERTEX)
-    empty = struct.pack(">BH", 0, 7)
+    face, strip = struct.pack(">fH3iH", 1, 3, 0, 1, 2, 7), struct.pack(">fH5iH", 1, 5, 0, 1, 2, 3, 1, 7)
+    head = (
+        "element face 3",
+        "property float area",
+        "property list ushort int vertex_indices",
+        "property ushort part",
+    )
+    lines = (*head, *VERTEX)
+    empty = struct.pack(">fHH", 1, 0, 7)
     body = face + strip + empty + CORNERS.astype(">f4").tobytes()
     assert_array_equal(read(ply(*lines, encoding=BIG, body=body)).points, CORNERS)
 
@@ -61,6 +67,13 @@ def test_a_negative_list_length_is_refused(read):
     lines = ("element face 1", "property list char char v", *VERTEX)
     with pytest.raises(ScanError, match="a list of -1 values"):
         read(ply(*lines, body=b"\xff" + CORNERS.tobytes()))
+
+
+def test_more_rows_of_lists_before_the_points_than_can_be_walked_are_refused(read, monkeypatch):
+    monkeypatch.setattr("worker.pipeline.ply._LIST_ROWS_LIMIT", 2)
+    lines = ("element face 3", "property list uchar int v", *VERTEX)
+    with pytest.raises(ScanError, match="'face' has 3 rows of lists before the points, the limit is 2"):
+        read(ply(*lines, body=bytes(3) + CORNERS.tobytes()))
 
 
 def test_elements_around_the_points_are_passed_over_in_ascii(read):

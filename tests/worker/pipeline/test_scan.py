@@ -161,6 +161,12 @@ def test_a_hall_of_300_m_is_read_and_one_of_600_m_is_not(tmp_path):
         read_scan(tmp_path / "hall.pcd")
 
 
+def test_a_room_of_20_m_in_centimetres_is_refused_with_that_hint(tmp_path):
+    write_pcd(tmp_path / "cm.pcd", hall(12) * 100)
+    with pytest.raises(ScanUnits, match=r"^cm.pcd: .*looks like centimetres; multiply by 0.01 "):
+        read_scan(tmp_path / "cm.pcd")
+
+
 def test_a_few_stray_returns_do_not_make_a_room_look_like_millimetres(tmp_path):
     points = hall(12)
     points[::500] += [2_000, 0, 0]
