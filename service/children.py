@@ -91,6 +91,7 @@ class WorkerPool:
             [*self._program, worker.queue, *options],
             env=self._environment,
             stdin=subprocess.DEVNULL,
+            stdout=sys.stderr.fileno(),  # stdout is the launcher's answer, and libraries print
             start_new_session=True,  # Ctrl-C is for the launcher, which ends its workers in order
         )
         worker.started = time.monotonic()

@@ -144,8 +144,13 @@ class EmbeddedRedis:
         """The descriptor of the locked file, which the server inherits."""
         if self._lock is not None:
             return self._lock
-        self._folder.mkdir(parents=True, exist_ok=True, mode=0o700)
-        lock = os.open(self._folder / "lock", os.O_RDWR | os.O_CREAT, 0o600)
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+            lock = os.open(self._folder / "lock", os.O_RDWR | os.O_CREAT, 0o600)
+        except OSError as error:
+            raise LaunchFailed(
+                f"the data folder {self._folder.parent} cannot be used ({error.strerror}); name another with SPICD_DATA_DIR"
+            ) from error
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:

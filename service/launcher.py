@@ -41,11 +41,9 @@ class Running:
     url: str  #: of the API
     docs: str  #: of its interactive documentation
     data_dir: str
-    redis_url: str
-    database_url: str
-    blob_url: str
     pid: int  #: of this process, which holds the API
-    redis_pid: int  #: 0 where Redis was there before
+    redis_url: str | None  #: of the embedded Redis; another's address may hold a password and is not told
+    redis_pid: int | None
     workers: list[dict[str, Any]]  #: `queue` and `pid` of each
 
     def document(self) -> dict[str, Any]:
@@ -191,13 +189,12 @@ def _resolve(settings: Settings, redis: EmbeddedRedis | None, listening: socket.
 
 def _migrate(settings: Settings) -> None:
     """Once, before the API and the workers look at the tables."""
-    database = Database(settings.resolved_database_url())
     try:
+        database = Database(settings.resolved_database_url())
         database.upgrade()
-    except Exception as error:
-        raise LaunchFailed(f"the database cannot be opened: {error}") from error
-    finally:
         database.close()
+    except Exception as error:  # whatever the driver raises
+        raise LaunchFailed(f"the database cannot be opened: {' '.join(str(error).split())}") from error
 
 
 def _running(settings: Settings, redis: EmbeddedRedis | None, pool: WorkerPool) -> Running:
@@ -208,10 +205,8 @@ def _running(settings: Settings, redis: EmbeddedRedis | None, pool: WorkerPool) 
         url=url,
         docs=f"{url}/docs",
         data_dir=str(settings.data_dir),
-        redis_url=settings.redis_url or "",
-        database_url=settings.resolved_database_url(),
-        blob_url=settings.resolved_blob_url(),
         pid=os.getpid(),
-        redis_pid=redis.pid if redis else 0,
+        redis_url=redis.url if redis else None,
+        redis_pid=redis.pid if redis else None,
         workers=[{"queue": worker.queue, "pid": worker.pid} for worker in pool.workers],
     )

@@ -19,6 +19,6 @@ def set_up_logging(level: str) -> None:
             "rq.registry",
             "alembic",
             "httpx",
-            "uvicorn.access",
+            "uvicorn",
         ):
             logging.getLogger(name).setLevel(logging.WARNING)

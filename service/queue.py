@@ -1,7 +1,7 @@
 """The way of a job to its workers: the only file of the service that knows rq.
 
-The queue carries names and ids and nothing else. It is never the record: what a job is and how far it got stands in
-the catalog, and a queue that was lost can be filled again from there.
+The queue carries names and ids and nothing else, and is never the record: what a job is and how far it got stands in
+the catalog.
 """
 
 from __future__ import annotations

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import logging
 import sys
 
 from redis import Redis
@@ -16,6 +17,8 @@ from service.lifetime import end_with_parent
 from service.logs import set_up_logging
 from service.settings import Settings
 from worker.rq_workers import GeometryWorker, InferenceWorker, OnDeath
+
+log = logging.getLogger("worker")
 
 # Imported before the first fork, so that no step pays for it. Importing is all that may happen here: native work in
 # the parent starts threads, and a fork among threads that hold locks deadlocks.
@@ -36,6 +39,7 @@ def main(arguments: list[str] | None = None) -> int:
         return 2
     for module in WARM_MODULES[options.queue]:
         importlib.import_module(module)
+    log.info("%s worker is ready", options.queue)
     kind = GeometryWorker if options.queue == "geometry" else InferenceWorker
     kind(
         options.queue,

@@ -10,7 +10,7 @@ from rich.table import Table
 from rich.text import Text
 
 from service.cli.maps import facts
-from service.cli.terminal import Terminal
+from service.cli.terminal import Terminal, columns
 from service.client import ClientError, Document, sentence
 
 _STYLES = {"successful": "green", "failed": "red", "dismissed": "yellow", "running": "cyan"}
@@ -53,7 +53,7 @@ def models(ctx: typer.Context) -> None:
 
 
 def _table(found: list[Document]) -> Table:
-    table = Table("job", "kind", "status", "progress", "message", "created")
+    table = columns("job", "kind", "status", "progress", "message", "created")
     for job in found:
         status = Text(job["status"], style=_STYLES.get(job["status"], ""))
         progress = f"{job.get('progress') or 0} %"
@@ -85,7 +85,7 @@ def _whole(job: Document) -> Group:
 
 
 def _model_table(cards: list[Document]) -> Table:
-    table = Table("model", "detector", "threshold", "summary")
+    table = columns("model", "detector", "threshold", "summary")
     for card in cards:
         name = f"{card.get('name')}/{card.get('version')}"
         table.add_row(

@@ -22,7 +22,7 @@ def main(arguments: list[str] | None = None) -> None:
     try:
         _commands()(args=words, prog_name="spicd")
     except (ClientError, LaunchFailed) as error:
-        Terminal(url="", as_json=False).err.print(str(error), style="bold red", highlight=False, markup=False)
+        Terminal(url="", as_json=False).fail(str(error))
         raise SystemExit(1) from None
 
 

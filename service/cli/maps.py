@@ -9,7 +9,7 @@ from rich.console import Group
 from rich.table import Table
 
 from service.cli.scans import Captured, Device
-from service.cli.terminal import Terminal
+from service.cli.terminal import Terminal, columns
 from service.client import Document
 
 Scans = Annotated[list[str], typer.Argument(help="Files, which are uploaded, or ids of scans.")]
@@ -98,7 +98,7 @@ def counts(document: Document) -> str:
 
 def scan_table(scans: list[Document]) -> Table:
     """How each scan was registered."""
-    table = Table("scan", "accepted", "fitness", "rmse (m)", "reason")
+    table = columns("scan", "accepted", "fitness", "rmse (m)", "reason")
     for scan in scans:
         accepted = {True: "[green]yes", False: "[red]no"}.get(scan.get("accepted"), "")  # type: ignore[arg-type]
         table.add_row(
@@ -116,8 +116,16 @@ def number(value: float | None, digits: int) -> str:
     return "" if value is None else f"{value:.{digits}f}"
 
 
+def _corners(bounds: Document | None) -> str:
+    return (
+        " to ".join(", ".join(f"{value:.2f}" for value in bounds[end]) for end in ("min", "max"))
+        if bounds
+        else ""
+    )
+
+
 def _table(maps: list[Document]) -> Table:
-    table = Table("map", "name", "status", "scans", "counts", "created")
+    table = columns("map", "name", "status", "scans", "counts", "created")
     for one in maps:
         scans = str(len(one.get("scans", [])))
         table.add_row(one["map_id"], one.get("name"), one["status"], scans, counts(one), one.get("created"))
@@ -132,7 +140,7 @@ def _whole(found: Document) -> Group:
             ("status", found["status"]),
             ("model", found.get("model")),
             ("counts", counts(found)),
-            ("bounds (m)", found.get("bounds")),
+            ("bounds (m)", _corners(found.get("bounds"))),
         ]
     )
     return Group(about, scan_table(found.get("scans", [])))

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
-from service.cli.terminal import Terminal, read_pose
+from service.cli.terminal import Terminal, columns, read_pose
 from service.client import ClientError, Document
 
 Captured = Annotated[str | None, typer.Option("--captured-at", help="RFC 3339, with its zone.")]
@@ -45,7 +45,7 @@ def add(
 
 
 def _table(scans: list[Document]) -> Table:
-    table = Table("scan", "file", "bytes", "sha256")
+    table = columns("scan", "file", "bytes", "sha256")
     for scan in scans:
         table.add_row(
             scan["scan_id"], scan.get("filename", ""), f"{scan.get('size', 0):,}", scan["sha256"][:16]

@@ -10,7 +10,7 @@ from rich.table import Table
 
 from service.cli.maps import Model, Scans, Wait, accepted_line, counts, facts, number, scan_table
 from service.cli.scans import Captured, Device
-from service.cli.terminal import Terminal
+from service.cli.terminal import Terminal, columns
 from service.client import Document
 
 
@@ -83,7 +83,7 @@ def changes(
 
 
 def _table(surveys: list[Document]) -> Table:
-    table = Table("survey", "status", "captured", "scans", "counts")
+    table = columns("survey", "status", "captured", "scans", "counts")
     for one in surveys:
         scans = str(len(one.get("scans", [])))
         table.add_row(one["survey_id"], one["status"], one.get("captured_at"), scans, counts(one))
@@ -111,7 +111,7 @@ def _whole(found: Document, url: str) -> Group:
 
 
 def _change_table(found: Document) -> Group:
-    table = Table("tile", "state", "score", "center (m)", "survey", "captured")
+    table = columns("tile", "state", "score", "center (m)", "survey", "captured")
     for feature in found["features"]:
         tile = feature["properties"]
         center = ", ".join(f"{value:.2f}" for value in tile["center"])

@@ -24,9 +24,11 @@ from rich.progress import (
     TextColumn,
     TimeElapsedColumn,
 )
+from rich.table import Table
 
 from service.client import Client, ClientError, Document, JobFailed, OnProgress, Pose
 
+PIPE_WIDTH = 160  #: characters; where nobody says how wide the place is that stdout goes to
 _ID = re.compile(r"[A-Za-z0-9_-]{1,64}")
 
 
@@ -36,7 +38,7 @@ class Terminal:
 
     url: str
     as_json: bool
-    out: Console = field(default_factory=lambda: Console(soft_wrap=not sys.stdout.isatty()))
+    out: Console = field(default_factory=lambda: Console(width=None if sys.stdout.isatty() else PIPE_WIDTH))
     err: Console = field(default_factory=lambda: Console(stderr=True))
 
     @contextmanager
@@ -54,7 +56,11 @@ class Terminal:
 
     def note(self, text: str) -> None:
         """Tell a person something that is no result."""
-        self.err.print(text, highlight=False)
+        self.err.print(text, highlight=False, soft_wrap=True)
+
+    def fail(self, text: str) -> None:
+        """Say in one line what went wrong."""
+        self.err.print(text, style="bold red", highlight=False, markup=False, soft_wrap=True)
 
     def upload(self, client: Client, path: Path, **about: Any) -> Document:
         """Send one file under a progress bar."""
@@ -92,6 +98,14 @@ class Terminal:
     def _bar(self, *columns: Any) -> Progress:
         hidden = self.as_json or not self.err.is_terminal
         return Progress(*columns, console=self.err, transient=True, disable=hidden)
+
+
+def columns(*names: str) -> Table:
+    """An empty table that folds what is too long for it: an id that is cut is of no use."""
+    table = Table()
+    for name in names:
+        table.add_column(name, overflow="fold")
+    return table
 
 
 def _advance(bar: Progress) -> OnProgress:

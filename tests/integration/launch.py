@@ -17,11 +17,7 @@ def create_app(settings: Settings) -> FastAPI:
 
     @app.get("/settings")
     def shown() -> dict[str, str | None]:
-        return {
-            "redis_url": settings.redis_url,
-            "database_url": settings.database_url,
-            "blob_url": settings.blob_url,
-        }
+        return {"redis_url": settings.redis_url, "data_dir": str(settings.data_dir)}
 
     return app
 

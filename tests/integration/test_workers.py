@@ -15,9 +15,15 @@ from redis import Redis
 from rq import Queue
 from rq.serializers import JSONSerializer
 
+from service.catalog import tables
+from service.catalog.catalog import open_catalog
+from service.catalog.jobs import new_job
 from service.catalog.steps import Step
 from service.embedded_redis import EmbeddedRedis
+from service.launcher import environment_of
 from service.queue import JobQueue
+from service.settings import Settings
+from worker.rq_workers import GeometryWorker
 
 STANDIN = Path(__file__).parent / "standin.py"
 ROOT = Path(__file__).parents[2]
@@ -50,9 +56,9 @@ class Bench:
         self.workers.append(subprocess.Popen(command, env=environment, cwd=ROOT, start_new_session=True))
         return self.workers[-1]
 
-    def submit(self, job_id: str, *steps: tuple[str, str]) -> JobQueue:
+    def submit(self, job_id: str, *steps: tuple[str, str], timeout_s: int = 60) -> JobQueue:
         table = tuple(Step(name=name, function=f"standin.{name}", queue=queue) for name, queue in steps)
-        queue = JobQueue(self.redis_url, steps={"map": table})
+        queue = JobQueue(self.redis_url, timeout_s=timeout_s, steps={"map": table})
         queue.submit(job_id, "map")
         return queue
 
@@ -164,6 +170,62 @@ def test_a_worker_told_to_stop_ends_its_step_after_the_grace(bench: Bench, kind:
     assert worker.wait(15) == 0
     assert not running(pid)
     assert "worker_stopped" in " ".join(bench.wait_for("died m1"))
+
+
+def test_a_stop_that_comes_when_the_step_is_over_kills_nobody(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    killed: list[int] = []
+    monkeypatch.setattr(os, "killpg", lambda group, number: killed.append(group))
+    worker = GeometryWorker(
+        "geometry", bench.redis, allowed=frozenset(), on_death=lambda *told: None, grace_s=1
+    )
+    worker.kill_horse()
+    assert killed == []
+
+
+@pytest.mark.parametrize("kind", ["geometry", "inference"])
+def test_a_step_that_takes_too_long_is_ended_and_says_so(bench: Bench, kind: str) -> None:
+    worker = bench.worker(kind)
+    bench.submit("m1", ("busy", kind), timeout_s=1)
+    bench.wait_for("died m1 timed_out")
+    bench.submit("m2", ("first", kind))
+    bench.wait_for("first m2")
+    assert worker.poll() is None
+
+
+def test_the_real_worker_writes_what_it_refused_into_the_catalog(bench: Bench) -> None:
+    settings = Settings(
+        data_dir=bench.folder / "data", redis_url=bench.redis_url, blob_url=None, database_url=None
+    )
+    catalog = open_catalog(settings)
+    with catalog.database.write() as session:
+        job = new_job("map", "lobby")
+        job_id, instant = job.id, job.created
+        session.add(
+            tables.Map(
+                id="lobby",
+                status="building",
+                model="spicd-net/1",
+                settings={},
+                counts={},
+                job_id=job_id,
+                created=instant,
+                updated=instant,
+            )
+        )
+        session.flush()
+        session.add(job)
+    Queue("geometry", connection=bench.redis, serializer=JSONSerializer).enqueue("os.system", job_id)
+    command = [sys.executable, "-m", "worker", "geometry"]
+    bench.workers.append(subprocess.Popen(command, cwd=ROOT, env=environment_of(settings)))
+    until(lambda: catalog.jobs.get(job_id).status == "failed", 60)
+    problem = catalog.jobs.get(job_id).problem
+    assert problem is not None
+    assert problem.code == "function_refused"
+    assert "os.system" in problem.detail
+    assert catalog.maps.get("lobby").status == "failed"
+    catalog.close()
 
 
 def test_an_idle_worker_told_to_stop_ends_at_once(bench: Bench) -> None:
