@@ -177,6 +177,7 @@ def test_a_stop_that_comes_when_the_step_is_over_kills_nobody(
 ) -> None:
     killed: list[int] = []
     monkeypatch.setattr(os, "killpg", lambda group, number: killed.append(group))
+    monkeypatch.setattr(os, "kill", lambda pid, number: killed.append(pid))
     worker = GeometryWorker(
         "geometry", bench.redis, allowed=frozenset(), on_death=lambda *told: None, grace_s=1
     )
