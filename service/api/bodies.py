@@ -63,7 +63,7 @@ async def received(
             form.finish()
             yield Body(fields=form.fields, uploads=tuple(form.uploads))
         else:
-            file = kept.enter_context(Incoming(folder, filename or "scan"))
+            file = kept.enter_context(Incoming(folder, filename or ""))
             await _pour(request, file.write, limit=limit)
             yield Body(uploads=(await run_in_threadpool(file.finish),))
     finally:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 import sys
+from collections.abc import Callable
 from datetime import datetime
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import APIRouter, Path, Query
 from fastapi import Request as HttpRequest
-from pydantic import BeforeValidator, Field, WithJsonSchema
+from pydantic import AfterValidator, Field
 
 from service.api import features
 from service.api.documents import Link, link
@@ -28,12 +29,10 @@ router = APIRouter(tags=["changes"])
 Span = tuple[datetime | None, datetime | None]  #: first and last instant, None where open
 
 
-def bbox(value: Any) -> Any:
-    """Four numbers (x and y) or six (x, y and z): the minimum corner, then the maximum."""
-    if not isinstance(value, str):
-        return value
+def bounds_of(bbox: str) -> Bounds:
+    """Four numbers (x and y) or six (x, y and z): the minimum corner, then the maximum. Raises ValueError."""
     try:
-        numbers = [float(part) for part in value.split(",")]
+        numbers = [float(part) for part in bbox.split(",")]
     except ValueError:
         numbers = []
     if len(numbers) not in (4, 6) or not all(math.isfinite(number) for number in numbers):
@@ -47,15 +46,16 @@ def bbox(value: Any) -> Any:
     return Bounds(min=(low[0], low[1], low[2]), max=(high[0], high[1], high[2]))
 
 
-def span(value: Any) -> Any:
-    """An instant, or an interval with `..` (or nothing) for an open end (OGC API - Features, `datetime`)."""
-    if not isinstance(value, str):
-        return value
-    parts = value.split("/")
+def span_of(interval: str) -> Span:
+    """An instant, or an interval with `..` (or nothing) for an open end (OGC API - Features, `datetime`).
+
+    Raises ValueError.
+    """
+    parts = interval.split("/")
     if len(parts) > 2:
         raise ValueError("give an instant or an interval start/end")
     if len(parts) == 1:
-        return (instant(value),) * 2
+        return (instant(interval),) * 2
     since, until = (None if part in ("", "..") else instant(part) for part in parts)
     if since is None and until is None:
         raise ValueError("an interval has at least one end; leave datetime out to take all")
@@ -64,8 +64,14 @@ def span(value: Any) -> Any:
     return since, until
 
 
-_BBOX = {"type": "string", "example": "0,0,7.5,4.5"}
-_DATETIME = {"type": "string", "example": "2026-03-01T00:00:00Z/.."}
+def sound(read: Callable[[str], object]) -> AfterValidator:
+    """A text that `read` can read; it stays a text, for a query parameter of many parts is taken for a list."""
+
+    def check(text: str) -> str:
+        read(text)
+        return text
+
+    return AfterValidator(check)
 
 
 class ChangesRequest(Request):
@@ -73,16 +79,15 @@ class ChangesRequest(Request):
 
     survey: Annotated[Id | None, Field(description="of this survey only")] = None
     bbox: Annotated[
-        Bounds | None,
-        BeforeValidator(bbox),
-        WithJsonSchema(_BBOX),
-        Field(description="map frame, metres; tiles whose box meets it"),
+        Annotated[str, sound(bounds_of)] | None,
+        Field(description="map frame, metres; tiles whose box meets it", examples=["0,0,7.5,4.5"]),
     ] = None
     datetime: Annotated[
-        Span | None,
-        BeforeValidator(span),
-        WithJsonSchema(_DATETIME),
-        Field(description="of the visit: RFC 3339 instant, or interval with `..` for an open end"),
+        Annotated[str, sound(span_of)] | None,
+        Field(
+            description="of the visit: RFC 3339 instant, or interval with `..` for an open end",
+            examples=["2026-03-01T00:00:00Z/.."],
+        ),
     ] = None
     min_score: Annotated[float | None, Field(ge=0, le=1, description="probability of change")] = None
     limit: Annotated[int, Field(ge=1, le=10000, description="most features in one answer")] = 100
@@ -114,12 +119,12 @@ def get_changes(
     catalog.maps.ready(map_id)
     if asked.survey is not None and catalog.surveys.ready(asked.survey).map_id != map_id:
         raise NotFound(f"survey {asked.survey!r} is not of map {map_id!r}")
-    since, until = asked.datetime or (None, None)
+    since, until = (None, None) if asked.datetime is None else span_of(asked.datetime)
     page = catalog.changes.page(
         ChangeFilter(
             map_id=map_id,
             survey_id=asked.survey,
-            bounds=asked.bbox,
+            bounds=None if asked.bbox is None else bounds_of(asked.bbox),
             since=since,
             until=until,
             min_score=asked.min_score,

@@ -34,8 +34,8 @@ class Incoming:
     """A file being written. Used as a context: what was not moved away by its end is removed."""
 
     def __init__(self, folder: Path, filename: str) -> None:
-        """`folder` exists; `filename` is the client's, and is not used as a path."""
-        self.filename = filename
+        """`folder` exists; `filename` is the client's, is cut to one short line, and is not used as a path."""
+        self.filename = _shown(filename)
         self._path = folder / f"{uuid4().hex}.part"
         self._file = self._path.open("wb")
         self._sha256 = hashlib.sha256()
@@ -80,3 +80,7 @@ class Incoming:
     ) -> None:
         self._file.close()
         self._path.unlink(missing_ok=True)
+
+
+def _shown(filename: str) -> str:
+    return "".join(letter for letter in filename if letter.isprintable())[:255] or "scan"

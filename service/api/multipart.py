@@ -89,7 +89,7 @@ class Form:
             wanted = " or ".join(repr(name) for name in sorted(self._file_fields))
             raise BadRequest(f"a file in the field {self._name!r}; files go in {wanted}")
         filename = options.get(b"filename", b"scan").decode("utf-8", "replace")
-        self._file = self._kept.enter_context(Incoming(self._folder, filename or "scan"))
+        self._file = self._kept.enter_context(Incoming(self._folder, filename))
 
     def _part_data(self, data: bytes, start: int, end: int) -> None:
         if self._file is not None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import json
 from collections.abc import Callable, Sequence
-from datetime import datetime
 from typing import Annotated, Any, TypeVar
 
 from fastapi import Request as HttpRequest
@@ -13,6 +12,7 @@ from pydantic import Field
 
 from service.api.documents import Document, Link, link
 from service.api.requests import Request
+from service.api.values import instant
 from service.catalog.changes import ChangePosition
 from service.catalog.clock import rfc3339
 from service.catalog.page import Page, Position
@@ -35,7 +35,7 @@ class PageRequest(Request):
         """Where to go on. Raises BadRequest."""
         if self.cursor is None:
             return None
-        created, key = _decoded(self.cursor, datetime.fromisoformat, str)
+        created, key = _decoded(self.cursor, instant, str)
         return created, key
 
 
@@ -63,7 +63,7 @@ def change_position(cursor: str | None) -> ChangePosition | None:
     """Where to go on. Raises BadRequest."""
     if cursor is None:
         return None
-    captured_at, survey_id, score, tile_id = _decoded(cursor, datetime.fromisoformat, str, float.fromhex, str)
+    captured_at, survey_id, score, tile_id = _decoded(cursor, instant, str, float.fromhex, str)
     return ChangePosition(captured_at=captured_at, survey_id=survey_id, score=score, tile_id=tile_id)
 
 

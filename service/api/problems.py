@@ -131,7 +131,14 @@ def _invalid_value(entry: dict[str, Any]) -> dict[str, Any]:
         shown = shown[:200] + "..."
     place = ".".join(str(part) for part in entry.get("loc", ()))
     detail = str(entry.get("msg", "")).removeprefix("Value error, ")
-    return {"place": place, "value": shown, "detail": detail}
+    if isinstance(shown, str):
+        shown = _encodable(shown)
+    return {"place": _encodable(place), "value": shown, "detail": _encodable(detail)}
+
+
+def _encodable(text: str) -> str:
+    """A lone surrogate, which JSON can spell and UTF-8 cannot, becomes a question mark."""
+    return text.encode("utf-8", "replace").decode()
 
 
 def _http_error(request: Request, error: Exception) -> Response:

@@ -7,7 +7,7 @@ from typing import Annotated, Any, TypeVar
 from fastapi.exceptions import RequestValidationError
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
-from service.api.values import DeviceId, Id, Instant, Model, Pose, from_text, names_from_text
+from service.api.values import DeviceId, Id, Instant, Model, Pose, Text, from_text, names_from_text
 
 R = TypeVar("R", bound=BaseModel)
 
@@ -18,13 +18,22 @@ class Request(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
-class ScanRequest(Request):
-    """What may be said of one scan."""
+class ScanQuery(Request):
+    """What may be said of one scan beside its raw bytes; `ScanRequest` is the same, checked further."""
 
     filename: Annotated[
         str | None,
         Field(max_length=255, description="shown again, and names the file in errors", examples=["hall.pcd"]),
     ] = None
+    captured_at: Annotated[Instant | None, Field(description="RFC 3339")] = None
+    device_id: DeviceId | None = None
+    pose: Annotated[str | None, Field(description="JSON: 4x4 row-major, map_from_sensor")] = None
+
+
+class ScanRequest(Request):
+    """What may be said of one scan."""
+
+    filename: Annotated[Text | None, Field(max_length=255, examples=["hall.pcd"])] = None
     captured_at: Annotated[Instant | None, Field(description="RFC 3339")] = None
     device_id: DeviceId | None = None
     pose: Annotated[
@@ -57,7 +66,7 @@ class MapRequest(Request):
     """A map of scans that were uploaded before, or come with the request."""
 
     id: Annotated[Id | None, Field(description="left out: the service chooses one")] = None
-    name: Annotated[str | None, Field(max_length=200, examples=["Lobby, ground floor"])] = None
+    name: Annotated[Text | None, Field(max_length=200, examples=["Lobby, ground floor"])] = None
     scan_ids: Annotated[tuple[Id, ...], BeforeValidator(names_from_text), Field(max_length=1000)] = ()
     settings: Annotated[MapSettings, BeforeValidator(from_text)] = MapSettings()
     model: Annotated[Model | None, Field(description="left out: the service's default")] = None
@@ -77,13 +86,13 @@ class SurveyRequest(Request):
     ] = None
 
 
-def checked(kind: type[R], fields: dict[str, Any]) -> R:
-    """The request in a body's fields. Raises RequestValidationError, which the API answers as for any other body."""
+def checked(kind: type[R], fields: dict[str, Any], *, place: str = "body") -> R:
+    """The request in these fields. Raises RequestValidationError, which the API answers as FastAPI's own."""
     try:
         return kind.model_validate(fields)
     except ValidationError as error:
         errors = [
-            {**entry, "loc": ("body", *entry["loc"])}
+            {**entry, "loc": (place, *entry["loc"])}
             for entry in error.errors(include_url=False, include_context=False)
         ]
         raise RequestValidationError(errors) from error

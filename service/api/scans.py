@@ -12,7 +12,7 @@ from service.api.bodies import Body
 from service.api.documents import Document, Link, ScanDocument, scan_document
 from service.api.paging import PageRequest, list_links
 from service.api.problems import documented
-from service.api.requests import ScanRequest, checked
+from service.api.requests import ScanQuery, ScanRequest, checked
 from service.api.schema import body_of
 from service.api.services import Provided
 from service.api.values import Id
@@ -51,20 +51,22 @@ async def upload_scan(
     request: Request,
     response: Response,
     services: Provided,
-    said: Annotated[ScanRequest, Query()],
+    asked: Annotated[ScanQuery, Query()],
 ) -> ScanDocument:
     """One PLY or PCD, as the raw body or as the field `file` of a form; it is read later, by the job that uses it.
 
     What is said of the scan stands in the query, or in the form, which wins.
     """
+    said = asked.model_dump(exclude_none=True)
+    checked(ScanRequest, said, place="query")  # before a long upload
     async with bodies.received(
         request,
         services.settings,
         takes=(bodies.RAW, bodies.FORM),
         files="file",
-        filename=said.filename,
+        filename=asked.filename,
     ) as body:
-        told = checked(ScanRequest, {**said.model_dump(exclude_none=True), **body.fields})
+        told = checked(ScanRequest, {**said, **body.fields})
         record, is_new = await run_in_threadpool(_keep, services.catalog, body, told)
     response.status_code = 201 if is_new else 200
     response.headers["Location"] = f"{request.scope.get('root_path', '')}/scans/{record.scan_id}"

@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
@@ -21,12 +21,11 @@ from service.api.requests import MapRequest, ScanRequest, SurveyRequest
 
 FILE = Path("openapi/openapi.json")
 _REF = "#/components/schemas/{model}"
-_BODIES: tuple[type[BaseModel], ...] = (
-    ScanRequest,
-    MapRequest,
-    SurveyRequest,
-    ProblemDocument,
-    TileCollection,
+_SENT: tuple[type[BaseModel], ...] = (ScanRequest, MapRequest, SurveyRequest)
+_ANSWERED: tuple[type[BaseModel], ...] = (ProblemDocument, TileCollection)
+_MODES: tuple[tuple[tuple[type[BaseModel], ...], Literal["validation", "serialization"]], ...] = (
+    (_SENT, "validation"),
+    (_ANSWERED, "serialization"),
 )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from datetime import datetime
+from datetime import UTC, datetime
 from typing import Annotated, Any
 
 from pydantic import AfterValidator, BeforeValidator, Field, WithJsonSchema
@@ -17,13 +17,16 @@ LARGEST_SHIFT = 1e6  #: metres
 _RFC3339 = re.compile(r"\d{4}-\d\d-\d\d[Tt ]\d\d:\d\d:\d\d(\.\d+)?([Zz]|[+-]\d\d:\d\d)")
 
 
-def instant(value: Any) -> Any:
-    """An RFC 3339 date and time, zone included: a time without a zone is nobody's."""
+def instant(value: object) -> datetime:
+    """An RFC 3339 date and time, zone included: a time without a zone is nobody's. Raises ValueError."""
     if isinstance(value, datetime):
         return value
     if not isinstance(value, str) or not _RFC3339.fullmatch(value):
         raise ValueError("give an RFC 3339 date and time with its zone, such as 2026-03-01T12:00:00Z")
-    return datetime.fromisoformat(value.upper())
+    try:
+        return datetime.fromisoformat(value.upper()).astimezone(UTC)
+    except OverflowError as error:
+        raise ValueError("the time is outside the years 1 to 9999 in UTC") from error
 
 
 def from_text(value: Any) -> Any:
@@ -78,5 +81,8 @@ Instant = Annotated[
     WithJsonSchema({"type": "string", "format": "date-time", "example": "2026-03-01T12:00:00Z"}),
 ]
 Pose = Annotated[Matrix, BeforeValidator(from_text), AfterValidator(rigid), WithJsonSchema(_MATRIX_SCHEMA)]
-DeviceId = Annotated[str, Field(min_length=1, max_length=128, examples=["robot-7"])]
-Model = Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]+/[A-Za-z0-9_.-]+$", examples=["spicd-net/1"])]
+Text = Annotated[str, Field(pattern=r"^[^\x00-\x1f\x7f]*$")]  #: one line; PostgreSQL takes no NUL
+DeviceId = Annotated[Text, Field(min_length=1, max_length=128, examples=["robot-7"])]
+Model = Annotated[
+    str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*/[A-Za-z0-9][A-Za-z0-9_.-]*$", examples=["spicd-net/1"])
+]

@@ -60,7 +60,7 @@ class Jobs:
         """How many jobs are in each state; states without a job are left out."""
         query = select(tables.Job.status, func.count()).group_by(tables.Job.status)
         with self._database.read() as session:
-            return dict(session.execute(query).tuples().all())
+            return dict(session.execute(query).all())
 
     def start(self, job_id: str) -> bool:
         """The job runs from now on; False when it has ended or gone, and the step has nothing to do."""

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from datetime import datetime
-from typing import Any, Literal, Self
+from datetime import UTC
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, AwareDatetime, BaseModel, ConfigDict, Field, model_validator
 
 from service.catalog.steps import JobKind
 
@@ -17,6 +17,7 @@ ScanFormat = Literal["ply", "pcd"]
 Vector3 = tuple[float, float, float]
 Row4 = tuple[float, float, float, float]
 Matrix = tuple[Row4, Row4, Row4, Row4]  #: (4, 4) row-major, rigid, target_from_source
+Utc = Annotated[AwareDatetime, AfterValidator(lambda instant: instant.astimezone(UTC))]
 
 TERMINAL: frozenset[JobStatus] = frozenset({"successful", "failed", "dismissed"})
 
@@ -54,10 +55,10 @@ class ScanRecord(Record):
     size: int  #: bytes
     sha256: str
     device_id: str | None
-    captured_at: datetime | None
+    captured_at: Utc | None
     pose: Matrix | None  #: map_from_sensor, the client's guess
     key: str  #: of the blob
-    created: datetime
+    created: Utc
 
 
 class ScanOutcome(Record):
@@ -111,8 +112,8 @@ class MapRecord(Record):
     counts: dict[str, int]
     job_id: str
     problem: Problem | None
-    created: datetime
-    updated: datetime
+    created: Utc
+    updated: Utc
 
 
 class SurveyRecord(Record):
@@ -124,13 +125,13 @@ class SurveyRecord(Record):
     model: str  #: `name/version`
     threshold: float | None  #: asked for, then the one that was used
     device_id: str | None
-    captured_at: datetime  #: given, else the latest of its scans, else the time of the request
+    captured_at: Utc  #: given, else the latest of its scans, else the time of the request
     scans: tuple[ScanOutcome, ...]  #: in the order of the request
     counts: dict[str, int]
     job_id: str
     problem: Problem | None
-    created: datetime
-    updated: datetime
+    created: Utc
+    updated: Utc
 
 
 class JobRecord(Record):
@@ -144,10 +145,10 @@ class JobRecord(Record):
     message: str  #: the stage
     progress: int = Field(ge=0, le=100)
     problem: Problem | None
-    created: datetime
-    started: datetime | None
-    finished: datetime | None
-    updated: datetime
+    created: Utc
+    started: Utc | None
+    finished: Utc | None
+    updated: Utc
 
 
 class ChangeRecord(Record):
@@ -158,4 +159,4 @@ class ChangeRecord(Record):
     survey_id: str
     model: str
     threshold: float | None
-    captured_at: datetime
+    captured_at: Utc

@@ -1,0 +1,100 @@
+"""What the tests of the service put into the catalog, and a queue that only remembers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+
+from service.catalog.catalog import Catalog
+from service.catalog.records import Bounds, ScanOutcome, ScanRecord, TileRecord, TileState
+from service.errors import QueueUnavailable
+
+MODEL = "spicd-net/1"
+IDENTITY = ((1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1))
+NOON = datetime(2026, 3, 1, 12, tzinfo=UTC)
+
+
+@dataclass
+class RememberingQueue:
+    """Stands in for the job queue."""
+
+    submitted: list[tuple[str, str]] = field(default_factory=list)
+    dismissed: list[tuple[str, str]] = field(default_factory=list)
+    down: bool = False
+
+    def submit(self, job_id: str, kind: str) -> None:
+        self.ping()
+        self.submitted.append((job_id, kind))
+
+    def dismiss(self, job_id: str, kind: str) -> None:
+        self.ping()
+        self.dismissed.append((job_id, kind))
+
+    def ping(self) -> None:
+        if self.down:
+            raise QueueUnavailable("the job queue does not answer")
+
+
+def ply(content: str = "hall") -> bytes:
+    """Bytes that start as a PLY does; nothing in the API reads further."""
+    return f"ply\nformat ascii 1.0\ncomment {content}\nend_header\n".encode()
+
+
+def add_scan(catalog: Catalog, content: str = "hall", **known: object) -> ScanRecord:
+    """A scan in the catalog."""
+    path = Path(catalog.blobs._root or ".") / f"{content}.part"
+    path.write_bytes(ply(content))
+    record, _ = catalog.scans.add(
+        path, filename=f"{content}.ply", format="ply", size=len(ply(content)), sha256=content, **known
+    )
+    return record
+
+
+def add_map(catalog: Catalog, map_id: str = "lobby", *, ready: bool = True) -> str:
+    """A map of one scan, built or not; its job's id."""
+    scan = add_scan(catalog, f"map-{map_id}")
+    _, job = catalog.maps.create(scan_ids=[scan.scan_id], model=MODEL, map_id=map_id)
+    if ready:
+        accepted = ScanOutcome(
+            scan_id=scan.scan_id, accepted=True, fitness=0.98, rmse=0.02, map_from_scan=IDENTITY
+        )
+        catalog.maps.save_result(
+            map_id, outcomes=[accepted], bounds=Bounds(min=(0, 0, 0), max=(3, 3, 1)), counts={"tiles": 4}
+        )
+        catalog.jobs.succeed(job.job_id)
+    return job.job_id
+
+
+def tile(i: int, j: int, state: TileState = "changed", score: float = 0.9) -> TileRecord:
+    """A tile of 1.5 x 1.5 x 1.0 m with its corner at (1.5 i, 1.5 j, 0)."""
+    seen = state != "unobserved"
+    return TileRecord(
+        tile_id=f"tile_{i:03}_{j:03}_000",
+        tile_index=(i, j, 0),
+        bounds=Bounds(min=(1.5 * i, 1.5 * j, 0), max=(1.5 * i + 1.5, 1.5 * j + 1.5, 1)),
+        state=state,
+        score=score if seen else None,
+        probabilities=(1 - score, score, 0) if seen else None,
+        n_reference=900,
+        n_current=800 if seen else 3,
+    )
+
+
+def add_survey(
+    catalog: Catalog,
+    tiles: list[TileRecord] | None = None,
+    *,
+    map_id: str = "lobby",
+    captured_at: datetime = NOON,
+    ready: bool = True,
+) -> tuple[str, str]:
+    """A survey of one scan, done or not; its id and its job's."""
+    scan = add_scan(catalog, f"visit-{captured_at.isoformat()}")
+    record, job = catalog.surveys.create(
+        map_id, scan_ids=[scan.scan_id], model=MODEL, captured_at=captured_at
+    )
+    if ready:
+        catalog.surveys.save_result(record.survey_id, tiles=tiles or [], threshold=0.5)
+        catalog.jobs.succeed(job.job_id)
+    return record.survey_id, job.job_id

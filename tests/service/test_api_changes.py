@@ -1,0 +1,158 @@
+"""/maps/{id}/changes: filters, order and pages."""
+
+from __future__ import annotations
+
+from datetime import timedelta
+
+import pytest
+from samples import NOON, add_map, add_scan, add_survey, tile
+
+from service.api.paging import encoded
+
+MARCH, APRIL, MAY = (NOON + timedelta(days=days) for days in (0, 31, 61))
+
+
+@pytest.fixture
+def surveys(catalog):
+    """Three visits: March and April with changes, May without; and a map beside them."""
+    add_map(catalog)
+    add_map(catalog, "hall")
+    add_survey(catalog, [tile(0, 0, "changed", 0.99)], map_id="hall", captured_at=MAY)
+    march, _ = add_survey(
+        catalog, [tile(0, 0, "changed", 0.6), tile(1, 1, "changed", 0.9)], captured_at=MARCH
+    )
+    april, _ = add_survey(
+        catalog,
+        [
+            tile(0, 0, "unchanged", 0.1),
+            tile(2, 0, "changed", 0.7),
+            tile(3, 3, "unobserved"),
+            tile(2, 1, "inconsistent", 0.2),
+        ],
+        captured_at=APRIL,
+    )
+    add_survey(catalog, [tile(0, 0, "unchanged", 0.2)], captured_at=MAY)
+    return {"march": march, "april": april}
+
+
+def found(client, **asked) -> list[tuple[str, float]]:
+    answer = client.get("/maps/lobby/changes", params=asked)
+    assert answer.status_code == 200, answer.text
+    body = answer.json()
+    assert body["numberReturned"] == len(body["features"])
+    return [(f["properties"]["tile_id"][5:12], f["properties"]["score"]) for f in body["features"]]
+
+
+ALL = [("002_000", 0.7), ("001_001", 0.9), ("000_000", 0.6)]
+
+
+def test_changed_tiles_come_newest_visit_first_then_most_certain_first(client, surveys):
+    assert found(client) == ALL
+
+
+@pytest.mark.parametrize(
+    ("asked", "expected"),
+    [
+        ({"min_score": 0.7}, ALL[:2]),
+        ({"bbox": "0,0,1.4,1.4"}, ALL[2:]),
+        ({"bbox": "1.5,1.5,1.5,1.5"}, ALL[1:]),  # a corner that two boxes share
+        ({"bbox": "0,0,0.2,9,9,0.3"}, ALL),
+        ({"bbox": "0,0,2,9,9,3"}, []),  # above every tile
+        ({"datetime": "2026-03-01T12:00:00Z"}, ALL[1:]),
+        ({"datetime": "2026-03-01T13:00:00+01:00"}, ALL[1:]),
+        ({"datetime": "2026-03-02T00:00:00Z/.."}, ALL[:1]),
+        ({"datetime": "../2026-03-02T00:00:00Z"}, ALL[1:]),
+        ({"datetime": "/2026-03-02T00:00:00Z"}, ALL[1:]),
+        ({"datetime": "2026-02-01T00:00:00Z/2026-02-02T00:00:00Z"}, []),
+        ({"survey": "april"}, ALL[:1]),
+        ({"survey": "march", "min_score": 0.7}, ALL[1:2]),
+    ],
+)
+def test_a_filter_keeps_what_it_names(client, surveys, asked, expected):
+    if "survey" in asked:
+        asked = {**asked, "survey": surveys[asked["survey"]]}
+    assert found(client, **asked) == expected
+
+
+@pytest.mark.parametrize(
+    "asked",
+    [
+        {"bbox": "0,0,1"},
+        {"bbox": "0,0,nan,1"},
+        {"bbox": "2,0,1,1"},
+        {"datetime": "2026-03-01"},
+        {"datetime": "../.."},
+        {"datetime": "2026-03-02T00:00:00Z/2026-03-01T00:00:00Z"},
+        {"datetime": "a/b/c"},
+        {"min_score": "1.2"},
+        {"limit": "0"},
+        {"limit": "10001"},
+        {"treshold": "0.5"},
+    ],
+)
+def test_a_value_that_does_not_match_is_named(client, surveys, asked):
+    ((name, value),) = asked.items()
+    answer = client.get("/maps/lobby/changes", params=asked)
+    assert answer.status_code == 422
+    assert answer.json()["errors"][0]["place"] == f"query.{name}"
+    assert answer.json()["errors"][0]["value"] == value
+
+
+def test_a_foreign_cursor_is_refused(client, surveys):
+    for cursor in ("nonsense", "e30", "W10", encoded("2026-03-01T12:00:00", "a", "0x1p-1", "b")):
+        answer = client.get("/maps/lobby/changes", params={"cursor": cursor})
+        assert answer.status_code == 422
+        assert answer.json()["type"] == "urn:spicd:problem:bad_request"
+
+
+def test_pages_hold_every_change_once_while_new_ones_arrive(client, catalog, surveys):
+    tied = [tile(i, 5, "changed", 0.8) for i in range(7)]
+    add_survey(catalog, tied, captured_at=MAY + timedelta(days=1))
+    url, seen, sizes = "/maps/lobby/changes?limit=3&min_score=0.5", [], []
+    while url:
+        body = client.get(url).json()
+        assert body["numberMatched"] == (10 if len(sizes) == 0 else 11)
+        seen += [feature["id"] for feature in body["features"]]
+        sizes.append(body["numberReturned"])
+        url = next((link["href"] for link in body["links"] if link["rel"] == "next"), None)
+        if len(sizes) == 1:  # a visit that is newer than where we stand is not slipped in
+            add_survey(catalog, [tile(9, 9)], captured_at=MAY + timedelta(days=2))
+    assert sizes == [3, 3, 3, 1]
+    assert len(set(seen)) == len(seen) == 10
+
+
+def test_only_a_survey_that_is_done_and_of_this_map_can_be_named(client, catalog, surveys):
+    running, job_id = add_survey(catalog, ready=False, captured_at=MAY + timedelta(days=3))
+    hall = client.get("/maps/hall/surveys").json()["surveys"][0]["survey_id"]
+    assert client.get("/maps/lobby/changes", params={"survey": running}).status_code == 409
+    assert client.get("/maps/lobby/changes", params={"survey": hall}).status_code == 404
+    assert client.get("/maps/lobby/changes", params={"survey": "none"}).status_code == 404
+    catalog.surveys.save_result(running, tiles=[tile(7, 7)], threshold=0.5)
+    catalog.jobs.dismiss(job_id)
+    assert found(client) == ALL  # tiles of a survey that was dismissed are not changes
+
+
+def test_a_map_that_is_not_ready_has_no_changes_to_tell(client, catalog):
+    add_map(catalog, ready=False)
+    assert client.get("/maps/lobby/changes").status_code == 409
+
+
+def test_lists_go_on_page_by_page(client, catalog):
+    for number in range(5):
+        add_map(catalog, f"m{number}")
+        add_survey(catalog, map_id="m0", captured_at=NOON + timedelta(days=number))
+    add_scan(catalog, "last")
+    for path, name, key, total in (
+        ("/maps", "maps", "map_id", 5),
+        ("/jobs", "jobs", "jobID", 10),
+        ("/scans", "scans", "scan_id", 11),
+        ("/maps/m0/surveys", "surveys", "survey_id", 5),
+    ):
+        url, seen = f"{path}?limit=2", []
+        while url:
+            body = client.get(url).json()
+            assert len(body[name]) <= 2
+            seen += [item[key] for item in body[name]]
+            url = next((link["href"] for link in body["links"] if link["rel"] == "next"), None)
+        assert len(seen) == len(set(seen)) == total
+    assert [found["map_id"] for found in client.get("/maps").json()["maps"]] == ["m4", "m3", "m2", "m1", "m0"]

@@ -1,0 +1,67 @@
+"""/models, /health and /metrics."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+from samples import add_map
+
+from service.api.problems import MEDIA_TYPE
+
+
+def test_the_cards_are_passed_on_as_they_are_newest_version_first(client, settings):
+    for version in ("2", "10"):
+        folder = settings.model_store / "spicd-net" / version
+        folder.mkdir()
+        (folder / "card.json").write_text(json.dumps({"name": "spicd-net", "version": version, "any": [1]}))
+    found = client.get("/models").json()
+    assert [card["version"] for card in found["models"]] == ["10", "2", "1"]
+    assert found["default"] == "spicd-net/1"
+    assert client.get("/models/spicd-net").json() == {"name": "spicd-net", "version": "10", "any": [1]}
+    assert client.get("/models/spicd-net?version=1").json()["threshold"] == 0.5
+
+
+def test_a_card_that_cannot_be_read_hides_no_other(client, settings):
+    folder = settings.model_store / "broken" / "1"
+    folder.mkdir(parents=True)
+    (folder / "card.json").write_text("{")
+    assert [card["name"] for card in client.get("/models").json()["models"]] == ["spicd-net"]
+
+
+def test_a_healthy_service_names_its_parts(client):
+    assert client.get("/health/live").json() == {"status": "ok"}
+    ready = client.get("/health/ready")
+    assert (ready.status_code, ready.json()) == (
+        200,
+        {"status": "ok", "checks": {"database": "ok", "queue": "ok", "blobs": "ok"}},
+    )
+
+
+def test_a_part_that_fails_is_named_and_the_others_stay_ok(client, queue, settings):
+    queue.down = True
+    answer = client.get("/health/ready")
+    assert (answer.status_code, answer.headers["content-type"]) == (503, MEDIA_TYPE)
+    assert answer.json()["checks"] == {"database": "ok", "queue": "failed", "blobs": "ok"}
+    queue.down = False
+    shutil.rmtree(settings.data_dir / "blobs")
+    (settings.data_dir / "blobs").write_text("in the way")
+    assert client.get("/health/ready").json()["checks"]["blobs"] == "failed"
+    for path in settings.data_dir.glob("spicd.sqlite*"):
+        path.unlink()
+    assert client.get("/health/ready").json()["checks"]["database"] == "failed"
+    assert client.get("/health/live").status_code == 200
+
+
+def test_metrics_count_requests_by_route_and_jobs_by_state(client, catalog):
+    add_map(catalog, ready=False)
+    client.get("/maps/lobby")
+    client.get("/maps/none")
+    client.get("/somewhere")
+    text = client.get("/metrics").text
+    assert 'spicd_requests_total{method="GET",route="/maps/{map_id}",status="200"} 1.0' in text
+    assert 'spicd_requests_total{method="GET",route="/maps/{map_id}",status="404"} 1.0' in text
+    assert 'spicd_requests_total{method="GET",route="none",status="404"} 1.0' in text
+    assert 'spicd_request_seconds_count{method="GET",route="/maps/{map_id}"} 2.0' in text
+    assert 'spicd_jobs{status="accepted"} 1.0' in text
+    assert 'spicd_jobs{status="failed"} 0.0' in text

@@ -1,0 +1,94 @@
+"""/jobs: OGC API - Processes status documents, and dismissal."""
+
+from __future__ import annotations
+
+import pytest
+from samples import add_map, add_survey
+
+from service.catalog.records import Problem
+
+
+def test_a_job_that_waits_is_an_ogc_status_document(client, catalog):
+    job_id = add_map(catalog, ready=False)
+    job = client.get(f"/jobs/{job_id}").json()
+    assert job.pop("created") == job.pop("updated")
+    assert job == {
+        "jobID": job_id,
+        "processID": "map",
+        "type": "process",
+        "status": "accepted",
+        "message": "waiting",
+        "progress": 0,
+        "started": None,
+        "finished": None,
+        "map_id": "lobby",
+        "survey_id": None,
+        "problem": None,
+        "links": [{"href": f"/jobs/{job_id}", "rel": "self", "type": "application/json"}],
+    }
+
+
+def test_a_job_that_runs_shows_its_stage_and_share(client, catalog):
+    job_id = add_map(catalog, ready=False)
+    catalog.jobs.start(job_id)
+    catalog.jobs.report(job_id, message="registration", progress=0.4)
+    job = client.get(f"/jobs/{job_id}").json()
+    assert (job["status"], job["message"], job["progress"]) == ("running", "registration", 40)
+    assert job["started"].endswith("Z")
+
+
+def test_a_finished_job_links_to_its_result(client, catalog):
+    add_map(catalog)
+    survey_id, job_id = add_survey(catalog)
+    job = client.get(f"/jobs/{job_id}").json()
+    assert (job["status"], job["progress"], job["processID"]) == ("successful", 100, "survey")
+    (result,) = [link["href"] for link in job["links"] if link["rel"].endswith("/results")]
+    assert result == f"/surveys/{survey_id}"
+
+
+@pytest.mark.parametrize("code", ["registration_failed", "scan_unreadable", "internal", "something_new"])
+def test_a_failed_job_carries_its_problem(client, catalog, code):
+    job_id = add_map(catalog, ready=False)
+    catalog.jobs.fail(job_id, Problem(code=code, detail="scan hall.pcd: fitness 0.12 is below 0.55"))
+    problem = client.get(f"/jobs/{job_id}").json()["problem"]
+    assert problem["type"] == f"urn:spicd:problem:{code}"
+    assert problem["title"]
+    assert problem["detail"] == "scan hall.pcd: fitness 0.12 is below 0.55"
+    assert client.get("/maps/lobby").json()["problem"] == problem
+
+
+def test_a_dismissed_job_stays_dismissed_and_answers_the_same_again(client, catalog, queue):
+    job_id = add_map(catalog, ready=False)
+    first = client.delete(f"/jobs/{job_id}")
+    assert (first.status_code, first.json()["status"]) == (200, "dismissed")
+    assert not catalog.jobs.succeed(job_id)
+    assert client.delete(f"/jobs/{job_id}").json() == first.json()
+    assert queue.dismissed[0] == (job_id, "map")
+    assert client.get("/maps/lobby").json()["status"] == "failed"
+
+
+def test_a_dismissal_stands_without_a_queue(client, catalog, queue):
+    job_id = add_map(catalog, ready=False)
+    queue.down = True
+    assert client.delete(f"/jobs/{job_id}").status_code == 200
+    assert catalog.jobs.is_dismissed(job_id)
+
+
+def test_a_job_that_ended_by_itself_cannot_be_dismissed(client, catalog, queue):
+    job_id = add_map(catalog)
+    answer = client.delete(f"/jobs/{job_id}")
+    assert (answer.status_code, answer.json()["type"]) == (409, "urn:spicd:problem:conflict")
+    assert client.get(f"/jobs/{job_id}").json()["status"] == "successful"
+    assert queue.dismissed == []
+
+
+def test_jobs_are_listed_by_state_and_map(client, catalog):
+    waiting = add_map(catalog, ready=False)
+    done = add_map(catalog, "hall")
+    for asked, ids in (
+        ({}, [done, waiting]),
+        ({"status": "accepted"}, [waiting]),
+        ({"map_id": "hall"}, [done]),
+        ({"map_id": "hall", "status": "failed"}, []),
+    ):
+        assert [job["jobID"] for job in client.get("/jobs", params=asked).json()["jobs"]] == ids

@@ -1,0 +1,132 @@
+"""/maps: recorded with their job, or not at all."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from samples import MODEL, add_map, add_scan, add_survey, ply
+
+from service.catalog import keys
+
+
+def test_a_map_of_known_scans_is_accepted_and_its_job_submitted(client, catalog, queue):
+    scan = add_scan(catalog)
+    asked = {
+        "id": "lobby",
+        "name": "Lobby",
+        "scan_ids": [scan.scan_id],
+        "settings": {"registration": {"min_fitness": 0.6}},
+    }
+    answer = client.post("/maps", json=asked)
+    assert answer.status_code == 202
+    job_id = answer.json()["job_id"]
+    assert answer.headers["location"] == f"/jobs/{job_id}"
+    assert queue.submitted == [(job_id, "map")]
+    found = client.get("/maps/lobby").json()
+    assert (found["status"], found["name"], found["model"]) == ("building", "Lobby", MODEL)
+    assert found["settings"] == {"registration": {"min_fitness": 0.6}}
+    assert found["scans"] == [
+        {
+            "scan_id": scan.scan_id,
+            "accepted": None,
+            "fitness": None,
+            "rmse": None,
+            "map_from_scan": None,
+            "reason": None,
+        }
+    ]
+    assert client.get(answer.headers["location"]).json()["map_id"] == "lobby"
+
+
+def test_a_map_of_files_keeps_them_as_scans_in_their_order(client, catalog):
+    known = add_scan(catalog, "known")
+    files = [("scans", (f"{name}.ply", ply(name))) for name in ("b", "a", "b")]
+    form = {"id": "hall", "scan_ids": known.scan_id, "device_id": "robot-7", "settings": "{}"}
+    answer = client.post("/maps", data=form, files=files)
+    assert answer.status_code == 202
+    scans = [catalog.scans.get(scan.scan_id) for scan in catalog.maps.get("hall").scans]
+    assert [scan.filename for scan in scans] == ["known.ply", "b.ply", "a.ply"]
+    assert [scan.device_id for scan in scans] == [None, "robot-7", "robot-7"]
+
+
+@pytest.mark.parametrize("given", [["a", "b"], "a,b", '["a", "b"]'])
+def test_a_form_names_scans_in_three_ways(client, catalog, given):
+    ids = {name: add_scan(catalog, name).scan_id for name in ("a", "b")}
+    if isinstance(given, list):
+        given = [ids[name] for name in given]
+    else:
+        given = given.replace("a", ids["a"], 1) if given == "a,b" else json.dumps(list(ids.values()))
+        given = given if given.startswith("[") else ",".join(ids.values())
+    answer = client.post(
+        "/maps", data={"id": "hall", "scan_ids": given}, files={"scans": ("c.ply", ply("c"))}
+    )
+    assert answer.status_code == 202
+    assert [scan.scan_id for scan in catalog.maps.get("hall").scans][:2] == list(ids.values())
+
+
+def test_without_an_id_the_service_chooses_one(client, catalog):
+    scan_ids = [add_scan(catalog).scan_id]
+    ids = {client.post("/maps", json={"scan_ids": scan_ids}).json()["map_id"] for _ in range(2)}
+    assert len(ids) == 2
+    assert all(client.get(f"/maps/{map_id}").status_code == 200 for map_id in ids)
+
+
+def test_when_the_queue_is_down_nothing_stays_recorded(client, catalog, queue, settings):
+    queue.down = True
+    answer = client.post("/maps", data={"id": "lobby"}, files={"scans": ("a.ply", ply())})
+    assert answer.status_code == 503
+    assert answer.json()["type"] == "urn:spicd:problem:queue_unavailable"
+    assert catalog.maps.page().items == []
+    assert catalog.jobs.page().items == []
+    assert catalog.scans.page().items == []
+    assert [path for path in settings.data_dir.rglob("*.ply") if path.is_file()] == []
+    queue.down = False
+    again = client.post("/maps", data={"id": "lobby"}, files={"scans": ("a.ply", ply())})
+    assert again.status_code == 202
+
+
+def test_a_taken_id_keeps_no_new_file_and_leaves_the_known_ones(client, catalog):
+    add_map(catalog)
+    known = add_scan(catalog, "known")
+    answer = client.post(
+        "/maps",
+        data={"id": "lobby"},
+        files=[("scans", ("new.ply", ply("new"))), ("scans", ("known.ply", ply("known")))],
+    )
+    assert answer.status_code == 409
+    names = {scan.filename for scan in catalog.scans.page().items}
+    assert known.filename in names
+    assert "new.ply" not in names
+
+
+def test_a_ready_map_shows_what_it_is_and_its_files(client, catalog):
+    add_map(catalog)
+    catalog.blobs.put_bytes(keys.map_manifest("lobby"), b'{"n_valid_patches": 4}')
+    catalog.blobs.put_bytes(keys.map_cloud("lobby"), b"ply\n0123456789")
+    found = client.get("/maps/lobby").json()
+    assert (found["status"], found["counts"]) == ("ready", {"tiles": 4})
+    assert found["bounds"] == {"min": [0, 0, 0], "max": [3, 3, 1]}
+    assert found["scans"][0]["map_from_scan"][3] == [0, 0, 0, 1]
+    hrefs = {link["rel"]: link["href"] for link in found["links"]}
+    assert client.get(hrefs["manifest"]).json() == {"n_valid_patches": 4}
+    cloud = client.get(hrefs["cloud"])
+    assert cloud.content == b"ply\n0123456789"
+    part = client.get(hrefs["cloud"], headers={"Range": "bytes=4-6"})
+    assert (part.status_code, part.content) == (206, b"012")
+
+
+def test_deleting_a_map_stops_its_jobs_first(client, catalog, queue):
+    add_map(catalog)
+    survey_id, job_id = add_survey(catalog, ready=False)
+    assert client.delete("/maps/lobby").status_code == 204
+    assert queue.dismissed == [(job_id, "survey")]
+    for path in ("/maps/lobby", f"/surveys/{survey_id}", f"/jobs/{job_id}"):
+        assert client.get(path).status_code == 404
+
+
+def test_a_map_can_be_deleted_while_the_queue_is_down(client, catalog, queue):
+    add_map(catalog, ready=False)
+    queue.down = True
+    assert client.delete("/maps/lobby").status_code == 204
+    assert client.get("/maps/lobby").status_code == 404

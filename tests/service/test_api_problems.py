@@ -1,0 +1,204 @@
+"""Problems: every error of every documented route is a problem document with its type."""
+
+from __future__ import annotations
+
+import pytest
+from samples import MODEL, add_map, add_scan, add_survey, ply
+
+from service.api.problems import MEDIA_TYPE, PROBLEMS
+from service.errors import ServiceError
+
+RAW = {"Content-Type": "application/octet-stream"}
+JSON = {"Content-Type": "application/json"}
+FORM = {"Content-Type": "multipart/form-data; boundary=b"}
+
+
+def problem(answer, status: int, code: str) -> dict:
+    assert answer.status_code == status, answer.text
+    assert answer.headers["content-type"] == MEDIA_TYPE
+    body = answer.json()
+    assert body["type"] == f"urn:spicd:problem:{code}"
+    assert body["status"] == status
+    assert body["title"] and body["detail"]
+    return body
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "status", "code"),
+    [
+        ("GET", "/nowhere", 404, "not_found"),
+        ("GET", "/scans/none", 404, "not_found"),
+        ("DELETE", "/scans/none", 404, "not_found"),
+        ("GET", "/maps/none", 404, "not_found"),
+        ("DELETE", "/maps/none", 404, "not_found"),
+        ("GET", "/maps/none/manifest", 404, "not_found"),
+        ("GET", "/maps/none/cloud.ply", 404, "not_found"),
+        ("GET", "/maps/none/surveys", 404, "not_found"),
+        ("POST", "/maps/none/surveys", 404, "not_found"),
+        ("GET", "/maps/none/changes", 404, "not_found"),
+        ("GET", "/surveys/none", 404, "not_found"),
+        ("DELETE", "/surveys/none", 404, "not_found"),
+        ("GET", "/surveys/none/tiles", 404, "not_found"),
+        ("GET", "/surveys/none/cloud.ply", 404, "not_found"),
+        ("GET", "/surveys/none/picture.png", 404, "not_found"),
+        ("GET", "/jobs/none", 404, "not_found"),
+        ("DELETE", "/jobs/none", 404, "not_found"),
+        ("GET", "/models/none", 404, "not_found"),
+        ("GET", "/models/spicd-net?version=9", 404, "not_found"),
+        ("GET", "/maps/building/manifest", 409, "not_ready"),
+        ("GET", "/maps/building/cloud.ply", 409, "not_ready"),
+        ("GET", "/maps/building/changes", 409, "not_ready"),
+        ("POST", "/maps/building/surveys", 409, "not_ready"),
+        ("GET", "/maps/ready/cloud.ply", 404, "not_found"),
+        ("PUT", "/maps/ready", 405, "method_not_allowed"),
+        ("POST", "/scans", 415, "wrong_media_type"),
+        ("POST", "/maps", 415, "wrong_media_type"),
+        ("POST", "/maps/ready/surveys", 415, "wrong_media_type"),
+        ("GET", "/scans?limit=0", 422, "invalid_request"),
+        ("GET", "/scans?cursor=x", 422, "bad_request"),
+        ("GET", "/maps?limit=many", 422, "invalid_request"),
+        ("GET", "/jobs?status=lost", 422, "invalid_request"),
+        ("GET", "/maps/ready/surveys?offset=3", 422, "invalid_request"),
+        ("GET", "/maps/not%20an%20id", 422, "invalid_request"),
+        ("GET", "/models/a%20b", 422, "invalid_request"),
+    ],
+)
+def test_a_request_without_a_body_ends_in_its_problem(client, catalog, method, path, status, code):
+    add_map(catalog, "ready")
+    add_map(catalog, "building", ready=False)
+    problem(client.request(method, path), status, code)
+
+
+@pytest.mark.parametrize(
+    ("headers", "body", "status", "code"),
+    [
+        (RAW, b"ply\n", 415, "wrong_media_type"),
+        ({"Content-Type": "text/plain"}, b"{}", 415, "wrong_media_type"),
+        (JSON, b"", 422, "bad_request"),
+        (JSON, b"{", 422, "bad_request"),
+        (JSON, b"[]", 422, "bad_request"),
+        (JSON, b"[" * 100_000, 422, "bad_request"),
+        (JSON, b'"\xff"', 422, "bad_request"),
+        (JSON, b"{}", 422, "bad_request"),
+        (JSON, b" " * 1_100_000, 413, "too_large"),
+        (JSON, b'{"scan_ids": ["\\ud800"]}', 422, "invalid_request"),
+        (JSON, b'{"scan_ids": ["a"], "\\ud800": 1}', 422, "invalid_request"),
+        (JSON, b'{"scan_ids": ["a"], "device_id": "a\\u0000"}', 422, "invalid_request"),
+        (JSON, b'{"scan_ids": ["a"], "device_id": "\\udfff"}', 422, "invalid_request"),
+        (JSON, b'{"scan_ids": ["a"], "captured_at": "0001-01-01T00:00:00+14:00"}', 422, "invalid_request"),
+        (JSON, b'{"scan_ids": ["none"]}', 404, "not_found"),
+        (JSON, b'{"scan_ids": 3}', 422, "invalid_request"),
+        (JSON, b'{"scan_ids": ["a", "a"]}', 422, "bad_request"),
+        (JSON, b'{"scan_ids": ["../a"]}', 422, "invalid_request"),
+        (JSON, b'{"scan_ids": ["a"], "model": "other/3"}', 422, "bad_request"),
+        (JSON, b'{"scan_ids": ["a"], "model": "../x"}', 422, "invalid_request"),
+        (JSON, b'{"scan_ids": ["a"], "colour": "red"}', 422, "invalid_request"),
+        ({"Content-Type": "multipart/form-data"}, b"", 422, "bad_request"),
+        (FORM, b"", 422, "bad_request"),
+        (FORM, b"no form at all", 422, "bad_request"),
+        (FORM, b"--b\r\n\r\nx\r\n--b--\r\n", 422, "bad_request"),
+        (
+            FORM,
+            b'--b\r\nContent-Disposition: form-data; name="scans"\r\n\r\n\r\n--b--\r\n',
+            422,
+            "scan_unreadable",
+        ),
+    ],
+)
+@pytest.mark.parametrize("path", ["/maps", "/maps/ready/surveys"])
+def test_a_body_that_does_not_match_ends_in_its_problem(client, catalog, path, headers, body, status, code):
+    add_map(catalog, "ready")
+    problem(client.post(path, content=body, headers=headers), status, code)
+
+
+@pytest.mark.parametrize(
+    ("fields", "place", "value"),
+    [
+        ({"id": "no spaces"}, "body.id", "no spaces"),
+        ({"id": ""}, "body.id", ""),
+        ({"id": "x" * 65}, "body.id", "x" * 65),
+        ({"settings": {"voxel_size": 0.1}}, "body.settings.voxel_size", 0.1),
+        ({"settings": {"tile_size": [1, 1, 1]}}, "body.settings.tile_size", "[1, 1, 1]"),
+        (
+            {"settings": {"registration": {"min_fitness": 1.5}}},
+            "body.settings.registration.min_fitness",
+            1.5,
+        ),
+        (
+            {"settings": {"registration": {"max_inlier_rmse": 0}}},
+            "body.settings.registration.max_inlier_rmse",
+            0,
+        ),
+        ({"captured_at": "yesterday"}, "body.captured_at", "yesterday"),
+        ({"name": "n" * 201}, "body.name", "n" * 200 + "..."),
+    ],
+)
+def test_a_field_that_does_not_match_is_named_with_its_value(client, catalog, fields, place, value):
+    answer = client.post("/maps", json={"scan_ids": [add_scan(catalog).scan_id], **fields})
+    errors = problem(answer, 422, "invalid_request")["errors"]
+    assert [(error["place"], error["value"]) for error in errors] == [(place, value)]
+
+
+@pytest.mark.parametrize("threshold", ["-0.1", "1.1", "NaN", "high"])
+def test_a_threshold_is_a_probability(client, catalog, threshold):
+    add_map(catalog)
+    answer = client.post(
+        "/maps/lobby/surveys", data={"threshold": threshold}, files={"scans": ("a.ply", ply())}
+    )
+    assert problem(answer, 422, "invalid_request")["errors"][0]["place"] == "body.threshold"
+
+
+def test_what_is_in_the_way_is_a_conflict(client, catalog):
+    job_id = add_map(catalog)
+    used = catalog.maps.get("lobby").scans[0].scan_id
+    taken = client.post("/maps", json={"id": "lobby", "scan_ids": [used]})
+    assert "lobby" in problem(taken, 409, "conflict")["detail"]
+    problem(client.delete(f"/scans/{used}"), 409, "conflict")
+    problem(client.delete(f"/jobs/{job_id}"), 409, "conflict")
+
+
+def test_an_unexpected_error_tells_nothing_of_the_inside(client, catalog, caplog):
+    catalog.database.engine.dispose()
+    services = client.app.state.services
+
+    class Broken:
+        def page(self, **_: object) -> None:
+            raise RuntimeError("postgresql://user:secret@host")
+
+    broken = {name: getattr(services.catalog, name) for name in services.catalog.__slots__}
+    client.app.state.services = type(services)(
+        settings=services.settings,
+        queue=services.queue,
+        cards=services.cards,
+        catalog=type(services.catalog)(**{**broken, "maps": Broken()}),
+    )
+    answer = client.get("/maps")
+    body = problem(answer, 500, "internal")
+    assert "secret" not in answer.text
+    assert body["instance"].startswith("urn:uuid:")
+    assert body["instance"] in caplog.text
+
+
+def test_a_405_says_what_is_allowed(client):
+    assert "GET" in client.put("/maps/lobby").headers["allow"]
+
+
+def test_every_error_of_the_service_has_its_place_in_the_table():
+    codes = {kind.code for kind in ServiceError.__subclasses__()}
+    assert codes <= set(PROBLEMS)
+    assert all(PROBLEMS[code][0] is not None for code in codes)
+
+
+def test_every_error_of_the_pipeline_has_a_title():
+    errors = pytest.importorskip("worker.errors")
+    kinds = [kind for kind in vars(errors).values() if isinstance(kind, type)]
+    assert {kind.code for kind in kinds} - {"cancelled"} <= set(PROBLEMS)
+
+
+def test_a_problem_of_a_survey_that_ran_is_no_problem_of_the_request(client, catalog):
+    add_map(catalog)
+    survey_id, job_id = add_survey(catalog, ready=False)
+    catalog.jobs.dismiss(job_id)
+    answer = client.get(f"/surveys/{survey_id}")
+    assert (answer.status_code, answer.json()["problem"]["type"]) == (200, "urn:spicd:problem:dismissed")
+    assert answer.json()["model"] == MODEL

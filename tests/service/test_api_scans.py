@@ -1,0 +1,168 @@
+"""/scans: streamed in, hashed, known by content, never parsed."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+
+import pytest
+from samples import IDENTITY, add_map, ply
+
+RAW = {"Content-Type": "application/octet-stream"}
+POSE = [[0, -1, 0, 2.5], [1, 0, 0, 0], [0, 0, 1, 0.35], [0, 0, 0, 1]]
+
+
+def incoming(settings) -> list[Path]:
+    folder = settings.data_dir / "incoming"
+    return list(folder.iterdir()) if folder.exists() else []
+
+
+def test_a_raw_body_becomes_a_scan_with_its_bytes(client, catalog, settings):
+    sent = {"filename": "hall.ply", "captured_at": "2026-03-01T13:00:00+01:00", "pose": json.dumps(POSE)}
+    answer = client.post("/scans", content=ply(), headers=RAW, params=sent)
+    scan = answer.json()
+    assert answer.status_code == 201
+    assert answer.headers["location"] == f"/scans/{scan['scan_id']}"
+    assert scan["sha256"] == hashlib.sha256(ply()).hexdigest()
+    assert (scan["filename"], scan["format"], scan["size"]) == ("hall.ply", "ply", len(ply()))
+    assert scan["captured_at"] == "2026-03-01T12:00:00Z"
+    assert scan["pose"] == POSE
+    assert "key" not in scan
+    assert catalog.blobs.get_bytes(catalog.scans.get(scan["scan_id"]).key) == ply()
+    assert incoming(settings) == []
+    assert client.get(answer.headers["location"]).json() == scan
+
+
+def test_a_form_brings_the_same_scan_with_its_fields(client):
+    form = {"device_id": "robot-7", "captured_at": "2026-03-01T12:00:00Z", "pose": json.dumps(POSE)}
+    answer = client.post("/scans", data=form, files={"file": ("flur.ply", ply())})
+    scan = answer.json()
+    assert answer.status_code == 201
+    assert (scan["filename"], scan["device_id"], scan["pose"]) == ("flur.ply", "robot-7", POSE)
+    raw = client.post("/scans", content=ply(), headers=RAW, params={"device_id": "robot-7"})
+    assert raw.status_code == 200
+    assert raw.json() == scan
+
+
+def test_the_same_bytes_twice_are_one_scan_and_from_two_devices_two(client):
+    ids = []
+    for device, status in (("a", 201), ("a", 200), ("b", 201)):
+        answer = client.post("/scans", content=ply(), headers=RAW, params={"device_id": device})
+        assert answer.status_code == status
+        ids.append(answer.json()["scan_id"])
+    assert ids[0] == ids[1] != ids[2]
+
+
+@pytest.mark.parametrize(
+    ("head", "known"),
+    [
+        (b"ply\r\nformat ascii 1.0\r\n", "ply"),
+        (b"# .PCD v0.7 - Point Cloud Data file format\n", "pcd"),
+        (b"VERSION 0.7\nFIELDS x y z\n", "pcd"),
+    ],
+)
+def test_the_first_bytes_tell_the_format(client, head, known):
+    assert client.post("/scans", content=head, headers=RAW).json()["format"] == known
+
+
+@pytest.mark.parametrize("body", [b"", b"plywood", b"\x89PNG\r\n", b"\x00" * 100])
+def test_another_file_is_refused_by_name_and_leaves_nothing(client, catalog, settings, body):
+    answer = client.post("/scans", content=body, headers=RAW, params={"filename": "hall.png"})
+    assert answer.status_code == 422
+    assert answer.json()["type"] == "urn:spicd:problem:scan_unreadable"
+    assert answer.json()["detail"].startswith("hall.png: ")
+    form = client.post("/scans", files={"file": ("hall.png", body)})
+    assert (form.status_code, form.json()) == (422, answer.json())
+    assert incoming(settings) == []
+    assert catalog.scans.page().items == []
+
+
+@pytest.mark.parametrize("declared", [True, False])
+@pytest.mark.parametrize("as_form", [True, False])
+def test_a_body_over_the_limit_is_refused_and_leaves_nothing(client, catalog, settings, declared, as_form):
+    body, headers = ply() + bytes(settings.max_upload_bytes), RAW
+    if as_form:
+        request = client.build_request("POST", "/scans", files={"file": ("hall.ply", body)})
+        body, headers = request.read(), {"Content-Type": request.headers["content-type"]}
+    content = body if declared else (body[n : n + 65536] for n in range(0, len(body), 65536))
+    answer = client.post("/scans", content=content, headers=headers)
+    assert answer.status_code == 413
+    assert str(settings.max_upload_bytes) in answer.json()["detail"]
+    assert incoming(settings) == []
+    assert catalog.scans.page().items == []
+
+
+@pytest.mark.parametrize("cut", [30, 120, 180])
+def test_a_form_that_ends_early_leaves_nothing(client, catalog, settings, cut):
+    request = client.build_request("POST", "/scans", files={"file": ("hall.ply", ply())})
+    headers = {"Content-Type": request.headers["content-type"]}
+    answer = client.post("/scans", content=request.read()[:cut], headers=headers)
+    assert answer.status_code == 422
+    assert answer.json()["type"] == "urn:spicd:problem:bad_request"
+    assert incoming(settings) == []
+    assert catalog.scans.page().items == []
+
+
+@pytest.mark.parametrize(
+    ("pose", "told"),
+    [
+        ("[[1,0,0,0],[0,1,0,0],[0,0,1,0]]", "pose"),
+        ("no json", "not JSON"),
+        (json.dumps([[2, 0, 0, 0], *IDENTITY[1:]]), "rigid"),
+        (json.dumps([[-1, 0, 0, 0], *IDENTITY[1:]]), "mirrors"),
+        (json.dumps([*IDENTITY[:3], [1, 0, 0, 1]]), "last row"),
+        ("[[NaN,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]", "finite"),
+    ],
+)
+def test_a_pose_that_is_not_rigid_is_refused_with_its_place(client, pose, told):
+    for answer in (
+        client.post("/scans", content=ply(), headers=RAW, params={"pose": pose}),
+        client.post("/scans", data={"pose": pose}, files={"file": ("hall.ply", ply())}),
+    ):
+        assert answer.status_code == 422
+        assert told in answer.json()["detail"]
+        assert ".pose" in answer.json()["errors"][0]["place"]
+
+
+@pytest.mark.parametrize("when", ["2026-03-01", "2026-03-01T12:00:00", "1700000000", "noon"])
+def test_a_time_without_a_zone_is_refused(client, when):
+    answer = client.post("/scans", content=ply(), headers=RAW, params={"captured_at": when})
+    assert answer.status_code == 422
+    assert answer.json()["errors"][0] == {
+        "place": "query.captured_at",
+        "value": when,
+        "detail": "give an RFC 3339 date and time with its zone, such as 2026-03-01T12:00:00Z",
+    }
+
+
+def test_a_file_name_is_kept_as_one_short_line(client):
+    body = (
+        b'--b\r\nContent-Disposition: form-data; name="file"; filename="../a\x00\x1b\xff'
+        + b"x" * 300
+        + b'.ply"\r\n\r\n'
+        + ply()
+        + b"\r\n--b--\r\n"
+    )
+    answer = client.post("/scans", content=body, headers={"Content-Type": "multipart/form-data; boundary=b"})
+    name = answer.json()["filename"]
+    assert len(name) == 255
+    assert name.isprintable()
+
+
+def test_a_form_takes_one_file_in_its_field(client):
+    two = client.post("/scans", files=[("file", ("a.ply", ply())), ("file", ("b.ply", ply()))])
+    assert (two.status_code, two.json()["detail"][:7]) == (422, "2 files")
+    other = client.post("/scans", files={"scan": ("a.ply", ply())})
+    assert (other.status_code, "'file'" in other.json()["detail"]) == (422, True)
+    none = client.post("/scans", data={"device_id": "a"}, files={})
+    assert none.status_code == 415
+
+
+def test_a_scan_is_deleted_once_and_not_while_a_map_rests_on_it(client, catalog):
+    scan_id = client.post("/scans", content=ply(), headers=RAW).json()["scan_id"]
+    assert client.delete(f"/scans/{scan_id}").status_code == 204
+    assert client.delete(f"/scans/{scan_id}").status_code == 404
+    add_map(catalog)
+    used = catalog.maps.get("lobby").scans[0].scan_id
+    assert client.delete(f"/scans/{used}").json()["type"] == "urn:spicd:problem:conflict"

@@ -1,0 +1,103 @@
+"""The API's description: written, whole, and true to the code."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from service.api import schema
+
+PROJECT = Path(__file__).resolve().parents[2]
+WRITTEN = PROJECT / schema.FILE
+
+
+@pytest.fixture(scope="module")
+def document() -> dict:
+    return json.loads(WRITTEN.read_text())
+
+
+def test_the_written_description_is_that_of_the_code():
+    assert WRITTEN.read_text() == schema.written(), "run `python -m service.api.schema`"
+
+
+def test_every_reference_leads_somewhere(document):
+    def references(node: object) -> set[str]:
+        if isinstance(node, dict):
+            here = {node["$ref"]} if "$ref" in node else set()
+            return here.union(*(references(value) for value in node.values()))
+        if isinstance(node, list):
+            return set().union(*(references(value) for value in node))
+        return set()
+
+    for reference in references(document):
+        found = document
+        for part in reference.removeprefix("#/").split("/"):
+            found = found[part]
+        assert found
+
+
+def test_every_call_of_the_public_api_is_described(document):
+    calls = {f"{method.upper()} {path}" for path, methods in document["paths"].items() for method in methods}
+    assert calls == {
+        "POST /scans",
+        "GET /scans",
+        "GET /scans/{scan_id}",
+        "DELETE /scans/{scan_id}",
+        "POST /maps",
+        "GET /maps",
+        "GET /maps/{map_id}",
+        "DELETE /maps/{map_id}",
+        "GET /maps/{map_id}/manifest",
+        "GET /maps/{map_id}/cloud.ply",
+        "POST /maps/{map_id}/surveys",
+        "GET /maps/{map_id}/surveys",
+        "GET /maps/{map_id}/changes",
+        "GET /surveys/{survey_id}",
+        "DELETE /surveys/{survey_id}",
+        "GET /surveys/{survey_id}/tiles",
+        "GET /surveys/{survey_id}/cloud.ply",
+        "GET /surveys/{survey_id}/picture.png",
+        "GET /jobs",
+        "GET /jobs/{job_id}",
+        "DELETE /jobs/{job_id}",
+        "GET /models",
+        "GET /models/{name}",
+        "GET /health/live",
+        "GET /health/ready",
+        "GET /metrics",
+    }
+
+
+def test_every_error_is_described_as_a_problem(document):
+    for path, methods in document["paths"].items():
+        for method, call in methods.items():
+            for status, answer in call["responses"].items():
+                if int(status) >= 400:
+                    content = answer["content"]
+                    assert list(content) == ["application/problem+json"], (method, path, status)
+
+
+def test_uploads_describe_their_body(document):
+    bodies = {
+        path: list(document["paths"][path]["post"]["requestBody"]["content"]) for path in ("/scans", "/maps")
+    }
+    assert bodies == {
+        "/scans": ["application/octet-stream", "multipart/form-data"],
+        "/maps": ["application/json", "multipart/form-data"],
+    }
+
+
+def test_importing_the_api_brings_neither_torch_nor_the_worker():
+    import subprocess
+    import sys
+
+    code = (
+        "import sys, service.api.app; "
+        "print([name for name in ('torch', 'open3d', 'worker', 'numpy') if name in sys.modules])"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=PROJECT, capture_output=True, text=True, check=True
+    )
+    assert done.stdout.strip() == "[]"

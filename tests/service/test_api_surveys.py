@@ -1,0 +1,126 @@
+"""/surveys: a visit compared with a map that is ready."""
+
+from __future__ import annotations
+
+import pytest
+from samples import NOON, add_map, add_scan, add_survey, ply, tile
+
+from service.catalog import keys
+
+
+def test_a_survey_of_files_is_accepted_and_its_job_submitted(client, catalog, queue):
+    add_map(catalog)
+    form = {"captured_at": "2026-03-01T12:00:00Z", "device_id": "robot-7", "threshold": "0.7"}
+    files = [("scans", ("a.ply", ply("a"))), ("scans", ("b.ply", ply("b")))]
+    answer = client.post("/maps/lobby/surveys", data=form, files=files)
+    assert answer.status_code == 202
+    accepted = answer.json()
+    assert answer.headers["location"] == f"/jobs/{accepted['job_id']}"
+    assert queue.submitted == [(accepted["job_id"], "survey")]
+    found = client.get(f"/surveys/{accepted['survey_id']}").json()
+    assert (found["status"], found["threshold"], found["map_id"]) == ("running", 0.7, "lobby")
+    assert (found["captured_at"], found["device_id"]) == ("2026-03-01T12:00:00Z", "robot-7")
+    assert len(found["scans"]) == 2
+    assert catalog.scans.get(found["scans"][0]["scan_id"]).captured_at == NOON
+
+
+def test_a_survey_of_known_scans_takes_the_model_of_the_map(client, catalog):
+    add_map(catalog)
+    answer = client.post("/maps/lobby/surveys", json={"scan_ids": [add_scan(catalog).scan_id]})
+    assert catalog.surveys.get(answer.json()["survey_id"]).model == catalog.maps.get("lobby").model
+
+
+def test_a_survey_before_its_map_is_ready_is_refused_unread(client, catalog, settings):
+    add_map(catalog, ready=False)
+    answer = client.post("/maps/lobby/surveys", files={"scans": ("a.ply", ply())})
+    assert answer.status_code == 409
+    assert answer.json()["type"] == "urn:spicd:problem:not_ready"
+    assert [scan.filename for scan in catalog.scans.page().items] == ["map-lobby.ply"]
+
+
+def test_when_the_queue_is_down_no_survey_stays_recorded(client, catalog, queue):
+    add_map(catalog)
+    queue.down = True
+    answer = client.post("/maps/lobby/surveys", files={"scans": ("a.ply", ply())})
+    assert answer.status_code == 503
+    assert client.get("/maps/lobby/surveys").json()["surveys"] == []
+    assert [scan.filename for scan in catalog.scans.page().items] == ["map-lobby.ply"]
+    assert len(catalog.jobs.page().items) == 1
+
+
+def test_the_tiles_are_features_in_the_frame_of_the_map(client, catalog):
+    add_map(catalog)
+    tiles = [tile(1, 2, "changed", 0.93), tile(0, 0, "unobserved"), tile(0, 1, "unchanged", 0.1)]
+    survey_id, _ = add_survey(catalog, tiles)
+    answer = client.get(f"/surveys/{survey_id}/tiles")
+    assert answer.headers["content-type"] == "application/geo+json"
+    found = answer.json()
+    assert found["type"] == "FeatureCollection"
+    assert found["conformsTo"] == [
+        "http://www.opengis.net/spec/json-fg-1/1.0/conf/core",
+        "http://www.opengis.net/spec/json-fg-1/1.0/conf/prisms",
+    ]
+    assert (found["numberMatched"], found["numberReturned"]) == (3, 3)
+    unobserved, _, changed = found["features"]
+    assert changed["id"] == f"{survey_id}.tile_001_002_000"
+    assert changed["geometry"] is None
+    assert changed["place"] == {
+        "type": "Prism",
+        "base": {
+            "type": "Polygon",
+            "coordinates": [[[1.5, 3.0], [3.0, 3.0], [3.0, 4.5], [1.5, 4.5], [1.5, 3.0]]],
+        },
+        "lower": 0.0,
+        "upper": 1.0,
+    }
+    assert changed["time"] == {"timestamp": "2026-03-01T12:00:00Z"}
+    assert changed["properties"] == {
+        "tile_id": "tile_001_002_000",
+        "tile_index": [1, 2, 0],
+        "center": [2.25, 3.75, 0.5],
+        "state": "changed",
+        "score": 0.93,
+        "probabilities": [pytest.approx(0.07), 0.93, 0],
+        "threshold": 0.5,
+        "n_reference": 900,
+        "n_current": 800,
+        "map_id": "lobby",
+        "survey_id": survey_id,
+        "model": "spicd-net/1",
+        "captured_at": "2026-03-01T12:00:00Z",
+    }
+    assert unobserved["properties"]["state"] == "unobserved"
+    assert unobserved["properties"]["score"] is None
+
+
+@pytest.mark.parametrize("what", ["tiles", "cloud.ply", "picture.png"])
+@pytest.mark.parametrize("ended", [False, True])
+def test_a_survey_without_a_result_says_so(client, catalog, what, ended):
+    add_map(catalog)
+    survey_id, job_id = add_survey(catalog, ready=False)
+    if ended:
+        catalog.jobs.dismiss(job_id)
+    answer = client.get(f"/surveys/{survey_id}/{what}")
+    assert answer.status_code == 409
+    assert job_id in answer.json()["detail"]
+
+
+def test_the_files_of_a_survey_come_as_they_are(client, catalog):
+    add_map(catalog)
+    survey_id, _ = add_survey(catalog)
+    missing = client.get(f"/surveys/{survey_id}/picture.png")
+    assert missing.status_code == 404
+    catalog.blobs.put_bytes(keys.survey_cloud(survey_id), b"ply\n")
+    catalog.blobs.put_bytes(keys.survey_picture(survey_id), b"\x89PNG")
+    cloud, picture = (client.get(f"/surveys/{survey_id}/{name}") for name in ("cloud.ply", "picture.png"))
+    assert (cloud.content, cloud.headers["content-type"]) == (b"ply\n", "application/octet-stream")
+    assert (picture.content, picture.headers["content-type"]) == (b"\x89PNG", "image/png")
+
+
+def test_deleting_a_survey_stops_its_job_and_leaves_its_map(client, catalog, queue):
+    add_map(catalog)
+    survey_id, job_id = add_survey(catalog, ready=False)
+    assert client.delete(f"/surveys/{survey_id}").status_code == 204
+    assert queue.dismissed == [(job_id, "survey")]
+    assert client.get(f"/surveys/{survey_id}").status_code == 404
+    assert client.get("/maps/lobby").json()["status"] == "ready"

@@ -1,0 +1,107 @@
+"""Blobs: whole or absent, by key."""
+
+from __future__ import annotations
+
+import pytest
+
+from service.catalog import keys
+from service.catalog.blobs import Blobs
+
+
+@pytest.fixture
+def blobs(tmp_path):
+    return Blobs((tmp_path / "blobs").as_uri())
+
+
+@pytest.fixture(params=["folder", "elsewhere"])
+def either(request, tmp_path):
+    """A local folder, and a store that is not one (obstore's memory stands in for S3)."""
+    return Blobs((tmp_path / "blobs").as_uri() if request.param == "folder" else "memory:///")
+
+
+def test_bytes_come_back_by_key(either):
+    either.put_bytes("maps/lobby/cloud.ply", b"ply")
+    assert either.get_bytes("maps/lobby/cloud.ply") == b"ply"
+    assert either.size("maps/lobby/cloud.ply") == 3
+    assert b"".join(either.stream("maps/lobby/cloud.ply")) == b"ply"
+    with either.local("maps/lobby/cloud.ply") as path:
+        assert path.read_bytes() == b"ply"
+
+
+def test_what_was_put_last_stands(either):
+    either.put_bytes("a/b", b"first, longer")
+    either.put_bytes("a/b", b"second")
+    assert either.get_bytes("a/b") == b"second"
+
+
+def test_a_file_of_seven_megabytes_comes_back_in_pieces(either, tmp_path):
+    source = tmp_path / "scan.bin"
+    source.write_bytes(bytes(range(256)) * 28_000)
+    either.put_file("scans/s/scan.bin", source)
+    pieces = list(either.stream("scans/s/scan.bin"))
+    assert b"".join(pieces) == source.read_bytes()
+
+
+@pytest.mark.parametrize("ask", ["get_bytes", "size", "path", "stream", "local"])
+def test_a_missing_key_is_a_missing_file(blobs, ask):
+    with pytest.raises(FileNotFoundError):
+        if ask == "local":
+            with blobs.local("maps/none/cloud.ply"):
+                pass
+        else:
+            getattr(blobs, ask)("maps/none/cloud.ply")
+    assert not blobs.exists("maps/none/cloud.ply")
+
+
+def test_a_moved_file_is_gone_where_it_was(either, tmp_path):
+    source = tmp_path / "scan.bin"
+    source.write_bytes(b"scan")
+    either.put_file("scans/s/scan.bin", source, move=True)
+    assert either.get_bytes("scans/s/scan.bin") == b"scan"
+    assert not source.exists()
+
+
+def test_a_local_blob_is_read_where_it_lies(blobs, tmp_path):
+    blobs.put_bytes("a/b.bin", b"x")
+    with blobs.local("a/b.bin") as path:
+        assert path == tmp_path / "blobs" / "a" / "b.bin"
+
+
+def test_a_copy_from_elsewhere_goes_when_it_was_read():
+    elsewhere = Blobs("memory:///")
+    elsewhere.put_bytes("a/b.bin", b"x")
+    with elsewhere.local("a/b.bin") as path:
+        assert path.name == "b.bin"
+    assert not path.exists()
+
+
+def test_a_prefix_takes_its_blobs_and_no_others(either):
+    either.put_bytes("maps/lobby/cloud.ply", b"x")
+    either.put_bytes("maps/lobby/scans/a.npz", b"x")
+    either.put_bytes("maps/lobby2/cloud.ply", b"x")
+    either.delete_prefix(keys.map_folder("lobby"))
+    either.delete_prefix(keys.map_folder("lobby"))
+    assert not either.exists("maps/lobby/cloud.ply")
+    assert not either.exists("maps/lobby/scans/a.npz")
+    assert either.exists("maps/lobby2/cloud.ply")
+
+
+@pytest.mark.parametrize(
+    ("given", "kept"),
+    [
+        ("hall.pcd", "hall.pcd"),
+        ("../../etc/passwd", "passwd"),
+        ("C:\\scans\\hall 1.ply", "hall_1.ply"),
+        ("...", "scan"),
+        ("", "scan"),
+        ("x" * 300 + ".ply", "x" * 96 + ".ply"),
+        ("späť.ply", "sp_.ply"),
+    ],
+)
+def test_a_file_name_becomes_one_harmless_part_of_a_key(given, kept):
+    assert keys.safe_name(given) == kept
+
+
+def test_a_description_belongs_to_one_model():
+    assert keys.map_description("lobby", "spicd-net/1") == "maps/lobby/description-spicd-net-1.npz"
+    assert keys.map_description("lobby", "spicd-net/1") != keys.map_description("lobby", "spicd-net/2")

@@ -1,0 +1,173 @@
+"""Maps, surveys and scans in the catalog: results that replace, and deletes that take all with them."""
+
+from __future__ import annotations
+
+from datetime import timedelta
+
+import pytest
+from pydantic import ValidationError
+from samples import IDENTITY, MODEL, NOON, add_map, add_scan, add_survey, tile
+
+from service.catalog import keys
+from service.catalog.records import Bounds, ScanOutcome, TileRecord
+from service.errors import BadRequest, Conflict, NotFound, NotReady
+
+
+def accepted(scan_id: str, fitness: float) -> ScanOutcome:
+    return ScanOutcome(
+        scan_id=scan_id, accepted=True, fitness=fitness, rmse=0.02, map_from_scan=IDENTITY, reason=None
+    )
+
+
+def test_a_map_lists_its_scans_in_the_order_asked_for(catalog):
+    ids = [add_scan(catalog, name).scan_id for name in ("b", "a", "c")]
+    catalog.maps.create(scan_ids=ids, model=MODEL, map_id="hall")
+    assert [scan.scan_id for scan in catalog.maps.get("hall").scans] == ids
+    assert {scan.accepted for scan in catalog.maps.get("hall").scans} == {None}
+
+
+def test_a_result_saved_twice_is_the_second_result(catalog):
+    add_map(catalog, ready=False)
+    scan_id = catalog.maps.get("lobby").scans[0].scan_id
+    for fitness in (0.7, 0.9):
+        catalog.maps.save_result(
+            "lobby",
+            outcomes=[accepted(scan_id, fitness)],
+            bounds=Bounds(min=(0, 0, 0), max=(fitness, 1, 1)),
+            counts={"tiles": round(10 * fitness)},
+        )
+    found = catalog.maps.get("lobby")
+    assert [scan.fitness for scan in found.scans] == [0.9]
+    assert (found.bounds.max[0], found.counts) == (0.9, {"tiles": 9})
+    assert found.status == "building"  # only the end of the job makes it ready
+
+
+def test_outcomes_of_a_failed_map_are_kept(catalog):
+    add_map(catalog, ready=False)
+    scan_id = catalog.maps.get("lobby").scans[0].scan_id
+    left_out = ScanOutcome(scan_id=scan_id, accepted=False, fitness=0.1, rmse=0.04, reason="fitness 0.10")
+    catalog.maps.save_outcomes("lobby", [left_out])
+    assert catalog.maps.get("lobby").scans == (left_out,)
+
+
+def test_an_outcome_of_a_foreign_scan_is_a_mistake(catalog):
+    add_map(catalog, ready=False)
+    with pytest.raises(ValueError, match="elsewhere"):
+        catalog.maps.save_outcomes("lobby", [accepted("elsewhere", 1)])
+
+
+def test_an_id_is_taken_once_and_the_second_leaves_no_job(catalog):
+    add_map(catalog)
+    scan = add_scan(catalog, "other")
+    with pytest.raises(Conflict, match="lobby"):
+        catalog.maps.create(scan_ids=[scan.scan_id], model=MODEL, map_id="lobby")
+    assert len(catalog.jobs.page().items) == 1
+
+
+def test_unknown_scans_are_named_all(catalog):
+    with pytest.raises(NotFound, match="'x', 'y'"):
+        catalog.maps.create(scan_ids=["x", add_scan(catalog).scan_id, "y"], model=MODEL)
+    assert catalog.maps.page().items == []
+
+
+@pytest.mark.parametrize("scan_ids", [[], ["twice", "twice"]])
+def test_a_map_needs_scans_each_once(catalog, scan_ids):
+    with pytest.raises(BadRequest):
+        catalog.maps.create(scan_ids=scan_ids, model=MODEL)
+
+
+def test_a_survey_saved_twice_has_its_tiles_once_and_counts_them(catalog):
+    add_map(catalog)
+    survey_id, _ = add_survey(catalog, ready=False)
+    catalog.surveys.save_result(survey_id, tiles=[tile(i, 0) for i in range(5)], threshold=0.4)
+    catalog.surveys.save_result(
+        survey_id,
+        tiles=[tile(0, 0), tile(1, 0, "unchanged", 0.1), tile(2, 0, "unobserved")],
+        threshold=0.5,
+        counts={"points": 99},
+    )
+    assert [change.tile.tile_index[0] for change in catalog.changes.of_survey(survey_id)] == [0, 1, 2]
+    found = catalog.surveys.get(survey_id)
+    assert found.threshold == 0.5
+    assert found.counts == {
+        "points": 99,
+        "tiles": 3,
+        "changed": 1,
+        "unchanged": 1,
+        "inconsistent": 0,
+        "unobserved": 1,
+    }
+
+
+def test_a_survey_is_as_late_as_its_latest_scan(catalog):
+    add_map(catalog)
+    ids = [
+        add_scan(catalog, str(hour), captured_at=NOON + timedelta(hours=hour)).scan_id for hour in (2, 5, 3)
+    ]
+    survey, _ = catalog.surveys.create("lobby", scan_ids=ids, model=MODEL)
+    assert catalog.surveys.get(survey.survey_id).captured_at == NOON + timedelta(hours=5)
+
+
+@pytest.mark.parametrize("status", ["building", "failed"])
+def test_a_survey_needs_a_map_that_is_ready(catalog, status):
+    job_id = add_map(catalog, ready=False)
+    if status == "failed":
+        catalog.jobs.dismiss(job_id)
+    with pytest.raises(NotReady, match=status):
+        catalog.surveys.create("lobby", scan_ids=[add_scan(catalog).scan_id], model=MODEL)
+
+
+def test_a_deleted_map_takes_its_surveys_jobs_and_blobs_and_leaves_its_scans(catalog):
+    add_map(catalog)
+    add_map(catalog, "hall")
+    survey_id, job_id = add_survey(catalog, [tile(0, 0)])
+    catalog.blobs.put_bytes(keys.map_cloud("lobby"), b"ply")
+    catalog.blobs.put_bytes(keys.survey_cloud(survey_id), b"ply")
+    catalog.maps.delete("lobby")
+    for ask, key in (
+        (catalog.maps.get, "lobby"),
+        (catalog.surveys.get, survey_id),
+        (catalog.jobs.get, job_id),
+    ):
+        with pytest.raises(NotFound):
+            ask(key)
+    assert catalog.changes.of_survey(survey_id) == ()
+    assert not catalog.blobs.exists(keys.map_cloud("lobby"))
+    assert not catalog.blobs.exists(keys.survey_cloud(survey_id))
+    assert len(catalog.scans.page().items) == 3
+    assert [found.map_id for found in catalog.maps.page().items] == ["hall"]
+
+
+def test_the_same_bytes_from_the_same_device_are_one_scan(catalog):
+    first = add_scan(catalog, "hall", device_id="robot-1")
+    assert add_scan(catalog, "hall", device_id="robot-1") == first
+    assert add_scan(catalog, "hall", device_id="robot-2").scan_id != first.scan_id
+    assert add_scan(catalog, "hall").scan_id != first.scan_id
+
+
+def test_a_scan_in_use_stays(catalog):
+    add_map(catalog)
+    scan_id = catalog.maps.get("lobby").scans[0].scan_id
+    with pytest.raises(Conflict):
+        catalog.scans.delete(scan_id)
+    catalog.maps.delete("lobby")
+    key = catalog.scans.get(scan_id).key
+    catalog.scans.delete(scan_id)
+    assert not catalog.blobs.exists(key)
+
+
+@pytest.mark.parametrize(
+    ("state", "score"), [("changed", None), ("unobserved", 0.4), ("changed", float("nan"))]
+)
+def test_a_tile_has_a_finite_score_exactly_where_it_was_observed(state, score):
+    with pytest.raises(ValidationError):
+        TileRecord(
+            tile_id="tile_000_000_000",
+            tile_index=(0, 0, 0),
+            bounds=Bounds(min=(0, 0, 0), max=(1, 1, 1)),
+            state=state,
+            score=score,
+            probabilities=None if score is None else (0.5, 0.4, 0.1),
+            n_reference=600,
+            n_current=600,
+        )
