@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
+import json
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 
+from fastapi.testclient import TestClient
+
+from service.api.app import create_app
 from service.catalog.catalog import Catalog
 from service.catalog.records import Bounds, ScanOutcome, ScanRecord, TileRecord, TileState
 from service.errors import QueueUnavailable
+from service.settings import Settings
 
 MODEL = "spicd-net/1"
 IDENTITY = ((1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1))
@@ -34,6 +41,28 @@ class RememberingQueue:
     def ping(self) -> None:
         if self.down:
             raise QueueUnavailable("the job queue does not answer")
+
+
+def settings_in(folder: Path) -> Settings:
+    """Everything in `folder`, with the card of one model, and bodies of at most 200 kB."""
+    card = folder / "models" / "spicd-net" / "1" / "card.json"
+    card.parent.mkdir(parents=True)
+    card.write_text(json.dumps({"name": "spicd-net", "version": "1", "threshold": 0.5}))
+    return Settings(
+        data_dir=folder / "data", model_store=folder / "models", model=MODEL, max_upload_bytes=200_000
+    )
+
+
+@contextlib.contextmanager
+def running(settings: Settings, queue: RememberingQueue) -> Iterator[TestClient]:
+    """The API as its clients see it: an unexpected error is an answer, not an exception."""
+    with TestClient(create_app(settings, queue=queue), raise_server_exceptions=False) as client:
+        yield client
+
+
+def catalog_of(client: TestClient) -> Catalog:
+    """The catalog that the API works on; a worker would open the same folder."""
+    return client.app.state.services.catalog
 
 
 def ply(content: str = "hall") -> bytes:

@@ -5,15 +5,24 @@ from __future__ import annotations
 from datetime import timedelta
 
 import pytest
-from samples import NOON, add_map, add_scan, add_survey, tile
+from samples import (
+    NOON,
+    RememberingQueue,
+    add_map,
+    add_scan,
+    add_survey,
+    catalog_of,
+    running,
+    settings_in,
+    tile,
+)
 
 from service.api.paging import encoded
 
 MARCH, APRIL, MAY = (NOON + timedelta(days=days) for days in (0, 31, 61))
 
 
-@pytest.fixture
-def surveys(catalog):
+def add_visits(catalog) -> dict[str, str]:
     """Three visits: March and April with changes, May without; and a map beside them."""
     add_map(catalog)
     add_map(catalog, "hall")
@@ -33,6 +42,18 @@ def surveys(catalog):
     )
     add_survey(catalog, [tile(0, 0, "unchanged", 0.2)], captured_at=MAY)
     return {"march": march, "april": april}
+
+
+@pytest.fixture
+def surveys(catalog):
+    return add_visits(catalog)
+
+
+@pytest.fixture(scope="module")
+def asked_often(tmp_path_factory):
+    """A service with those visits, for requests that change nothing; and the ids of the visits."""
+    with running(settings_in(tmp_path_factory.mktemp("service")), RememberingQueue()) as client:
+        yield client, add_visits(catalog_of(client))
 
 
 def found(client, **asked) -> list[tuple[str, float]]:
@@ -68,7 +89,8 @@ def test_changed_tiles_come_newest_visit_first_then_most_certain_first(client, s
         ({"survey": "march", "min_score": 0.7}, ALL[1:2]),
     ],
 )
-def test_a_filter_keeps_what_it_names(client, surveys, asked, expected):
+def test_a_filter_keeps_what_it_names(asked_often, asked, expected):
+    client, surveys = asked_often
     if "survey" in asked:
         asked = {**asked, "survey": surveys[asked["survey"]]}
     assert found(client, **asked) == expected
@@ -90,7 +112,8 @@ def test_a_filter_keeps_what_it_names(client, surveys, asked, expected):
         {"treshold": "0.5"},
     ],
 )
-def test_a_value_that_does_not_match_is_named(client, surveys, asked):
+def test_a_value_that_does_not_match_is_named(asked_often, asked):
+    client, _ = asked_often
     ((name, value),) = asked.items()
     answer = client.get("/maps/lobby/changes", params=asked)
     assert answer.status_code == 422

@@ -3,7 +3,17 @@
 from __future__ import annotations
 
 import pytest
-from samples import MODEL, add_map, add_scan, add_survey, ply
+from samples import (
+    MODEL,
+    RememberingQueue,
+    add_map,
+    add_scan,
+    add_survey,
+    catalog_of,
+    ply,
+    running,
+    settings_in,
+)
 
 from service.api.problems import MEDIA_TYPE, PROBLEMS
 from service.errors import ServiceError
@@ -11,6 +21,15 @@ from service.errors import ServiceError
 RAW = {"Content-Type": "application/octet-stream"}
 JSON = {"Content-Type": "application/json"}
 FORM = {"Content-Type": "multipart/form-data; boundary=b"}
+
+
+@pytest.fixture(scope="module")
+def asked(tmp_path_factory):
+    """A service with a map that is ready and one that is not, for requests that change nothing."""
+    with running(settings_in(tmp_path_factory.mktemp("service")), RememberingQueue()) as client:
+        add_map(catalog_of(client), "ready")
+        add_map(catalog_of(client), "building", ready=False)
+        yield client
 
 
 def problem(answer, status: int, code: str) -> dict:
@@ -63,10 +82,8 @@ def problem(answer, status: int, code: str) -> dict:
         ("GET", "/models/a%20b", 422, "invalid_request"),
     ],
 )
-def test_a_request_without_a_body_ends_in_its_problem(client, catalog, method, path, status, code):
-    add_map(catalog, "ready")
-    add_map(catalog, "building", ready=False)
-    problem(client.request(method, path), status, code)
+def test_a_request_without_a_body_ends_in_its_problem(asked, method, path, status, code):
+    problem(asked.request(method, path), status, code)
 
 
 @pytest.mark.parametrize(
@@ -106,9 +123,8 @@ def test_a_request_without_a_body_ends_in_its_problem(client, catalog, method, p
     ],
 )
 @pytest.mark.parametrize("path", ["/maps", "/maps/ready/surveys"])
-def test_a_body_that_does_not_match_ends_in_its_problem(client, catalog, path, headers, body, status, code):
-    add_map(catalog, "ready")
-    problem(client.post(path, content=body, headers=headers), status, code)
+def test_a_body_that_does_not_match_ends_in_its_problem(asked, path, headers, body, status, code):
+    problem(asked.post(path, content=body, headers=headers), status, code)
 
 
 @pytest.mark.parametrize(
@@ -133,17 +149,16 @@ def test_a_body_that_does_not_match_ends_in_its_problem(client, catalog, path, h
         ({"name": "n" * 201}, "body.name", "n" * 200 + "..."),
     ],
 )
-def test_a_field_that_does_not_match_is_named_with_its_value(client, catalog, fields, place, value):
-    answer = client.post("/maps", json={"scan_ids": [add_scan(catalog).scan_id], **fields})
+def test_a_field_that_does_not_match_is_named_with_its_value(asked, fields, place, value):
+    answer = asked.post("/maps", json={"scan_ids": [add_scan(catalog_of(asked)).scan_id], **fields})
     errors = problem(answer, 422, "invalid_request")["errors"]
     assert [(error["place"], error["value"]) for error in errors] == [(place, value)]
 
 
 @pytest.mark.parametrize("threshold", ["-0.1", "1.1", "NaN", "high"])
-def test_a_threshold_is_a_probability(client, catalog, threshold):
-    add_map(catalog)
-    answer = client.post(
-        "/maps/lobby/surveys", data={"threshold": threshold}, files={"scans": ("a.ply", ply())}
+def test_a_threshold_is_a_probability(asked, threshold):
+    answer = asked.post(
+        "/maps/ready/surveys", data={"threshold": threshold}, files={"scans": ("a.ply", ply())}
     )
     assert problem(answer, 422, "invalid_request")["errors"][0]["place"] == "body.threshold"
 
