@@ -71,9 +71,11 @@ def test_the_server_ends_when_its_parent_is_killed_and_the_folder_is_free_again(
         server_pid = int(holder.stdout.readline())
         os.kill(server_pid, signal.SIGSTOP)  # it cannot end yet, and might still write
         holder.send_signal(signal.SIGKILL)
-    with pytest.raises(DataFolderInUse):
-        EmbeddedRedis(folder).start()
-    os.kill(server_pid, signal.SIGCONT)
+    try:
+        with pytest.raises(DataFolderInUse):
+            EmbeddedRedis(folder).start()
+    finally:
+        os.kill(server_pid, signal.SIGCONT)
     end = time.monotonic() + 10
     while Path(f"/proc/{server_pid}").exists():
         assert time.monotonic() < end, "the server outlived its parent"
