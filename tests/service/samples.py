@@ -1,15 +1,22 @@
-"""What the tests of the service put into the catalog, and a queue that only remembers."""
+"""What the tests of the service put into the catalog, and a queue that only remembers.
+
+The tests run on SQLite. With SPICD_TEST_DATABASE_URL (a PostgreSQL server, any database of it) each test makes a
+database of its own there, and leaves it.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import json
+import os
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
+from uuid import uuid4
 
 from fastapi.testclient import TestClient
+from sqlalchemy import create_engine, make_url, text
 
 from service.api.app import create_app
 from service.catalog.catalog import Catalog
@@ -49,8 +56,26 @@ def settings_in(folder: Path) -> Settings:
     card.parent.mkdir(parents=True)
     card.write_text(json.dumps({"name": "spicd-net", "version": "1", "threshold": 0.5}))
     return Settings(
-        data_dir=folder / "data", model_store=folder / "models", model=MODEL, max_upload_bytes=200_000
+        data_dir=folder / "data",
+        model_store=folder / "models",
+        model=MODEL,
+        max_upload_bytes=200_000,
+        database_url=fresh_database(),
     )
+
+
+def fresh_database() -> str | None:
+    """A new database on the server that the environment names; None, which is SQLite, where it names none."""
+    server = os.environ.get("SPICD_TEST_DATABASE_URL")
+    if server is None:
+        return None
+    name = f"spicd_{uuid4().hex}"
+    url = make_url(server).set(drivername="postgresql+psycopg")
+    engine = create_engine(url, isolation_level="AUTOCOMMIT")
+    with engine.connect() as connection:
+        connection.execute(text(f"CREATE DATABASE {name}"))
+    engine.dispose()
+    return url.set(database=name).render_as_string(hide_password=False)
 
 
 @contextlib.contextmanager
