@@ -1,0 +1,139 @@
+"""The network of Section 3.6: its shapes, its identities, and that the fast layers are the plain ones."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import nn
+
+from worker.detectors.spicd_net.chamfer import chamfer_statistics
+from worker.detectors.spicd_net.frozen import FrozenEncoder
+from worker.detectors.spicd_net.layers import Moments, NormedLinear, PooledLinear
+from worker.detectors.spicd_net.network import PairHead, SpicdNetwork, TransformNet
+
+SIZES = [40, 25, 60]
+
+
+@pytest.fixture
+def clouds() -> torch.Tensor:
+    torch.manual_seed(1)
+    return torch.randn(sum(SIZES), 6)
+
+
+def plain(layer: NormedLinear) -> nn.Sequential:
+    """The same layer, written out."""
+    outputs, inputs = layer.weight.shape
+    linear, norm = nn.Linear(inputs, outputs, bias=False), nn.BatchNorm1d(outputs)
+    with torch.no_grad():
+        linear.weight.copy_(layer.weight)
+        norm.weight.copy_(layer.gamma)
+        norm.bias.copy_(layer.beta)
+    return nn.Sequential(linear, norm)
+
+
+def lived_in(layer: NormedLinear) -> NormedLinear:
+    with torch.no_grad():
+        layer.gamma.copy_(torch.randn(len(layer.gamma)))  # of either sign: a maximum may become a minimum
+        layer.beta.copy_(torch.randn(len(layer.beta)))
+    return layer
+
+
+def test_a_normed_linear_is_linear_then_batch_norm_with_its_gradients_and_running_statistics(clouds):
+    layer = lived_in(NormedLinear(6, 9))
+    reference = plain(layer)
+    x, y = clouds.clone().requires_grad_(), clouds.clone().requires_grad_()
+    weights = torch.randn(len(clouds), 9)
+    (layer(x) * weights).sum().backward()
+    (reference(y) * weights).sum().backward()
+    assert torch.allclose(layer(clouds), reference(clouds), atol=1e-5)
+    assert torch.allclose(x.grad, y.grad, atol=1e-5)
+    assert torch.allclose(layer.weight.grad, reference[0].weight.grad, atol=1e-4)
+    assert torch.allclose(layer.running_mean, reference[1].running_mean, atol=1e-6)
+    assert torch.allclose(layer.running_var, reference[1].running_var, atol=1e-5)
+
+
+def test_a_pooled_linear_is_linear_batch_norm_and_max_with_its_gradients(clouds):
+    layer = lived_in(PooledLinear(6, 9))
+    reference = plain(layer)
+    x, y = clouds.clone().requires_grad_(), clouds.clone().requires_grad_()
+    pooled = layer(x, SIZES)
+    written_out = torch.stack([cloud.amax(0) for cloud in reference(y).split(SIZES)])
+    weights = torch.randn_like(pooled)
+    (pooled * weights).sum().backward()
+    (written_out * weights).sum().backward()
+    assert torch.allclose(pooled, written_out, atol=1e-5)
+    assert torch.allclose(x.grad, y.grad, atol=1e-5)
+    assert torch.allclose(layer.weight.grad, reference[0].weight.grad, atol=1e-4)
+
+
+def test_the_gradient_of_the_moments_is_the_numerical_one():
+    assert torch.autograd.gradcheck(Moments.apply, torch.randn(20, 4, dtype=torch.double, requires_grad=True))
+
+
+@pytest.mark.parametrize("k", [3, 64])
+def test_an_untrained_t_net_gives_the_identity(k):
+    net = TransformNet(k).eval()
+    assert torch.equal(net(torch.randn(50, k), [20, 30]), torch.eye(k).repeat(2, 1, 1))
+
+
+def test_the_layers_have_the_papers_widths():
+    net = SpicdNetwork()
+    widths = [tuple(m.weight.shape) for m in net.head.modules() if isinstance(m, nn.Linear)]
+    assert widths == [(64, 8), (32, 64), (256, 2080), (128, 256), (3, 128)]
+    encoder = net.encoder
+    shapes = [tuple(m.weight.shape) for m in (encoder.mlp1, encoder.mlp2, encoder.mlp3, encoder.mlp4)]
+    assert shapes == [(64, 3), (64, 64), (128, 64), (1024, 128)]
+
+
+def test_a_descriptor_does_not_depend_on_the_order_of_the_points(network):
+    cloud = torch.rand(150, 3) - 0.5
+    with torch.no_grad():
+        first, again = (network.encoder(c, [150])[0] for c in (cloud, cloud[torch.randperm(150)]))
+    assert torch.allclose(first, again, atol=1e-5)
+
+
+def test_a_cloud_is_encoded_the_same_alone_and_among_others(network):
+    cloud, other = torch.rand(150, 3) - 0.5, torch.rand(70, 3) - 0.5
+    with torch.no_grad():
+        alone = network.encoder(cloud, [150])[0][0]
+        among = network.encoder(torch.cat([other, cloud]), [70, 150])[0][1]
+    assert torch.allclose(alone, among, atol=1e-5)
+
+
+def test_the_frozen_encoder_on_distinct_points_is_the_network_on_repeated_ones(network):
+    cloud = torch.rand(700, 3) - 0.5  # more than one piece
+    repeated = torch.cat([cloud, cloud, cloud[:100]])
+    with torch.no_grad():
+        expected = network.encoder(repeated - repeated.mean(0), [1500])[0][0]
+    found = FrozenEncoder(network.encoder)(cloud, repeated.mean(0))
+    assert torch.allclose(found, expected, atol=1e-5)
+    assert expected.std() > 0.01  # the network tells channels apart, so that the line above says something
+
+
+def test_chamfer_statistics_of_a_shifted_copy_are_the_shift():
+    grid = torch.stack(torch.meshgrid(*[torch.arange(5.0)] * 3, indexing="ij"), -1).reshape(1, 125, 3)
+    shifted = grid + torch.tensor([0.0, 0.0, 0.3])
+    expected = torch.full((1, 8), 1.3).log()
+    assert torch.allclose(chamfer_statistics(grid, shifted), expected, atol=1e-4)
+
+
+def test_chamfer_statistics_see_the_lone_point_in_its_direction_only():
+    near = torch.zeros(1, 128, 3)
+    far = near.clone()
+    far[0, 0, 0] = 2.0
+    statistics = chamfer_statistics(near, far).expm1()
+    assert statistics[0].tolist() == pytest.approx([0, 0, 0, 0, 2 / 128, 2, 0, 0], abs=1e-5)
+
+
+def test_the_chamfer_feature_is_gated_in_training_only():
+    head = PairHead()
+    for layer in head.classifier:
+        if isinstance(layer, nn.Dropout):
+            layer.p = 0.0
+    descriptors = torch.zeros(400, 1024)
+    statistics = torch.ones(400, 8)
+    in_use = head.eval()(descriptors, descriptors, statistics)
+    assert torch.allclose(in_use, in_use[:1].expand_as(in_use), atol=1e-6)
+    torch.manual_seed(0)
+    gated = (head.train()(descriptors, descriptors, statistics) - in_use[0]).abs().amax(1) > 1e-6
+    assert 0.12 < gated.float().mean() < 0.28  # 0.2 of 400, four sigmas either way

@@ -1,0 +1,69 @@
+"""A model is opened only if its files are those of its card."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from worker.detectors.spicd_net.detector import SpicdNet
+from worker.detectors.store import open_detector
+from worker.errors import DetectorUnavailable
+
+
+def edit(card_path, **fields) -> None:
+    card_path.write_text(json.dumps({**json.loads(card_path.read_text()), **fields}))
+
+
+def test_an_opened_model_scores_as_the_network_it_was_saved_from(model_store, network, card, pairs):
+    opened = open_detector(model_store, "spicd-net/7", device="cpu")
+    assert opened.card.version == "7"
+    expected = SpicdNet(card, network, torch.device("cpu")).score(pairs)
+    assert np.array_equal(opened.score(pairs).probabilities, expected.probabilities, equal_nan=True)
+
+
+def test_weights_that_are_not_the_cards_are_refused(model_store):
+    weights = model_store / "spicd-net" / "7" / "weights.safetensors"
+    content = bytearray(weights.read_bytes())
+    content[-1] ^= 1
+    weights.write_bytes(content)
+    with pytest.raises(DetectorUnavailable, match="sha256"):
+        open_detector(model_store, "spicd-net/7")
+
+
+def test_a_card_without_a_hash_vouches_for_nothing(model_store):
+    edit(model_store / "spicd-net" / "7" / "card.json", sha256=None)
+    with pytest.raises(DetectorUnavailable, match="sha256"):
+        open_detector(model_store, "spicd-net/7")
+
+
+@pytest.mark.parametrize("name", ["spicd-net/8", "other/1"])
+def test_an_unknown_model_is_named(model_store, name):
+    with pytest.raises(DetectorUnavailable, match="no model at"):
+        open_detector(model_store, name)
+
+
+@pytest.mark.parametrize("name", ["spicd-net", "../spicd-net/7", "spicd-net/..", "/7", "a/b/c"])
+def test_a_name_cannot_leave_the_store(model_store, name):
+    with pytest.raises(DetectorUnavailable, match="name/version"):
+        open_detector(model_store, name)
+
+
+def test_an_unknown_detector_is_refused_with_those_there_are(model_store):
+    edit(model_store / "spicd-net" / "7" / "card.json", detector="voxels")
+    with pytest.raises(DetectorUnavailable, match=r"'voxels'.*spicd-net"):
+        open_detector(model_store, "spicd-net/7")
+
+
+def test_an_unsound_card_is_refused(model_store):
+    edit(model_store / "spicd-net" / "7" / "card.json", threshold=3)
+    with pytest.raises(DetectorUnavailable, match="threshold"):
+        open_detector(model_store, "spicd-net/7")
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_a_missing_gpu_is_said(model_store):
+    with pytest.raises(DetectorUnavailable, match="cuda"):
+        open_detector(model_store, "spicd-net/7", device="cuda")

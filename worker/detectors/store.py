@@ -1,0 +1,95 @@
+"""Opens the models of `model_store/`: a card, and weights that match it."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Literal
+
+import pydantic
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load
+
+from worker.detectors.card import Card
+from worker.detectors.detector import Detector
+from worker.detectors.spicd_net.detector import SpicdNet
+from worker.errors import DetectorUnavailable
+
+Device = Literal["auto", "cpu", "cuda"]
+Weights = dict[str, torch.Tensor]
+
+#: A new detector is one class and one entry here: card, weights and device to Detector.
+DETECTORS: dict[str, Callable[[Card, Weights, torch.device], Detector]] = {"spicd-net": SpicdNet.load}
+
+
+def open_detector(model_store: Path, name: str = "spicd-net/1", device: Device = "auto") -> Detector:
+    """The detector `<name>/<version>`, ready to score.
+
+    Raises DetectorUnavailable when there is no such model, its card is unsound, its weights are not those of
+    the card, or the device is not there.
+    """
+    card = open_card(model_store, name)
+    if card.detector not in DETECTORS:
+        raise DetectorUnavailable(
+            f"model {name}: no detector {card.detector!r}; there are {sorted(DETECTORS)}"
+        )
+    weights = _read_weights(_folder(model_store, name), card)
+    try:
+        return DETECTORS[card.detector](card, weights, resolve_device(device))
+    except (RuntimeError, ValueError) as unsound:
+        raise DetectorUnavailable(f"model {name}: {unsound}") from unsound
+
+
+def open_card(model_store: Path, name: str) -> Card:
+    """The card of `<name>/<version>` without its weights. Raises DetectorUnavailable."""
+    return read_card(_folder(model_store, name))
+
+
+def read_card(folder: Path) -> Card:
+    """The card in a model's folder. Raises DetectorUnavailable."""
+    path = folder / "card.json"
+    try:
+        return Card.model_validate_json(path.read_bytes())
+    except OSError as missing:
+        raise DetectorUnavailable(f"no model at {folder}: {missing.strerror}") from missing
+    except pydantic.ValidationError as unsound:
+        raise DetectorUnavailable(
+            f"{path}: {unsound.error_count()} fields are unsound: {unsound}"
+        ) from unsound
+
+
+def resolve_device(device: Device) -> torch.device:
+    """The device to run on; `auto` is the GPU when there is one. Raises DetectorUnavailable."""
+    if device == "cuda" and not torch.cuda.is_available():
+        raise DetectorUnavailable("device cuda is asked for, but torch finds no CUDA GPU; use auto or cpu")
+    if device == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    return torch.device(device)
+
+
+def _folder(model_store: Path, name: str) -> Path:
+    parts = name.split("/")
+    if len(parts) != 2 or any(part in ("", ".", "..") or "\\" in part for part in parts):
+        raise DetectorUnavailable(f"model {name!r} is not of the form name/version")
+    return model_store / parts[0] / parts[1]
+
+
+def _read_weights(folder: Path, card: Card) -> Weights:
+    """The weights named by the card, read once so that what is hashed is what is loaded."""
+    if card.weights is None:
+        return {}
+    path = folder / card.weights
+    try:
+        content = path.read_bytes()
+    except OSError as missing:
+        raise DetectorUnavailable(f"no weights at {path}: {missing.strerror}") from missing
+    found = hashlib.sha256(content).hexdigest()
+    if found != card.sha256:
+        raise DetectorUnavailable(f"{path} has sha256 {found}, its card says {card.sha256}")
+    try:
+        weights: Weights = load(content)
+    except SafetensorError as unsound:
+        raise DetectorUnavailable(f"{path} is no safetensors file: {unsound}") from unsound
+    return weights
