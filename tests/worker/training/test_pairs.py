@@ -1,0 +1,163 @@
+"""The composition of Section 3.5.3."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from worker.training.augmentation import (
+    Augmentation,
+    Nuisance,
+    augmented,
+    replenished,
+    second_look,
+    turned_alike,
+)
+from worker.training.dataset import TileSet, load_tiles, save_tiles, split_tiles
+from worker.training.pairs import PairMaker, PairSettings, composition
+
+STILL = Augmentation(jitter=0, dropout=0, shift=0, yaw=0)
+SAME_LOOK = Nuisance(yaw=0, shift=0, dropout=(0, 0), magnitude=(-0.02, -0.02))  # 0.001 + 0.05 m is 0
+PLAIN = PairSettings(
+    patch_points=512, augmentation=STILL, nuisance=SAME_LOOK, symmetries=False, rerun_share=1.0
+)
+
+
+def rows(points: np.ndarray) -> set[tuple[float, ...]]:
+    return set(map(tuple, points.round(4)))
+
+
+def test_the_classes_have_their_exact_shares():
+    assert np.bincount(composition(2000, (0.50, 0.35, 0.15))).tolist() == [1000, 700, 300]
+
+
+def test_a_batch_holds_both_branches_end_to_end_about_their_centroids(tiles):
+    (batch, *rest) = PairMaker(tiles, PairSettings()).batches(20, 8, np.random.default_rng(0))
+    assert len(rest) == 1  # 20 pairs are two batches of 8
+    assert len(batch.sizes) == 16
+    assert sum(batch.sizes) == len(batch.points)
+    for cloud in np.split(batch.points, np.cumsum(batch.sizes)[:-1]):
+        assert cloud.mean(axis=0) == pytest.approx(0, abs=1e-5)
+    assert batch.reference_sample.shape == batch.current_sample.shape == (8, 128, 3)
+
+
+def test_the_same_stream_gives_the_same_pairs(tiles):
+    maker = PairMaker(tiles, PairSettings())
+    first, again = (next(maker.batches(8, 8, np.random.default_rng(5))) for _ in range(2))
+    assert np.array_equal(first.points, again.points)
+    assert np.array_equal(first.labels, again.labels)
+
+
+def test_with_no_nuisance_an_unchanged_pair_of_one_visit_is_the_same_tile(tiles):
+    pair = PairMaker(tiles, replace(PLAIN, revisit_share=0.0)).pair(0, np.random.default_rng(0))
+    assert rows(pair.reference) == rows(pair.current)
+
+
+def test_revisits_pair_the_two_observations_of_one_tile(tiles):
+    maker = PairMaker(tiles, replace(PLAIN, revisit_share=1.0))
+    both = {frozenset((frozenset(rows(a)), frozenset(rows(b)))) for a, b in _visits(tiles)}
+    for seed in range(10):
+        pair = maker.pair(0, np.random.default_rng(seed))
+        assert frozenset((frozenset(rows(pair.reference)), frozenset(rows(pair.current)))) in both
+
+
+def test_a_changed_pair_differs_by_a_cluster(tiles):
+    maker = PairMaker(tiles, replace(PLAIN, revisit_share=0.0))
+    for seed in range(10):
+        pair = maker.pair(1, np.random.default_rng(seed))
+        differing = rows(pair.reference) ^ rows(pair.current)
+        share = len(differing) / len(pair.reference)
+        assert 0.05 < share < 0.2  # 7.5% gone or come, twice that if moved
+
+
+def test_different_tiles_are_3_m_apart_or_of_two_buildings(tiles):
+    maker = PairMaker(tiles, PLAIN)
+    owner = {frozenset(rows(points)): i for i, points in enumerate(tiles.points_a)}
+    within = 0
+    for seed in range(60):
+        pair = maker.pair(2, np.random.default_rng(seed))
+        i, j = (owner[frozenset(rows(points))] for points in (pair.reference, pair.current))
+        if tiles.buildings[i] == tiles.buildings[j]:
+            within += 1
+            assert np.linalg.norm(tiles.centres[i] - tiles.centres[j]) >= 3.0
+    assert within > 5  # both kinds were drawn
+    assert within < 55
+
+
+def test_a_second_look_loses_points_and_keeps_the_shape_at_half_intensity(tiles):
+    reference = tiles.points_a[0]
+    nuisance = replace(SAME_LOOK, dropout=(0.5, 0.5))
+    for intensity, expected in ((1.0, 0.5), (0.5, 0.75)):
+        _, current = second_look(reference, reference, nuisance, intensity, np.random.default_rng(0))
+        assert len(current) == round(expected * len(reference))
+        assert rows(current) <= rows(reference)
+
+
+def test_both_looks_are_turned_and_shifted_together(tiles):
+    points = tiles.points_a[0]
+    nuisance = replace(SAME_LOOK, yaw=1.0, shift=0.3)
+    reference, current = second_look(points, points, nuisance, 1.0, np.random.default_rng(0))
+    assert rows(reference) == rows(current)
+    assert np.abs(reference - points).max() > 0.1
+
+
+def test_replenished_points_lie_beside_points_that_are_left(tiles):
+    points = tiles.points_a[0]
+    filled = replenished(points, Augmentation(dropout=0.2), np.random.default_rng(0))
+    new = filled[(filled != points).any(axis=1)]
+    old = filled[(filled == points).all(axis=1)]
+    assert len(new) == round(0.2 * len(points))
+    distance = np.linalg.norm(new[:, None] - old, axis=2).min(axis=1)
+    assert distance.max() < 6 * 0.002
+
+
+def test_augmentation_of_a_branch_is_small(tiles):
+    points = tiles.points_a[0]
+    moved = augmented(points, Augmentation(dropout=0), np.random.default_rng(0)) - points
+    assert 0.004 < moved.std(axis=0).mean() < 0.03
+
+
+def test_symmetries_keep_the_tile_and_the_distances(tiles):
+    a, b = tiles.points_a[0], tiles.points_a[1]
+    count = min(len(a), len(b))
+    seen = set()
+    for seed in range(40):
+        turned_a, turned_b = turned_alike(a, b, np.random.default_rng(seed))
+        apart = np.linalg.norm(turned_a[:count] - turned_b[:count], axis=1)
+        assert apart == pytest.approx(np.linalg.norm(a[:count] - b[:count], axis=1), abs=1e-6)
+        assert (np.abs(turned_a) <= [0.75, 0.75, 0.5]).all()
+        seen.add(tuple(turned_a[0].round(5)))
+    assert len(seen) == 8
+
+
+def test_a_saved_set_comes_back_within_half_a_millimetre(tiles, tmp_path):
+    save_tiles(tiles, tmp_path / "tiles.npz")
+    loaded = load_tiles(tmp_path / "tiles.npz")
+    for before, after in zip(
+        (*tiles.points_a, *tiles.points_b), (*loaded.points_a, *loaded.points_b), strict=True
+    ):
+        assert after == pytest.approx(before, abs=5e-4)
+    assert np.array_equal(loaded.centres, tiles.centres)
+    assert np.array_equal(loaded.buildings, tiles.buildings)
+    assert (loaded.tile_size, loaded.source) == (tiles.tile_size, tiles.source)
+
+
+def test_a_file_of_another_kind_is_refused(tmp_path):
+    np.savez(tmp_path / "other.npz", something=1)
+    with pytest.raises(ValueError, match="no training set"):
+        load_tiles(tmp_path / "other.npz")
+
+
+def test_the_split_holds_out_one_region_of_every_building(tiles):
+    training, validation = split_tiles(tiles, share=0.2, seed=1)
+    assert (len(training), len(validation)) == (32, 8)
+    for building in (0, 1):
+        region = validation.centres[validation.buildings == building]
+        assert len(region) == 4
+        assert np.ptp(region, axis=0).max() <= 3.0 + 1e-9  # four of twenty tiles, side by side
+
+
+def _visits(tiles: TileSet) -> list[tuple[np.ndarray, np.ndarray]]:
+    return list(zip(tiles.points_a, tiles.points_b, strict=True))

@@ -1,0 +1,179 @@
+"""Makes a model of a checkpoint: weights, and a card that says what they are (`model_store/`).
+
+It stands apart from training, which needs torch and NumPy alone: a GPU machine hands its checkpoint back.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import platform
+import sys
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from safetensors.torch import save
+
+from worker.detectors.card import Card, Preprocessing
+from worker.detectors.spicd_net.detector import SpicdNet
+from worker.detectors.store import Weights
+from worker.pipeline.tiling import TileGrid, TilePairs, Tiles
+from worker.training.calibration import (
+    PREVALENCE,
+    SurveyPairs,
+    area_under_roc,
+    best_threshold,
+    operating,
+    survey_pairs,
+)
+from worker.training.dataset import TileSet, load_tiles, split_tiles
+from worker.training.pairs import PairSettings
+
+WEIGHTS = "weights.safetensors"
+VOXEL_SIZE, MIN_POINTS = 0.05, 512  #: paper, Table 3; the training tiles are made with the same
+
+DEVIATIONS = (
+    "encoder and T-Nets with batch normalisation as in PointNet, which the paper does not mention",
+    "patches enter as their distinct points, in training too; augmentation is applied before repetition",
+    "revisit_share of the pairs are two independent simulated visits, not one tile sampled twice",
+    "pairs are turned by the square's symmetries; range of change density as given in settings",
+)
+
+
+def publish(
+    checkpoint: Path,
+    tiles: Path,
+    model_store: Path,
+    *,
+    unseen: Path | None = None,
+    version: str = "1",
+    summary: str,
+    command: str = "",
+    name: str = "spicd-net",
+) -> Path:
+    """Write `model_store/<name>/<version>/`, its threshold chosen on the validation tiles; returns the folder.
+
+    `unseen` is a training set of other buildings, on which the card's evaluation is measured; without one
+    the validation tiles serve for that too, and the card says so.
+    """
+    state = torch.load(checkpoint, map_location="cpu", weights_only=True)
+    settings, training_set = state["settings"], load_tiles(tiles)
+    validation = split_tiles(training_set, share=settings["held_out"])[1]
+    card = Card(
+        name=name,
+        version=version,
+        detector="spicd-net",
+        summary=summary,
+        threshold=0.5,
+        preprocessing=Preprocessing(
+            voxel_size=VOXEL_SIZE,
+            tile_size=training_set.tile_size,
+            patch_points=settings["pairs"]["patch_points"],
+            min_points=MIN_POINTS,
+            seed=settings["seed"],
+        ),
+        weights=WEIGHTS,
+        training=_training(state, training_set, command),
+        licence="MIT",
+        sources=("method: AI 2026, 7(4), 141, https://doi.org/10.3390/ai7040141",),
+    )
+    detector = SpicdNet.load(card, state["network"], torch.device("cpu"))
+    pair_settings = _pair_settings(settings)
+    pairs = survey_pairs(validation, pair_settings, seed=settings["seed"])
+    scores = change_scores(detector, pairs)
+    chosen = best_threshold(scores, pairs)
+    evaluation: dict[str, Any] = {"validation": _measured(chosen.threshold, scores, pairs)}
+    if unseen is not None:
+        other = survey_pairs(load_tiles(unseen), pair_settings, seed=settings["seed"])
+        evaluation["unseen buildings"] = _measured(chosen.threshold, change_scores(detector, other), other)
+    evaluation["pairs"] = (
+        "two independent simulated visits, the second with a synthetic change or none (paper, Section 3.5.1), "
+        f"no augmentation; precision and F1 for {PREVALENCE:.0%} changed tiles"
+    )
+    return _write(
+        model_store / name / version,
+        card.model_copy(update={"threshold": chosen.threshold, "evaluation": evaluation}),
+        state["network"],
+    )
+
+
+def change_scores(detector: SpicdNet, pairs: SurveyPairs) -> NDArray[np.float32]:
+    """(P,) probability of change, by the path that a survey takes."""
+    size = np.array(detector.card.preprocessing.tile_size)
+    grid = TileGrid(origin=-size / 2, size=size, shape=(1, 1, 1))  # its one tile is centred at the origin
+    count = len(pairs.reference)
+    tiles = Tiles(grid=grid, indices=np.zeros((count, 3), np.int32), points=pairs.reference)
+    observed = np.ones(count, dtype=np.bool_)
+    return detector.score(TilePairs(reference=tiles, current=pairs.current, observed=observed)).change
+
+
+def _measured(threshold: float, scores: NDArray[np.float32], pairs: SurveyPairs) -> dict[str, Any]:
+    return {
+        "pairs": len(pairs.kinds),
+        "area_under_roc": area_under_roc(scores, pairs.changed),
+        **asdict(operating(threshold, scores, pairs)),
+    }
+
+
+def _training(state: dict[str, Any], tiles: TileSet, command: str) -> dict[str, Any]:
+    return {
+        "command": command,
+        "settings": state["settings"],
+        "best_epoch": state["best_epoch"],
+        "seconds_to_best": round(state["seconds"]),
+        "paper": "up to 1,000 epochs, 276 run (Section 3.8)",
+        "validation_pairs": state["measured"],
+        "tiles": len(tiles),
+        "tile_source": tiles.source,
+        "deviations": list(DEVIATIONS),
+        "torch": torch.__version__,
+        "machine": platform.machine(),
+    }
+
+
+def _pair_settings(settings: dict[str, Any]) -> PairSettings:
+    kept = {name: value for name, value in settings["pairs"].items() if name in ("magnitude", "density")}
+    return PairSettings(**kept)
+
+
+def _write(folder: Path, card: Card, weights: Weights) -> Path:
+    """The weights before the card that vouches for them."""
+    content = save({name: tensor.contiguous() for name, tensor in weights.items()})
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / WEIGHTS).write_bytes(content)
+    signed = card.model_copy(update={"sha256": hashlib.sha256(content).hexdigest()})
+    text = json.dumps(signed.model_dump(mode="json"), indent=2, allow_nan=False)
+    (folder / "card.json").write_text(text + "\n", encoding="utf-8")
+    return folder
+
+
+def main() -> None:
+    """`python -m worker.evaluation.publish CHECKPOINT TILES`"""
+    parser = argparse.ArgumentParser(prog="python -m worker.evaluation.publish")
+    parser.add_argument("checkpoint", type=Path)
+    parser.add_argument("tiles", type=Path, help="the training set that it was made with")
+    parser.add_argument("--unseen", type=Path, help="tiles of other buildings, to measure on")
+    parser.add_argument("--store", type=Path, default=Path("model_store"))
+    parser.add_argument("--version", default="1")
+    parser.add_argument("--summary", default="SPICD-Net as the paper describes it")
+    parser.add_argument("--command", default="", help="how the training was started, for the card")
+    given = parser.parse_args()
+    folder = publish(
+        given.checkpoint,
+        given.tiles,
+        given.store,
+        unseen=given.unseen,
+        version=given.version,
+        summary=given.summary,
+        command=given.command,
+    )
+    sys.stdout.write(f"{folder}\n")
+
+
+if __name__ == "__main__":
+    main()

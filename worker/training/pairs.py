@@ -1,0 +1,161 @@
+"""Training pairs from tiles without any label (paper, Section 3.5.3)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worker.pipeline.patches import patch
+from worker.pipeline.values import Points
+from worker.training.anomalies import OPERATIONS, Change
+from worker.training.augmentation import Augmentation, Nuisance, augmented, second_look, turned_alike
+from worker.training.dataset import TileSet
+
+UNCHANGED, CHANGED, DIFFERENT = 0, 1, 2
+SAMPLE_POINTS = 128  #: of the Chamfer branch (paper, Section 3.6.3)
+STORED_JITTER = 0.0001  #: metres, where the stored reference patch itself comes back
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class PairSettings:
+    """How pairs are made; the defaults are the paper's but for the two that say so."""
+
+    patch_points: int = 4096  #: points of a padded patch
+    shares: tuple[float, float, float] = (0.50, 0.35, 0.15)  #: of the three classes
+    rerun_share: float = (
+        0.7  #: of unchanged pairs of one observation: sampled anew, the rest are stored patches
+    )
+    revisit_share: float = 0.75  #: ours: pairs of both visits, where there are two; 0 is the paper's protocol
+    revisit_intensity: float = 0.5  #: ours: of the nuisance on such pairs, whatever the class
+    changed_intensity: float = 0.5  #: of the nuisance on changed pairs
+    magnitude: tuple[float, float] = (0.10, 0.50)  #: metres
+    density: tuple[float, float] = (0.075, 0.075)  #: share of the tile's points; the paper fixes 7.5%
+    min_separation: float = 3.0  #: metres between different tiles of one building
+    symmetries: bool = True  #: ours: both patches under one of the square's eight symmetries
+    augmentation: Augmentation = field(default_factory=Augmentation)
+    nuisance: Nuisance = field(default_factory=Nuisance)
+
+
+@dataclass(frozen=True, slots=True)
+class Pair:
+    """One example."""
+
+    reference: Points  #: (n, 3) float32, metres, tile-centre frame: a patch's distinct points
+    current: Points  #: (m, 3)
+    reference_sample: Points  #: (128, 3), for the Chamfer branch
+    current_sample: Points  #: (128, 3)
+    label: int  #: 0 unchanged, 1 changed, 2 different place
+
+
+@dataclass(frozen=True, slots=True)
+class Batch:
+    """B examples as the network takes them."""
+
+    points: Points  #: (P, 3) float32: 2 B clouds end to end, references first, each with its centroid at 0
+    sizes: list[int]  #: of the clouds
+    reference_sample: Points  #: (B, 128, 3)
+    current_sample: Points  #: (B, 128, 3)
+    labels: NDArray[np.int64]  #: (B,)
+
+
+class PairMaker:
+    """Draws pairs from a set of tiles; the same generator gives the same pairs."""
+
+    def __init__(self, tiles: TileSet, settings: PairSettings) -> None:
+        if len(tiles) < 2:
+            raise ValueError(f"pairs need at least two tiles, there are {len(tiles)}")
+        self._tiles = tiles
+        self._settings = settings
+        self._half = (np.asarray(tiles.tile_size) / 2).astype(np.float32)
+
+    def batches(self, count: int, size: int, rng: np.random.Generator) -> Iterator[Batch]:
+        """`count` pairs in the classes' exact shares, in random order, `size` at a time; a last few are left out."""
+        labels = rng.permutation(composition(count, self._settings.shares))
+        for start in range(0, count - size + 1, size):
+            yield batched([self.pair(int(label), rng) for label in labels[start : start + size]])
+
+    def pair(self, label: int, rng: np.random.Generator) -> Pair:
+        """One example of a class."""
+        settings = self._settings
+        if label == DIFFERENT:
+            reference, current = self._different(rng)
+        elif label == CHANGED:
+            reference, current = self._changed(rng)
+        else:
+            reference, current = self._unchanged(rng)
+        if settings.symmetries:
+            reference, current = turned_alike(reference, current, rng)
+        reference = augmented(reference, settings.augmentation, rng)
+        current = augmented(current, settings.augmentation, rng)
+        return Pair(reference, current, self._sample(reference, rng), self._sample(current, rng), label)
+
+    def _unchanged(self, rng: np.random.Generator) -> tuple[Points, Points]:
+        first, second, revisit = self._two_looks(rng)
+        if not revisit and rng.random() >= self._settings.rerun_share:
+            stored = self._patch(first, rng)
+            return stored, (stored + rng.normal(scale=STORED_JITTER, size=stored.shape)).astype(np.float32)
+        intensity = self._settings.revisit_intensity if revisit else 1.0
+        return self._sampled(first, second, intensity, rng)
+
+    def _changed(self, rng: np.random.Generator) -> tuple[Points, Points]:
+        settings = self._settings
+        first, second, revisit = self._two_looks(rng)
+        operation = OPERATIONS[str(rng.choice(list(OPERATIONS)))]
+        change = Change(magnitude=rng.uniform(*settings.magnitude), density=rng.uniform(*settings.density))
+        intensity = settings.revisit_intensity if revisit else settings.changed_intensity
+        return self._sampled(first, operation(second, change, self._half, rng), intensity, rng)
+
+    def _different(self, rng: np.random.Generator) -> tuple[Points, Points]:
+        """Tiles of two buildings, or at least `min_separation` apart in one (any other tile if none is)."""
+        tiles = self._tiles
+        i = int(rng.integers(len(tiles)))
+        away = np.linalg.norm(tiles.centres - tiles.centres[i], axis=1) >= self._settings.min_separation
+        others = np.flatnonzero(away | (tiles.buildings != tiles.buildings[i]))
+        if len(others) == 0:
+            raise ValueError(f"no tile is {self._settings.min_separation} m from tile {i}")
+        j = int(rng.choice(others))
+        return self._patch(tiles.points_a[i], rng), self._patch(tiles.points_a[j], rng)
+
+    def _two_looks(self, rng: np.random.Generator) -> tuple[Points, Points, bool]:
+        """Two dense looks at a random tile, and whether they are of two visits (in either order)."""
+        i = int(rng.integers(len(self._tiles)))
+        a, b = self._tiles.points_a[i], self._tiles.points_b[i]
+        if len(b) == 0 or rng.random() >= self._settings.revisit_share:
+            return a, a, False
+        return (a, b, True) if rng.random() < 0.5 else (b, a, True)
+
+    def _sampled(
+        self, first: Points, second: Points, intensity: float, rng: np.random.Generator
+    ) -> tuple[Points, Points]:
+        reference, current = second_look(first, second, self._settings.nuisance, intensity, rng)
+        return self._patch(reference, rng), self._patch(current, rng)
+
+    def _patch(self, points: Points, rng: np.random.Generator) -> Points:
+        """The distinct points of a patch: what repeats would add, a max-pool does not see."""
+        return patch(points, size=self._settings.patch_points, seed=int(rng.integers(2**31))).distinct
+
+    def _sample(self, distinct: Points, rng: np.random.Generator) -> Points:
+        """(128, 3) of the padded patch without replacement, drawn anew each time (paper, Section 3.6.3)."""
+        places = rng.choice(self._settings.patch_points, SAMPLE_POINTS, replace=False)
+        return distinct[places % len(distinct)]
+
+
+def composition(count: int, shares: tuple[float, float, float]) -> NDArray[np.int64]:
+    """(count,) labels in exact shares, in order; what rounding leaves goes to the first class."""
+    changed, different = (round(count * share) for share in shares[1:])
+    return np.repeat([UNCHANGED, CHANGED, DIFFERENT], [count - changed - different, changed, different])
+
+
+def batched(pairs: list[Pair]) -> Batch:
+    """References before currents, every cloud about its centroid."""
+    clouds = [pair.reference for pair in pairs] + [pair.current for pair in pairs]
+    return Batch(
+        np.concatenate([cloud - cloud.mean(axis=0) for cloud in clouds]),
+        [len(cloud) for cloud in clouds],
+        np.stack([pair.reference_sample for pair in pairs]),
+        np.stack([pair.current_sample for pair in pairs]),
+        np.array([pair.label for pair in pairs], dtype=np.int64),
+    )

@@ -1,0 +1,245 @@
+"""Trains SPICD-Net (paper, Section 3.8) and can be stopped and taken up again."""
+
+from __future__ import annotations
+
+import csv
+import time
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from worker.detectors.spicd_net.layers import PooledLinear
+from worker.detectors.spicd_net.network import PairOutput, SpicdNetwork
+from worker.progress import Progress, silent
+from worker.training.dataset import TileSet, load_tiles, split_tiles
+from worker.training.losses import total_loss
+from worker.training.metrics import Measured, measured
+from worker.training.pairs import Batch, PairMaker, PairSettings
+from worker.training.prefetch import prefetched
+from worker.training.schedule import Schedule
+
+CHECKPOINT, BEST, LOG = "last.pt", "best.pt", "epochs.csv"
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class TrainSettings:
+    """The paper's values, but for `minutes`."""
+
+    epochs: int = 1000
+    minutes: float | None = None  #: wall clock of the whole run, resumed parts included; None: epochs alone
+    patience: int = 100  #: epochs without a better checkpoint
+    batch: int = 16  #: pairs
+    train_pairs: int = 2000  #: an epoch
+    validation_pairs: int = 500
+    learning_rate: float = 1e-3
+    final_learning_rate: float = 1e-5
+    weight_decay: float = 1e-4
+    held_out: float = 0.1  #: share of the tiles
+    seed: int = 42
+    device: str = "cpu"
+    coarse_search: bool = (
+        True  #: bfloat16 where max-pooling looks for its winners; a third less time on the CPU
+    )
+    pairs: PairSettings = field(default_factory=PairSettings)
+
+    @property
+    def schedule(self) -> Schedule:
+        return Schedule(
+            epochs=self.epochs,
+            minutes=self.minutes,
+            start=self.learning_rate,
+            end=self.final_learning_rate,
+        )
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class EpochRow:
+    """One line of the log."""
+
+    epoch: int
+    seconds: float  #: since the run began, stops left out
+    learning_rate: float  #: at the epoch's end
+    train_loss: float
+    validation_loss: float
+    accuracy: float
+    precision_unchanged: float
+    precision_changed: float
+    precision_different: float
+    recall_unchanged: float
+    recall_changed: float
+    recall_different: float
+
+
+def train(settings: TrainSettings, dataset: Path, out: Path, progress: Progress = silent) -> Path:
+    """Train on the tiles of `dataset`, keeping everything in the folder `out`; returns the best checkpoint.
+
+    A folder that already holds a checkpoint of the same settings and data is taken up where it stopped.
+    Raises ValueError for a checkpoint of others, FloatingPointError when the loss is no longer a number.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    training, validation = split_tiles(load_tiles(dataset), share=settings.held_out)
+    run = Run(settings, training, validation, out)
+    run.resume()
+    while not run.finished:
+        run.epoch(progress)
+    progress("train", 1.0)
+    return out / BEST
+
+
+class Run:
+    """The state of one training."""
+
+    def __init__(self, settings: TrainSettings, training: TileSet, validation: TileSet, out: Path) -> None:
+        torch.manual_seed(settings.seed)
+        self._settings = settings
+        self._out = out
+        self._device = torch.device(settings.device)
+        self._network = SpicdNetwork().to(self._device)
+        for module in self._network.modules():
+            if isinstance(module, PooledLinear):
+                module.coarse_search = settings.coarse_search
+        self._optimizer = torch.optim.Adam(
+            self._network.parameters(),
+            lr=settings.learning_rate,
+            weight_decay=settings.weight_decay,
+            fused=True,
+        )
+        self._makers = PairMaker(training, settings.pairs), PairMaker(validation, settings.pairs)
+        self._epochs = 0
+        self._seconds = 0.0
+        self._best = (-1.0, -1.0)
+        self._best_epoch = 0
+
+    @property
+    def finished(self) -> bool:
+        """The epochs or the time are spent, or nothing has become better for long."""
+        stale = self._epochs - self._best_epoch >= self._settings.patience
+        return stale or self._settings.schedule.done(self._epochs, self._seconds) >= 1.0
+
+    def epoch(self, progress: Progress) -> EpochRow:
+        """Train on one epoch's pairs, validate, and keep both checkpoints and the log."""
+        began = time.monotonic() - self._seconds
+        loss, rate = self._train_pass(began, progress)
+        found = self._validate()
+        self._epochs += 1
+        self._seconds = time.monotonic() - began
+        if found.rank > self._best:
+            self._best, self._best_epoch = found.rank, self._epochs
+            self._save(BEST, {"measured": asdict(found)})
+        self._save(
+            CHECKPOINT, {"optimizer": self._optimizer.state_dict(), "torch_rng": torch.get_rng_state()}
+        )
+        return self._log(loss, rate, found)
+
+    def resume(self) -> None:
+        """Take up the last checkpoint, if the folder has one."""
+        path = self._out / CHECKPOINT
+        if not path.exists():
+            return
+        state = torch.load(path, map_location=self._device, weights_only=True)
+        if state["settings"] != asdict(self._settings):
+            raise ValueError(f"{path} was made with other settings; use them, or another folder")
+        self._network.load_state_dict(state["network"])
+        self._optimizer.load_state_dict(state["optimizer"])
+        torch.set_rng_state(state["torch_rng"].cpu())
+        self._epochs, self._seconds = state["epochs"], state["seconds"]
+        self._best, self._best_epoch = tuple(state["best"]), state["best_epoch"]
+
+    def _train_pass(self, began: float, progress: Progress) -> tuple[float, float]:
+        """Mean loss over the epoch's steps, and the last learning rate. Ends early when the time is up."""
+        settings, schedule = self._settings, self._settings.schedule
+        steps = max(settings.train_pairs // settings.batch, 1)
+        # Each epoch has its own stream, so that a resumed run sees the pairs that an unbroken one sees.
+        rng = np.random.default_rng((settings.seed, 1, self._epochs))
+        batches = self._makers[0].batches(settings.train_pairs, settings.batch, rng)
+        self._network.train()
+        losses, rate = [], schedule.start
+        for step, batch in enumerate(prefetched(batches)):
+            done = schedule.done(self._epochs + step / steps, time.monotonic() - began)
+            if done >= 1.0:
+                break
+            progress("train", done)
+            rate = schedule.rate(done)
+            losses.append(self._step(batch, rate))
+        return float(np.mean(losses)) if losses else float("nan"), rate
+
+    def _step(self, batch: Batch, rate: float) -> float:
+        for group in self._optimizer.param_groups:
+            group["lr"] = rate
+        output = self._forward(batch)
+        loss = total_loss(output.logits, torch.from_numpy(batch.labels).to(self._device), output.transforms)
+        value = loss.item()
+        if not np.isfinite(value):
+            raise FloatingPointError(
+                f"epoch {self._epochs + 1}: the loss is {value}; lower the learning rate"
+            )
+        self._optimizer.zero_grad(set_to_none=True)
+        loss.backward()  # type: ignore[no-untyped-call]
+        self._optimizer.step()
+        return value
+
+    @torch.no_grad()
+    def _validate(self) -> Measured:
+        """On the same pairs after every epoch."""
+        settings = self._settings
+        rng = np.random.default_rng((settings.seed, 2))
+        batches = prefetched(self._makers[1].batches(settings.validation_pairs, settings.batch, rng))
+        self._network.eval()
+        logits, labels = [], []
+        for batch in batches:
+            logits.append(self._forward(batch).logits.cpu())
+            labels.append(torch.from_numpy(batch.labels))
+        answers, truth = torch.cat(logits), torch.cat(labels)
+        loss = float(total_loss(answers, truth, (torch.eye(3)[None],)))
+        return measured(answers.softmax(dim=1).numpy(), truth.numpy(), loss)
+
+    def _forward(self, batch: Batch) -> PairOutput:
+        points, reference_sample, current_sample = (
+            torch.from_numpy(array).to(self._device)
+            for array in (batch.points, batch.reference_sample, batch.current_sample)
+        )
+        output: PairOutput = self._network(points, batch.sizes, reference_sample, current_sample)
+        return output
+
+    def _save(self, name: str, more: dict[str, Any]) -> None:
+        """Written beside and moved, so that a stop in between leaves the old file whole."""
+        state = {
+            "settings": asdict(self._settings),
+            "network": self._network.state_dict(),
+            "epochs": self._epochs,
+            "seconds": self._seconds,
+            "best": list(self._best),
+            "best_epoch": self._best_epoch,
+            **more,
+        }
+        partial = self._out / f"{name}.partial"
+        torch.save(state, partial)
+        partial.replace(self._out / name)
+
+    def _log(self, loss: float, rate: float, found: Measured) -> EpochRow:
+        row = EpochRow(
+            epoch=self._epochs,
+            seconds=round(self._seconds, 1),
+            learning_rate=rate,
+            train_loss=loss,
+            validation_loss=found.loss,
+            accuracy=found.accuracy,
+            **_by_class("precision", found.precision),
+            **_by_class("recall", found.recall),
+        )
+        path = self._out / LOG
+        fresh = not path.exists()
+        with path.open("a", newline="") as file:
+            writer = csv.DictWriter(file, list(asdict(row)))
+            if fresh:
+                writer.writeheader()
+            writer.writerow(asdict(row))
+        return row
+
+
+def _by_class(name: str, values: tuple[float, float, float]) -> dict[str, float]:
+    classes = ("unchanged", "changed", "different")
+    return {f"{name}_{of}": value for of, value in zip(classes, values, strict=True)}
