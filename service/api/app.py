@@ -11,7 +11,9 @@ from fastapi import FastAPI
 from fastapi.concurrency import run_in_threadpool
 
 from service.api import changes, health, jobs, maps, models, problems, scans, surveys
+from service.api.bodies import INCOMING
 from service.api.cards import Cards
+from service.api.incoming import sweep
 from service.api.metrics import Metrics, MetricsMiddleware
 from service.api.schema import describe
 from service.api.services import Queue, Services
@@ -59,6 +61,7 @@ def _lifespan(settings: Settings, queue: Queue | None) -> Any:
             raise ValueError("no SPICD_REDIS_URL: `spicd up` starts an embedded server and sets it")
         used = queue or JobQueue(settings.redis_url or "", timeout_s=settings.job_timeout_s)
         catalog = await run_in_threadpool(open_catalog, settings)
+        await run_in_threadpool(sweep, settings.data_dir / INCOMING)
         app.state.services = Services(
             settings=settings, catalog=catalog, queue=used, cards=Cards(settings.model_store)
         )

@@ -19,6 +19,9 @@ from service.settings import Settings
 
 PIECE = 1 << 20  #: bytes handed to the disk at a time
 MAX_JSON_BYTES = 1 << 20
+INCOMING = (
+    "incoming"  #: folder in the data folder; on the disk of the blobs, so that keeping a file is a rename
+)
 
 JSON = "application/json"
 FORM = "multipart/form-data"
@@ -46,7 +49,7 @@ async def received(
     if media_type not in takes:
         said = media_type or "no media type"
         raise WrongMediaType(f"the body comes as {said}; send it as {' or '.join(takes)}")
-    folder = settings.data_dir / "incoming"
+    folder = settings.data_dir / INCOMING
     limit = MAX_JSON_BYTES if media_type == JSON else settings.max_upload_bytes
     await run_in_threadpool(folder.mkdir, parents=True, exist_ok=True)
     kept = contextlib.ExitStack()

@@ -5,7 +5,10 @@ Only the first bytes are looked at: they tell PLY from PCD.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
+import re
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -15,8 +18,10 @@ from uuid import uuid4
 from service.catalog.records import ScanFormat
 from service.errors import ScanUnreadable
 
-_HEAD = 64  #: bytes that are enough to tell the format
-_PCD = (b"# .PCD", b"#.PCD", b"VERSION")
+ABANDONED_S = 24 * 3600
+_HEAD = 256  #: bytes that are enough to tell the format
+_PLY = re.compile(rb"ply[ \t]*\r?\n")
+_PCD = re.compile(rb"\s*(#[^\n]*\.PCD|(VERSION|FIELDS|COLUMNS)\s)")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -64,9 +69,9 @@ class Incoming:
     def _format(self) -> ScanFormat:
         if not self._head:
             raise ScanUnreadable(f"{self.filename}: the file is empty; send a PLY or PCD")
-        if self._head[:4] in (b"ply\n", b"ply\r"):
+        if _PLY.match(self._head):
             return "ply"
-        if self._head.lstrip().startswith(_PCD):
+        if _PCD.match(self._head):
             return "pcd"
         raise ScanUnreadable(
             f"{self.filename}: neither PLY nor PCD, it starts with {self._head[:12]!r}; send the scan as one of the two"
@@ -80,6 +85,14 @@ class Incoming:
     ) -> None:
         self._file.close()
         self._path.unlink(missing_ok=True)
+
+
+def sweep(folder: Path) -> None:
+    """Remove what uploads left that a killed process could not clean up; a day is longer than any of them lasts."""
+    for path in folder.glob("*.part"):
+        with contextlib.suppress(OSError):  # another process sweeps as well
+            if time.time() - path.stat().st_mtime > ABANDONED_S:
+                path.unlink()
 
 
 def _shown(filename: str) -> str:

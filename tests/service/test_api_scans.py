@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
+import time
 from pathlib import Path
 
 import pytest
-from samples import IDENTITY, add_map, ply
+from samples import IDENTITY, add_map, ply, running
 
 RAW = {"Content-Type": "application/octet-stream"}
 POSE = [[0, -1, 0, 2.5], [1, 0, 0, 0], [0, 0, 1, 0.35], [0, 0, 0, 1]]
@@ -60,6 +62,7 @@ def test_the_same_bytes_twice_are_one_scan_and_from_two_devices_two(client):
         (b"ply\r\nformat ascii 1.0\r\n", "ply"),
         (b"# .PCD v0.7 - Point Cloud Data file format\n", "pcd"),
         (b"VERSION 0.7\nFIELDS x y z\n", "pcd"),
+        (b"#.PCD\n", "pcd"),
     ],
 )
 def test_the_first_bytes_tell_the_format(client, head, known):
@@ -166,3 +169,26 @@ def test_a_scan_is_deleted_once_and_not_while_a_map_rests_on_it(client, catalog)
     add_map(catalog)
     used = catalog.maps.get("lobby").scans[0].scan_id
     assert client.delete(f"/scans/{used}").json()["type"] == "urn:spicd:problem:conflict"
+
+
+def test_a_start_sweeps_what_a_killed_process_left_and_no_upload_of_today(settings, queue):
+    folder = settings.data_dir / "incoming"
+    folder.mkdir(parents=True)
+    for name, age_s in (("old.part", 25 * 3600), ("new.part", 60)):
+        (folder / name).write_bytes(b"ply")
+        os.utime(folder / name, (time.time() - age_s,) * 2)
+    with running(settings, queue):
+        assert [path.name for path in folder.iterdir()] == ["new.part"]
+
+
+def test_every_real_scan_is_taken_by_its_first_bytes_sound_or_not(client, shared_data):
+    """Whether it can be read is for the job to say; only what names neither format is refused here."""
+    refused = []
+    for path in sorted((shared_data / "formats").rglob("*.p[lc][yd]")):
+        head = path.read_bytes()[:300]
+        answer = client.post("/scans", content=head, headers=RAW, params={"filename": path.name})
+        if answer.status_code == 422:
+            refused.append(path.name)
+        else:
+            assert answer.json()["format"] == path.suffix[1:]
+    assert refused == ["ascii_empty.pcd"]
