@@ -1,0 +1,108 @@
+"""A survey without a service: files in, files and one JSON document out."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from worker.detectors.detector import Detector
+from worker.errors import MapFailed
+from worker.pipeline.chaining import Outcome, ScanFile
+from worker.pipeline.changes import ChangeSet
+from worker.pipeline.export import tile_results, write_coloured_cloud
+from worker.pipeline.features import feature_collection
+from worker.pipeline.flow import (
+    BuiltMap,
+    LocatedSurvey,
+    PipelineSettings,
+    build_map,
+    detect,
+    locate_survey,
+)
+from worker.pipeline.picture import draw_picture
+from worker.progress import Progress, silent
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Comparison:
+    """Two visits, and what is different."""
+
+    built: BuiltMap
+    located: LocatedSurvey
+    changes: ChangeSet
+
+
+def compare(
+    references: Sequence[Path],
+    currents: Sequence[Path],
+    detector: Detector,
+    *,
+    threshold: float | None = None,
+    progress: Progress = silent,
+) -> Comparison:
+    """The whole method on files. Raises PipelineError, and OSError for a file that is not there."""
+    settings = PipelineSettings.model_validate({}).for_model(detector.card.preprocessing)
+    earlier, later = (
+        [ScanFile(name=str(path), path=path) for path in paths] for paths in (references, currents)
+    )
+    on_map, on_survey = _titled("map", progress), _titled("survey", progress)
+    built = build_map(earlier, settings=settings, progress=on_map)
+    if not built.tiles.points:
+        raise MapFailed(
+            f"no tile holds {settings.tiling.min_points} points of the reference "
+            f"({len(built.reference.points)} points in all); add scans with --reference"
+        )
+    located = locate_survey(later, built.reference, built.tiles, settings=settings, progress=on_survey)
+    changes = detect(located.pairs, detector, threshold=threshold, progress=on_survey)
+    return Comparison(built=built, located=located, changes=changes)
+
+
+def write_results(
+    found: Comparison, out: Path, *, map_id: str, survey_id: str, model: str
+) -> dict[str, Path]:
+    """`tiles.geojson`, `cloud.ply` and `picture.png` in the folder `out`, by what they are. Raises OSError."""
+    out.mkdir(parents=True, exist_ok=True)
+    files = {"tiles": out / "tiles.geojson", "cloud": out / "cloud.ply", "picture": out / "picture.png"}
+    features = feature_collection(found.changes, map_id=map_id, survey_id=survey_id, model=model)
+    files["tiles"].write_text(json.dumps(features, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    write_coloured_cloud(files["cloud"], found.located.current, found.changes)
+    draw_picture(
+        files["picture"],
+        found.built.reference.points,
+        found.located.current,
+        found.changes,
+        title=f"{survey_id} compared with {map_id}",
+    )
+    return files
+
+
+def document(found: Comparison, files: dict[str, Path], *, model: str) -> dict[str, Any]:
+    """The comparison, JSON-ready; changed tiles most certain first, metres, frame of the first reference."""
+    changed = [tile for tile in tile_results(found.changes) if tile.state == "changed"]
+    return {
+        "model": model,
+        "threshold": found.changes.threshold,
+        "counts": {"tiles": len(found.changes.states), **found.changes.counts()},
+        "reference": [_registration(outcome) for outcome in found.built.outcomes],
+        "current": [_registration(outcome) for outcome in found.located.outcomes],
+        "changed": [asdict(tile) for tile in sorted(changed, key=lambda tile: -(tile.score or 0.0))],
+        "files": {what: str(path) for what, path in files.items()},
+    }
+
+
+def _titled(phase: str, progress: Progress) -> Progress:
+    return lambda stage, share: progress(f"{phase}: {stage}", share)
+
+
+def _registration(outcome: Outcome) -> dict[str, Any]:
+    return {
+        "name": outcome.name,
+        "accepted": outcome.scan is not None,
+        "fitness": outcome.fitness,
+        "rmse": outcome.inlier_rmse,
+        "map_from_scan": None if outcome.scan is None else outcome.scan.map_from_scan.tolist(),
+        "reason": outcome.reason,
+    }

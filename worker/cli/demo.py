@@ -1,0 +1,28 @@
+"""`spicd-worker demo`, which is `make demo`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from worker.cli import terminal
+
+
+def register(commands: typer.Typer) -> None:
+    """Add `demo` to the command line."""
+    commands.command("demo")(demo)
+
+
+def demo(
+    out: Annotated[Path, typer.Option(help="Folder for scans, results and the service's data.")] = Path(
+        "demo"
+    ),
+    seed: Annotated[int, typer.Option(help="Of the noise and of the robot's way.")] = 1,
+) -> None:
+    """Simulate two visits to a small building, run the whole service on them, and show what it found."""
+    # Not at the head of the file: Open3D takes a second, which `--help` need not wait for.
+    from worker.demo.run import DemoSettings, run  # noqa: PLC0415
+
+    run(out, DemoSettings(seed=seed), out_console=terminal.output(), err_console=terminal.messages())

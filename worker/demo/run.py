@@ -1,0 +1,180 @@
+"""The demo from its first scan to its last table."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+from service.client import Client, ClientError, Document
+from worker.demo.child import ServiceChild
+from worker.demo.failure import DemoFailed
+from worker.demo.placement import placement_line
+from worker.demo.show import show_files, show_judgement
+from worker.demo.story import Story, tell
+from worker.demo.verdict import Judgement, grid_of, judge
+from worker.evaluation.sensor import SimulatedScan
+from worker.pipeline.pcd import write_pcd
+
+MAP_ID = "office"
+RESULTS = {
+    "changes": "changes.geojson",
+    "tiles": "tiles.geojson",
+    "cloud": "cloud.ply",
+    "picture": "picture.png",
+}
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class DemoSettings:
+    """How long the robot works."""
+
+    seed: int = 1
+    stops: tuple[int, int] = (16, 12)  #: scans of the first and of the second visit
+    duration_s: float = 5.0  #: seconds of standing at each
+    prior_error: tuple[float, float] = (0.1, 2.0)  #: sigma of the robot's odometry, metres and degrees
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class DemoResult:
+    """What the service answered, and how near that is to the truth."""
+
+    map: Document
+    survey: Document
+    judgement: Judgement
+    files: dict[str, Path] = field(default_factory=dict)
+
+
+def run(out: Path, settings: DemoSettings, *, out_console: Console, err_console: Console) -> DemoResult:
+    """Run the demo in the folder `out`. Raises DemoFailed where the service does not do its job.
+
+    A change that the detector does not find is a result, not a failure.
+    """
+    began = time.monotonic()
+    fresh = [out / name for name in ("data", "scans")]
+    for folder in fresh:
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir(parents=True)
+    try:
+        with _steps(err_console) as steps, ServiceChild(fresh[0], out / "service.log") as child:
+            result, story = _through_the_service(child, out, settings, steps)
+    except ClientError as error:
+        raise DemoFailed(str(error)) from error
+    show_judgement(out_console, result.judgement)
+    for visit, outcomes, scans in (
+        ("map", result.map["scans"], story.first),
+        ("survey", result.survey["scans"], story.second),
+    ):
+        out_console.print(placement_line(visit, outcomes, scans), highlight=False)
+    show_files(out_console, result.files)
+    out_console.print(f"all in {time.monotonic() - began:.0f} s", highlight=False)
+    return result
+
+
+class _Steps:
+    """A line for each step, with its time."""
+
+    def __init__(self, progress: Progress) -> None:
+        self._progress = progress
+
+    @contextmanager
+    def step(self, name: str) -> Iterator[_Step]:
+        task = self._progress.add_task(name, total=1.0, stage="")
+        step = _Step(self._progress, task)
+        yield step
+        step.at("", 1.0)
+
+
+class _Step:
+    def __init__(self, progress: Progress, task: int) -> None:
+        self._progress, self._task = progress, task
+
+    def at(self, stage: str, share: float) -> None:
+        self._progress.update(self._task, stage=stage, completed=share)  # type: ignore[arg-type]
+
+    def follow(self, job: Document) -> None:
+        """As a listener of `Client.wait`."""
+        self.at(job["message"], (job["progress"] or 0) / 100)
+
+
+@contextmanager
+def _steps(console: Console) -> Iterator[_Steps]:
+    columns = (
+        TextColumn("{task.description:<34}"),
+        BarColumn(bar_width=24),
+        TimeElapsedColumn(),
+        TextColumn("[dim]{task.fields[stage]}"),
+    )
+    with Progress(*columns, console=console) as progress:
+        yield _Steps(progress)
+
+
+def _through_the_service(
+    child: ServiceChild, out: Path, settings: DemoSettings, steps: _Steps
+) -> tuple[DemoResult, Story]:
+    with steps.step("simulate two visits to an office"):
+        story = tell(
+            seed=settings.seed,
+            stops=settings.stops,
+            duration_s=settings.duration_s,
+            prior_error=settings.prior_error,
+        )
+    with steps.step("start the service"):
+        url = child.await_ready()["url"]
+    with Client(url) as client:
+        with steps.step("upload the first visit") as step:
+            first = _uploaded(client, story.first, out / "scans", "first", step)
+        with steps.step("build the map") as step:
+            accepted = client.create_map(first, map_id=MAP_ID, name="The demo's office")
+            client.wait(accepted["job_id"], step.follow)
+        with steps.step("upload the second visit") as step:
+            second = _uploaded(client, story.second, out / "scans", "second", step)
+        with steps.step("compare it with the map") as step:
+            accepted = client.submit_survey(MAP_ID, second, device_id="demo-robot")
+            client.wait(accepted["job_id"], step.follow)
+        survey_id = accepted["survey_id"]
+        with steps.step("fetch the results"):
+            files = _downloaded(client, survey_id, out)
+            survey, built = client.survey(survey_id), client.map(MAP_ID)
+            judgement = _judged(client, survey_id, story, out)
+    return DemoResult(map=built, survey=survey, judgement=judgement, files=files), story
+
+
+def _uploaded(
+    client: Client, scans: Sequence[SimulatedScan], folder: Path, visit: str, step: _Step
+) -> list[str]:
+    """Ids of the scans, each written as PCD and sent with the pose that the robot believes."""
+    ids = []
+    for number, scan in enumerate(scans):
+        path = folder / f"{visit}-{number + 1:02d}.pcd"
+        step.at(path.name, number / len(scans))
+        write_pcd(path, scan.points)
+        sent = client.upload_scan(path, device_id="demo-robot", pose=scan.prior.tolist())
+        ids.append(sent["scan_id"])
+    return ids
+
+
+def _downloaded(client: Client, survey_id: str, out: Path) -> dict[str, Path]:
+    here = f"/surveys/{survey_id}"
+    paths = {
+        "changes": f"/maps/{MAP_ID}/changes?limit=10000",
+        "tiles": f"{here}/tiles",
+        "cloud": f"{here}/cloud.ply",
+        "picture": f"{here}/picture.png",
+    }
+    return {what: client.download(path, out / RESULTS[what]) for what, path in paths.items()}
+
+
+def _judged(client: Client, survey_id: str, story: Story, out: Path) -> Judgement:
+    manifest = json.loads(client.download(f"/maps/{MAP_ID}/manifest", out / "manifest.json").read_text())
+    grid = grid_of(manifest)
+    names = [edit.sentence for edit in story.edits]
+    each = list(zip(names, story.truth_of_each(grid), strict=True))
+    return judge(client.tiles(survey_id)["features"], story.truth(grid), each)

@@ -1,0 +1,92 @@
+"""What happens in the demo: an office, and what somebody did there between two visits of a robot."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+from worker.evaluation.scenes import Change, Mesh, Scene, small_office
+from worker.evaluation.scenes.furniture import crate
+from worker.evaluation.sensor import SimulatedScan
+from worker.evaluation.truth import TileTruth, changed_tiles
+from worker.evaluation.visits import visit
+from worker.pipeline.tiling import TileGrid
+
+OFFICE = 2  #: seed of the building
+
+
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class Edit:
+    """One change and the scene on either side of it."""
+
+    sentence: str  #: what a person would call it
+    before: Scene
+    after: Scene
+
+
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class Story:
+    """Two visits. World frame: floor z = 0, which is the map's frame too, as the first prior is exact."""
+
+    edits: tuple[Edit, ...]
+    first: tuple[SimulatedScan, ...]
+    second: tuple[SimulatedScan, ...]
+
+    def truth(self, grid: TileGrid) -> TileTruth:
+        """What changed in each tile (map frame) where a sensor could see it."""
+        return self._between(self.edits[0].before, self.edits[-1].after, grid)
+
+    def truth_of_each(self, grid: TileGrid) -> tuple[TileTruth, ...]:
+        """Likewise for each edit alone."""
+        return tuple(self._between(edit.before, edit.after, grid) for edit in self.edits)
+
+    def _between(self, before: Scene, after: Scene, grid: TileGrid) -> TileTruth:
+        return changed_tiles(
+            before,
+            after,
+            grid,
+            sensors_before=[scan.world_from_sensor for scan in self.first],
+            sensors_after=[scan.world_from_sensor for scan in self.second],
+        )
+
+
+Step = tuple[str, Callable[[Scene], tuple[Scene, Change]]]
+
+#: Two pieces come, two go, two are moved, each to a free place in the office of seed 2.
+_STEPS: tuple[Step, ...] = (
+    (
+        "crate put into the west office",
+        lambda s: s.with_added("crate-west", _big_crate().at(1.5, 1.0, yaw=20)),
+    ),
+    ("cabinet taken out of the east office", lambda s: s.without("cabinet-2")),
+    ("chair moved by 1.1 m", lambda s: s.shifted("chair-2", dx=1.0, dy=0.4, yaw=-30)),
+    ("plant taken away", lambda s: s.without("plant-2")),
+    ("table moved by 1.2 m", lambda s: s.shifted("table-1", dx=0.8, dy=-0.9, yaw=25)),
+    ("crate left in the corridor", lambda s: s.with_added("crate-hall", _big_crate().at(7.6, 4.4, yaw=4))),
+)
+
+
+def edits(scene: Scene) -> tuple[Edit, ...]:
+    """What was done, one after the other."""
+    found: list[Edit] = []
+    for sentence, step in _STEPS:
+        before = found[-1].after if found else scene
+        after, _ = step(before)
+        found.append(Edit(sentence=sentence, before=before, after=after))
+    return tuple(found)
+
+
+def _big_crate() -> Mesh:
+    return crate(0.7, 0.5, 0.6)
+
+
+def tell(*, seed: int, stops: tuple[int, int], duration_s: float, prior_error: tuple[float, float]) -> Story:
+    """Walk the office before and after, with so many stops; `prior_error` is the sigma in metres and degrees."""
+    made = edits(small_office(OFFICE))
+    scenes = (made[0].before, made[-1].after)
+    first, second = (
+        visit(scene, count, seed=10 * seed + number, prior_error=prior_error, duration_s=duration_s)
+        for number, (scene, count) in enumerate(zip(scenes, stops, strict=True))
+    )
+    exact = replace(first[0], prior=first[0].world_from_sensor)
+    return Story(edits=made, first=(exact, *first[1:]), second=second)
