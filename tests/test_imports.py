@@ -1,0 +1,294 @@
+"""Who may import whom (docs/architecture.md), read from the source: imports inside functions count as well."""
+
+from __future__ import annotations
+
+import ast
+import sys
+from collections.abc import Iterator, Mapping
+from graphlib import CycleError, TopologicalSorter
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGES = ("service", "worker")
+
+Imports = Mapping[
+    str, frozenset[str]
+]  #: module -> dotted names it imports, those of our own as far as modules go
+
+#: What each part may import of our own code: the rows above are free to use the rows they name, never the reverse.
+MAY_IMPORT = {
+    "service.errors": (),
+    "service.settings": (),
+    "service.logs": (),
+    "service.lifetime": (),
+    "service.client": (),
+    "service.catalog": ("service.errors", "service.settings"),
+    "service.queue": ("service.catalog.steps", "service.errors"),
+    "service.embedded_redis": ("service.lifetime",),
+    "service.api": ("service.catalog", "service.queue", "service.errors", "service.settings"),
+    "worker.errors": (),
+    "worker.progress": (),
+    "worker.reporting": ("worker.errors",),
+    # the values that a detector is given, and nothing that the pipeline does
+    "worker.detectors": (
+        "worker.pipeline.values",
+        "worker.pipeline.tiling",
+        "worker.pipeline.patches",
+        "worker.errors",
+        "worker.progress",
+    ),
+    "worker.pipeline": ("worker.detectors", "worker.errors", "worker.progress"),
+    "worker.training": (
+        "worker.detectors.spicd_net",
+        "worker.pipeline.values",
+        "worker.pipeline.patches",
+        "worker.errors",
+        "worker.progress",
+    ),
+    "worker.evaluation": (
+        "worker.training",
+        "worker.pipeline",
+        "worker.detectors",
+        "worker.errors",
+        "worker.progress",
+    ),
+    # the demo is a client of the service like any other
+    "worker.demo": (
+        "service.client",
+        "worker.evaluation",
+        "worker.pipeline",
+        "worker.detectors",
+        "worker.errors",
+        "worker.progress",
+    ),
+}
+
+#: Third-party packages that have their places, and nobody else imports.
+ONLY_IN = {
+    "rq": ("service.queue", "worker.__main__", "worker.jobs", "worker.rq_jobs", "worker.rq_workers"),
+    "redis": ("service.queue", "service.embedded_redis", "worker.__main__", "worker.rq_workers"),
+    "open3d": ("worker.pipeline", "worker.evaluation"),
+    "kiss_matcher": ("worker.pipeline",),
+    "torch": ("worker.detectors", "worker.training", "worker.evaluation", "worker.cli"),
+    "sqlalchemy": ("service.catalog",),
+    "obstore": ("service.catalog",),
+    "fastapi": ("service.api", "service.launcher"),
+}
+
+#: The files of the worker that know the service; the demo and the rest are in MAY_IMPORT.
+KNOWS_THE_SERVICE = ("worker.__main__", "worker.jobs", "worker.rq_jobs", "worker.rq_workers", "worker.demo")
+
+TRAINING_NEEDS = {"torch", "numpy"}
+OPTIONAL_FOR_TRAINING = {"fpsample"}  #: imported in a `try`; patches.py has its own without
+
+
+@pytest.fixture(scope="module")
+def imports() -> Imports:
+    return read_imports(ROOT)
+
+
+@pytest.fixture(scope="module")
+def imports_at_start() -> Imports:
+    return read_imports(ROOT, in_functions=False)
+
+
+def test_each_part_imports_what_stands_below_it_and_nothing_else(imports: Imports) -> None:
+    assert against_layers(imports) == []
+
+
+def test_the_service_imports_nothing_of_the_worker_and_none_of_its_libraries(imports: Imports) -> None:
+    assert in_the_service(imports) == []
+
+
+@pytest.mark.parametrize("package", ONLY_IN)
+def test_a_library_with_its_places_is_imported_nowhere_else(imports: Imports, package: str) -> None:
+    assert outside(imports, package, ONLY_IN[package]) == []
+
+
+def test_only_the_shell_of_the_worker_knows_the_service(imports: Imports) -> None:
+    worker = {name: found for name, found in imports.items() if within(name, ("worker",))}
+    assert outside(worker, "service", KNOWS_THE_SERVICE) == []
+
+
+def test_training_runs_where_there_is_only_torch_and_numpy(imports: Imports) -> None:
+    assert third_party(reached(imports, "worker.training")) <= TRAINING_NEEDS | OPTIONAL_FOR_TRAINING
+
+
+def test_no_modules_import_each_other_in_a_circle(imports_at_start: Imports) -> None:
+    assert circle(imports_at_start) is None
+
+
+@pytest.mark.parametrize(
+    ("path", "line"),
+    [
+        ("service/api/maps.py", "from worker.pipeline import flow"),
+        ("service/catalog/maps.py", "def f():\n    import torch"),
+        ("service/cli/up.py", "import numpy.linalg"),
+        ("service/catalog/maps.py", "from service.api import maps"),
+        ("service/catalog/jobs.py", "from rq import Queue"),
+        ("service/client.py", "from ..service import errors"),
+        ("worker/pipeline/flow.py", "from service.catalog.jobs import Jobs"),
+        ("worker/pipeline/flow.py", "from redis import Redis"),
+        ("worker/pipeline/flow.py", "from .. import jobs"),
+        ("worker/pipeline/flow.py", "import importlib\nimportlib.import_module('worker.jobs')"),
+        ("worker/detectors/store.py", "from worker.pipeline.registration import register"),
+        ("worker/detectors/store.py", "from worker.pipeline import icp"),
+        ("worker/detectors/store.py", "import open3d as o3d"),
+        ("worker/training/trainer.py", "from worker.evaluation import sensor"),
+        ("worker/training/trainer.py", "import scipy"),
+        ("worker/pipeline/patches.py", "import matplotlib"),  # training reaches it
+        ("worker/evaluation/sensor.py", "import worker.jobs"),
+        ("worker/demo/extra.py", "from service.catalog.catalog import open_catalog"),
+    ],
+)
+def test_a_forbidden_import_is_found(imports: Imports, path: str, line: str) -> None:
+    assert set(violations(with_line(imports, path, line))) - set(violations(imports))
+
+
+def test_a_circle_is_found(imports_at_start: Imports) -> None:
+    line = "from worker.pipeline import tiling"  # which imports values
+    assert circle(with_line(imports_at_start, "worker/pipeline/values.py", line))
+
+
+def with_line(imports: Imports, path: str, line: str) -> Imports:
+    """`imports` as they would be with `line` in the file at `path`."""
+    name = module_name(Path(path))
+    added = imports_of(line, name, is_package=False, modules={*imports, name})
+    return {**imports, name: imports.get(name, frozenset()) | added}
+
+
+def violations(imports: Imports) -> list[str]:
+    """What the tests above would complain of, circles apart."""
+    training = third_party(reached(imports, "worker.training")) - TRAINING_NEEDS - OPTIONAL_FOR_TRAINING
+    return [
+        *against_layers(imports),
+        *in_the_service(imports),
+        *(each for package, places in ONLY_IN.items() for each in outside(imports, package, places)),
+        *(f"training reaches {package}" for package in sorted(training)),
+    ]
+
+
+def against_layers(imports: Imports) -> list[str]:
+    """`module imports other` for each import that MAY_IMPORT does not name."""
+    return [
+        f"{name} imports {other}"
+        for part, allowed in MAY_IMPORT.items()
+        for name, found in imports.items()
+        if within(name, (part,))
+        for other in sorted(found)
+        if within(other, PACKAGES) and not within(other, (part, *allowed))
+    ]
+
+
+def in_the_service(imports: Imports) -> list[str]:
+    """The base install carries none of these."""
+    heavy = ("worker", "torch", "open3d", "numpy", "scipy", "matplotlib", "safetensors", "imagecodecs")
+    return [
+        f"{name} imports {other}"
+        for name, found in imports.items()
+        if within(name, ("service",))
+        for other in sorted(found)
+        if within(other, heavy)
+    ]
+
+
+def outside(imports: Imports, package: str, places: tuple[str, ...]) -> list[str]:
+    """Modules that import `package` and are not in one of its places."""
+    return [
+        f"{name} imports {package}"
+        for name, found in imports.items()
+        if not within(name, places) and any(within(other, (package,)) for other in found)
+    ]
+
+
+def reached(imports: Imports, part: str) -> set[str]:
+    """Everything that is imported, directly or not, when the modules of `part` are."""
+    waiting = [name for name in imports if within(name, (part,))]
+    seen: set[str] = set()
+    while waiting:
+        name = waiting.pop()
+        if name not in seen:
+            seen.add(name)
+            waiting += imports.get(name, ())
+    return seen
+
+
+def third_party(names: set[str]) -> set[str]:
+    """The packages among `names` that are neither ours nor Python's."""
+    return {name.partition(".")[0] for name in names} - {*PACKAGES, *sys.stdlib_module_names}
+
+
+def circle(imports: Imports) -> list[str] | None:
+    """Modules that import each other in a circle; a package and its own parts do not count.
+
+    `imports` are those that run when a module is imported: one inside a function is how a circle is cut.
+    """
+    graph = {
+        name: {other for other in found if other in imports and not within(name, (other,))}
+        for name, found in imports.items()
+    }
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        return list(error.args[1])
+    return None
+
+
+def within(name: str, parts: tuple[str, ...]) -> bool:
+    """Whether a dotted name is one of `parts` or lies in it."""
+    return any(name == part or name.startswith(part + ".") for part in parts)
+
+
+def read_imports(root: Path, *, in_functions: bool = True) -> Imports:
+    """Every import of every module of our packages under `root`."""
+    files = [path for package in PACKAGES for path in sorted((root / package).rglob("*.py"))]
+    modules = {module_name(path.relative_to(root)) for path in files}
+    return {
+        (name := module_name(path.relative_to(root))): imports_of(
+            path.read_text(),
+            name,
+            is_package=path.name == "__init__.py",
+            modules=modules,
+            in_functions=in_functions,
+        )
+        for path in files
+    }
+
+
+def module_name(path: Path) -> str:
+    parts = path.with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def imports_of(
+    source: str, module: str, *, is_package: bool, modules: set[str], in_functions: bool = True
+) -> frozenset[str]:
+    """The dotted names that the source of `module` imports, wherever in it."""
+    nodes = _nodes(ast.parse(source), in_functions)
+    return frozenset(name for node in nodes for name in _named(node, module, is_package, modules))
+
+
+def _nodes(node: ast.AST, in_functions: bool) -> Iterator[ast.AST]:
+    yield node
+    for child in ast.iter_child_nodes(node):
+        if in_functions or not isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef):
+            yield from _nodes(child, in_functions)
+
+
+def _named(node: ast.AST, module: str, is_package: bool, modules: set[str]) -> Iterator[str]:
+    match node:
+        case ast.Import():
+            yield from (alias.name for alias in node.names)
+        case ast.ImportFrom():
+            base = node.module or ""
+            if node.level:
+                above = module.split(".")
+                above = above[: len(above) - node.level + is_package]
+                base = ".".join([*above, base] if base else above)
+            for alias in node.names:  # `from package import module` names the module
+                whole = f"{base}.{alias.name}"
+                yield whole if whole in modules else base
+        case ast.Call(func=ast.Attribute(attr="import_module"), args=[ast.Constant(value=str(name)), *_]):
+            yield name
