@@ -37,11 +37,15 @@ from worker.training.pairs import PairSettings
 WEIGHTS = "weights.safetensors"
 VOXEL_SIZE, MIN_POINTS = 0.05, 512  #: paper, Table 3; the training tiles are made with the same
 
+#: Of the pair settings, what says which synthetic changes there are.
+KEPT = ("magnitude", "density", "min_shown", "shown_distance")
+
 DEVIATIONS = (
     "encoder and T-Nets with batch normalisation as in PointNet, which the paper does not mention",
     "patches enter as their distinct points, in training too; augmentation is applied before repetition",
     "revisit_share of the pairs are two independent simulated visits, not one tile sampled twice",
-    "pairs are turned by the square's symmetries; range of change density as given in settings",
+    "a changed pair comes with an unchanged one of the same tile; changes that hardly show are drawn again",
+    "pairs are turned by the square's symmetries; change density is the range given in settings",
 )
 
 
@@ -137,7 +141,7 @@ def _training(state: dict[str, Any], tiles: TileSet, command: str) -> dict[str, 
 
 
 def _pair_settings(settings: dict[str, Any]) -> PairSettings:
-    kept = {name: value for name, value in settings["pairs"].items() if name in ("magnitude", "density")}
+    kept = {name: value for name, value in settings["pairs"].items() if name in KEPT}
     return PairSettings(**kept)
 
 

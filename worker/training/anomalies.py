@@ -25,39 +25,64 @@ class Change:
     density: float  #: share of the tile's points that it touches
 
 
-Operation = Callable[[Points, Change, Half, np.random.Generator], Points]
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Changed:
+    """A tile after a change."""
+
+    points: Points  #: (n, 3) metres, tile-centre frame
+    appeared: Points  #: (a, 3) those of `points` that were not there
+    vanished: Points  #: (v, 3) those that are there no more
 
 
-def add_object(points: Points, change: Change, half: Half, rng: np.random.Generator) -> Points:
+Operation = Callable[[Points, Change, Half, np.random.Generator], Changed]
+
+
+def add_object(points: Points, change: Change, half: Half, rng: np.random.Generator) -> Changed:
     """(n, 3) -> (n + k, 3): the k points around a random one again, shifted and jittered, kept in the tile."""
     chosen = _cluster(points, change.density, rng)
     spread = rng.normal(scale=nuisance_sigma(change.magnitude), size=(len(chosen), 3))
-    added = points[chosen] + _shift(change.magnitude, ADD_VERTICAL, rng) + spread
-    return np.concatenate([points, np.clip(added, -half, half).astype(np.float32)])
+    shifted = points[chosen] + _shift(change.magnitude, ADD_VERTICAL, rng) + spread
+    added = np.clip(shifted, -half, half).astype(np.float32)
+    return Changed(points=np.concatenate([points, added]), appeared=added, vanished=points[:0])
 
 
-def remove_object(points: Points, change: Change, half: Half, rng: np.random.Generator) -> Points:  # noqa: ARG001
+def remove_object(points: Points, change: Change, half: Half, rng: np.random.Generator) -> Changed:  # noqa: ARG001
     """(n, 3) -> (n - k, 3): the k points around a random one are gone, but never below 64 points."""
     chosen = _cluster(points, change.density, rng)
     chosen = chosen[: max(len(points) - MIN_RETAINED, 0)]
-    return np.delete(points, chosen, axis=0)
+    kept = np.delete(points, chosen, axis=0)
+    return Changed(points=kept, appeared=points[:0], vanished=points[chosen])
 
 
-def move_object(points: Points, change: Change, half: Half, rng: np.random.Generator) -> Points:
+def move_object(points: Points, change: Change, half: Half, rng: np.random.Generator) -> Changed:
     """(n, 3) -> (n, 3): the k points around a random one are shifted as one, kept in the tile."""
     chosen = _cluster(points, change.density, rng)
     moved = points.copy()
     shifted = points[chosen] + _shift(change.magnitude, MOVE_VERTICAL, rng)
     moved[chosen] = np.clip(shifted, -half, half)
-    return moved
+    return Changed(points=moved, appeared=moved[chosen], vanished=points[chosen])
 
 
 OPERATIONS: dict[str, Operation] = {"add": add_object, "remove": remove_object, "move": move_object}
 
 
+def shown(before: Points, after: Changed, distance: float) -> int:
+    """How many points of a change lie farther than `distance` (metres) from every point of the other cloud.
+
+    A piece of floor doubled a little beside itself is floor as before: of such a change, nothing shows.
+    """
+    return _far(after.appeared, before, distance) + _far(after.vanished, after.points, distance)
+
+
 def nuisance_sigma(magnitude: float) -> float:
     """Metres; 0.001 + 0.05 m (paper, Sections 3.5.1 and 3.5.3)."""
     return 0.001 + 0.05 * magnitude
+
+
+def _far(points: Points, others: Points, distance: float) -> int:
+    squares = (others * others).sum(axis=1) - 2 * points @ others.T  # |a - b|^2 less the |a|^2 of its row
+    nearest = squares.min(axis=1, initial=np.inf) + (points * points).sum(axis=1)
+    return int((nearest > distance**2).sum())
 
 
 def _cluster(points: Points, density: float, rng: np.random.Generator) -> NDArray[np.intp]:

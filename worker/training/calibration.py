@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from worker.pipeline.values import Points
-from worker.training.anomalies import OPERATIONS, Change
+from worker.training.anomalies import OPERATIONS
 from worker.training.dataset import TileSet
-from worker.training.pairs import PairSettings
+from worker.training.pairs import PairSettings, altered
 
 #: Share of changed tiles that the threshold is chosen for; the paper's experiments change about 24 of 172.
 PREVALENCE = 0.15
@@ -56,12 +56,9 @@ def survey_pairs(tiles: TileSet, settings: PairSettings, *, seed: int) -> Survey
             continue
         for first, second in ((a, b), (b, a)):
             for kind in (UNCHANGED, *OPERATIONS):
-                change = Change(
-                    magnitude=rng.uniform(*settings.magnitude), density=rng.uniform(*settings.density)
-                )
-                changed = second if kind == UNCHANGED else OPERATIONS[kind](second, change, half, rng)
+                operation = OPERATIONS.get(kind)
                 reference.append(first)
-                current.append(changed)
+                current.append(altered(second, operation, settings, half, rng) if operation else second)
                 kinds.append(kind)
     return SurveyPairs(reference=tuple(reference), current=tuple(current), kinds=tuple(kinds))
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from worker.pipeline.patches import patch
 from worker.pipeline.values import Points
-from worker.training.anomalies import OPERATIONS, Change
+from worker.training.anomalies import OPERATIONS, Change, Half, Operation, shown
 from worker.training.augmentation import Augmentation, Nuisance, augmented, second_look, turned_alike
 from worker.training.dataset import TileSet
 
@@ -21,18 +21,20 @@ STORED_JITTER = 0.0001  #: metres, where the stored reference patch itself comes
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class PairSettings:
-    """How pairs are made; the defaults are the paper's but for the two that say so."""
+    """How pairs are made; the defaults are the paper's but for those that say so."""
 
     patch_points: int = 4096  #: points of a padded patch
     shares: tuple[float, float, float] = (0.50, 0.35, 0.15)  #: of the three classes
     rerun_share: float = (
         0.7  #: of unchanged pairs of one observation: sampled anew, the rest are stored patches
     )
-    revisit_share: float = 0.75  #: ours: pairs of both visits, where there are two; 0 is the paper's protocol
-    revisit_intensity: float = 0.5  #: ours: of the nuisance on such pairs, whatever the class
+    revisit_share: float = 0.9  #: ours: pairs of both visits, where there are two; 0 is the paper's protocol
+    revisit_intensity: float = 0.0  #: ours: of the nuisance on such pairs, which have an honest one
     changed_intensity: float = 0.5  #: of the nuisance on changed pairs
     magnitude: tuple[float, float] = (0.10, 0.50)  #: metres
     density: tuple[float, float] = (0.075, 0.075)  #: share of the tile's points; the paper fixes 7.5%
+    min_shown: int = 40  #: ours: points of a change that must lie `shown_distance` off; 0 is the paper's
+    shown_distance: float = 0.075  #: metres; with `min_shown` what the simulator's truth calls a change
     min_separation: float = 3.0  #: metres between different tiles of one building
     symmetries: bool = True  #: ours: both patches under one of the square's eight symmetries
     augmentation: Augmentation = field(default_factory=Augmentation)
@@ -61,6 +63,10 @@ class Batch:
     labels: NDArray[np.int64]  #: (B,)
 
 
+#: A tile's dense points seen first and second, and whether that was on two visits.
+Looks = tuple[Points, Points, bool]
+
+
 class PairMaker:
     """Draws pairs from a set of tiles; the same generator gives the same pairs."""
 
@@ -72,41 +78,49 @@ class PairMaker:
         self._half = (np.asarray(tiles.tile_size) / 2).astype(np.float32)
 
     def batches(self, count: int, size: int, rng: np.random.Generator) -> Iterator[Batch]:
-        """`count` pairs in the classes' exact shares, in random order, `size` at a time; a last few are left out."""
-        labels = rng.permutation(composition(count, self._settings.shares))
-        for start in range(0, count - size + 1, size):
-            yield batched([self.pair(int(label), rng) for label in labels[start : start + size]])
+        """`count` pairs in the classes' exact shares, `size` at a time; a last few are left out.
 
-    def pair(self, label: int, rng: np.random.Generator) -> Pair:
-        """One example of a class."""
+        Each changed pair comes with an unchanged one of the same tile and looks, so that nothing but the change
+        tells them apart.
+        """
+        ready: list[Pair] = []
+        groups = composition(count, self._settings.shares)
+        for place in rng.permutation(len(groups)):
+            looks = self._two_looks(rng)
+            ready += [self.pair(label, rng, looks) for label in groups[place]]
+            if len(ready) >= size:
+                yield batched(ready[:size])
+                ready = ready[size:]
+
+    def pair(self, label: int, rng: np.random.Generator, looks: Looks | None = None) -> Pair:
+        """One example of a class, of the given looks where the class is of one tile."""
+        looks = looks or self._two_looks(rng)
         settings = self._settings
         if label == DIFFERENT:
             reference, current = self._different(rng)
         elif label == CHANGED:
-            reference, current = self._changed(rng)
+            reference, current = self._changed(looks, rng)
         else:
-            reference, current = self._unchanged(rng)
+            reference, current = self._unchanged(looks, rng)
         if settings.symmetries:
             reference, current = turned_alike(reference, current, rng)
         reference = augmented(reference, settings.augmentation, rng)
         current = augmented(current, settings.augmentation, rng)
         return Pair(reference, current, self._sample(reference, rng), self._sample(current, rng), label)
 
-    def _unchanged(self, rng: np.random.Generator) -> tuple[Points, Points]:
-        first, second, revisit = self._two_looks(rng)
+    def _unchanged(self, looks: Looks, rng: np.random.Generator) -> tuple[Points, Points]:
+        first, second, revisit = looks
         if not revisit and rng.random() >= self._settings.rerun_share:
             stored = self._patch(first, rng)
             return stored, (stored + rng.normal(scale=STORED_JITTER, size=stored.shape)).astype(np.float32)
         intensity = self._settings.revisit_intensity if revisit else 1.0
         return self._sampled(first, second, intensity, rng)
 
-    def _changed(self, rng: np.random.Generator) -> tuple[Points, Points]:
+    def _changed(self, looks: Looks, rng: np.random.Generator) -> tuple[Points, Points]:
         settings = self._settings
-        first, second, revisit = self._two_looks(rng)
-        operation = OPERATIONS[str(rng.choice(list(OPERATIONS)))]
-        change = Change(magnitude=rng.uniform(*settings.magnitude), density=rng.uniform(*settings.density))
+        first, second, revisit = looks
         intensity = settings.revisit_intensity if revisit else settings.changed_intensity
-        return self._sampled(first, operation(second, change, self._half, rng), intensity, rng)
+        return self._sampled(first, changed(second, settings, self._half, rng), intensity, rng)
 
     def _different(self, rng: np.random.Generator) -> tuple[Points, Points]:
         """Tiles of two buildings, or at least `min_separation` apart in one (any other tile if none is)."""
@@ -119,7 +133,7 @@ class PairMaker:
         j = int(rng.choice(others))
         return self._patch(tiles.points_a[i], rng), self._patch(tiles.points_a[j], rng)
 
-    def _two_looks(self, rng: np.random.Generator) -> tuple[Points, Points, bool]:
+    def _two_looks(self, rng: np.random.Generator) -> Looks:
         """Two dense looks at a random tile, and whether they are of two visits (in either order)."""
         i = int(rng.integers(len(self._tiles)))
         a, b = self._tiles.points_a[i], self._tiles.points_b[i]
@@ -143,10 +157,38 @@ class PairMaker:
         return distinct[places % len(distinct)]
 
 
-def composition(count: int, shares: tuple[float, float, float]) -> NDArray[np.int64]:
-    """(count,) labels in exact shares, in order; what rounding leaves goes to the first class."""
-    changed, different = (round(count * share) for share in shares[1:])
-    return np.repeat([UNCHANGED, CHANGED, DIFFERENT], [count - changed - different, changed, different])
+def changed(points: Points, settings: PairSettings, half: Half, rng: np.random.Generator) -> Points:
+    """(n, 3) -> (m, 3): the tile under one of the operations, each as likely.
+
+    A change of which too little shows is drawn again, a dozen times at most: a tile may have no place for one.
+    """
+    operation = OPERATIONS[str(rng.choice(list(OPERATIONS)))]
+    return altered(points, operation, settings, half, rng)
+
+
+def altered(
+    points: Points, operation: Operation, settings: PairSettings, half: Half, rng: np.random.Generator
+) -> Points:
+    """As `changed`, under the given operation."""
+    for _ in range(12):
+        change = Change(magnitude=rng.uniform(*settings.magnitude), density=rng.uniform(*settings.density))
+        result = operation(points, change, half, rng)
+        if settings.min_shown == 0 or shown(points, result, settings.shown_distance) >= settings.min_shown:
+            break
+    return result.points
+
+
+def composition(count: int, shares: tuple[float, float, float]) -> list[tuple[int, ...]]:
+    """`count` labels in exact shares, as groups of one tile each; what rounding leaves is unchanged."""
+    changed_count, different = (round(count * share) for share in shares[1:])
+    unchanged = count - changed_count - different
+    both = min(unchanged, changed_count)
+    return [
+        *[(UNCHANGED, CHANGED)] * both,
+        *[(UNCHANGED,)] * (unchanged - both),
+        *[(CHANGED,)] * (changed_count - both),
+        *[(DIFFERENT,)] * different,
+    ]
 
 
 def batched(pairs: list[Pair]) -> Batch:

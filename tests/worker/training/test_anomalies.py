@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 
 from tests.worker.training.conftest import HALF
-from worker.training.anomalies import Change, add_object, move_object, nuisance_sigma, remove_object
+from worker.training.anomalies import (
+    Change,
+    Changed,
+    add_object,
+    move_object,
+    nuisance_sigma,
+    remove_object,
+    shown,
+)
 
 CHANGE = Change(magnitude=0.3, density=0.075)
 
@@ -23,51 +31,47 @@ def rng(seed: int = 0) -> np.random.Generator:
 
 def test_adding_keeps_every_point_and_adds_the_density(tile):
     changed = add_object(tile, CHANGE, HALF, rng())
-    assert len(changed) == 430  # 400 and 7.5% of it
-    assert np.array_equal(changed[:400], tile)
+    assert len(changed.appeared) == 30  # 7.5% of 400
+    assert len(changed.vanished) == 0
+    assert np.array_equal(changed.points, np.concatenate([tile, changed.appeared]))
 
 
 def test_removing_takes_the_neighbours_of_one_point(tile):
     changed = remove_object(tile, CHANGE, HALF, rng())
-    assert len(changed) == 370
-    kept = set(map(tuple, changed))
-    gone = np.array([point for point in tile if tuple(point) not in kept])
-    centre = gone[np.linalg.norm(gone[:, None] - gone, axis=2).max(axis=1).argmin()]
-    spread = np.linalg.norm(gone - centre, axis=1).max()
-    assert (np.linalg.norm(changed - centre, axis=1) < spread).sum() < 30  # a ball, not a scatter
+    gone = changed.vanished
+    assert (len(gone), len(changed.points), len(changed.appeared)) == (30, 370, 0)
+    spread = np.linalg.norm(gone - gone[0], axis=1).max()  # the nearest to the centre, itself, comes first
+    assert (np.linalg.norm(changed.points - gone[0], axis=1) >= spread).all()
 
 
 def test_removing_leaves_64_points_and_nothing_below_that():
     few = rng().uniform(-0.1, 0.1, (70, 3)).astype(np.float32)
     half_gone = Change(magnitude=0.3, density=0.5)
-    assert len(remove_object(few, half_gone, HALF, rng())) == 64
-    assert len(remove_object(few[:50], half_gone, HALF, rng())) == 50
+    assert len(remove_object(few, half_gone, HALF, rng()).points) == 64
+    assert len(remove_object(few[:50], half_gone, HALF, rng()).points) == 50
 
 
 def test_moving_shifts_the_cluster_as_one(tile):
     changed = move_object(tile, CHANGE, HALF, rng())
-    shifts = (changed - tile)[(changed != tile).any(axis=1)]
+    shifts = changed.appeared - changed.vanished
     assert len(shifts) == 30
     assert shifts == pytest.approx(np.broadcast_to(shifts[0], shifts.shape), abs=1e-6)
+    assert (changed.points != tile).any(axis=1).sum() == 30
 
 
-@pytest.mark.parametrize(("operation", "share"), [(move_object, 0.3), (add_object, 0.25)])
-def test_a_shift_has_the_magnitude_less_what_its_vertical_part_loses(tile, operation, share):
-    """Undoing the attenuation gives the full length again; jitter averages out over 30 points."""
+def test_a_move_has_the_magnitude_less_what_its_vertical_part_loses(tile):
     for seed in range(20):
-        changed = operation(tile, CHANGE, HALF, rng(seed))
-        before = move_object(tile, Change(magnitude=0.0, density=0.075), HALF, rng(seed))
-        if operation is move_object:
-            shift = (changed - before)[(changed != before).any(axis=1)].mean(axis=0)
-        else:
-            shift = changed[400:].mean(axis=0) - _cluster_mean(tile, seed)
-        full = shift / [1, 1, share]
-        assert np.linalg.norm(full) == pytest.approx(0.3, abs=1e-5 if operation is move_object else 0.06)
+        changed = move_object(tile, CHANGE, HALF, rng(seed))
+        shift = (changed.appeared - changed.vanished)[0]
+        assert np.linalg.norm(shift / [1, 1, 0.3]) == pytest.approx(0.3, abs=1e-5)
 
 
-def _cluster_mean(tile: np.ndarray, seed: int) -> np.ndarray:
-    kept = set(map(tuple, remove_object(tile, CHANGE, HALF, rng(seed))))
-    return np.array([point for point in tile if tuple(point) not in kept]).mean(axis=0)
+def test_an_addition_has_the_magnitude_less_what_its_vertical_part_loses(tile):
+    """The jitter has a sigma of 16 mm and averages out over the 30 points."""
+    for seed in range(20):
+        copied = remove_object(tile, CHANGE, HALF, rng(seed)).vanished  # the same cluster of the same stream
+        shift = (add_object(tile, CHANGE, HALF, rng(seed)).appeared - copied).mean(axis=0)
+        assert np.linalg.norm(shift / [1, 1, 0.25]) == pytest.approx(0.3, abs=0.04)
 
 
 @pytest.mark.parametrize("operation", [add_object, move_object])
@@ -75,8 +79,23 @@ def test_nothing_leaves_the_tile(operation):
     edge = (rng().uniform(-1, 1, (400, 3)) * HALF).astype(np.float32)
     for seed in range(20):
         changed = operation(edge, Change(magnitude=0.5, density=0.3), HALF, rng(seed))
-        assert (np.abs(changed) <= HALF).all()
+        assert (np.abs(changed.points) <= HALF).all()
 
 
 def test_the_jitter_grows_with_the_magnitude():
     assert nuisance_sigma(0.5) == pytest.approx(0.026)
+
+
+def test_a_doubled_piece_of_floor_shows_nothing_and_a_lifted_one_shows_all():
+    floor = np.stack(np.meshgrid(np.arange(-0.7, 0.7, 0.05), np.arange(-0.7, 0.7, 0.05), [-0.4]), -1)
+    floor = floor.reshape(-1, 3).astype(np.float32)
+    for height, expected in ((0.0, 0), (0.2, 25)):
+        appeared = floor[:25] + np.array([0.02, 0.02, height], dtype=np.float32)
+        after = Changed(points=np.concatenate([floor, appeared]), appeared=appeared, vanished=floor[:0])
+        assert shown(floor, after, 0.075) == expected
+
+
+def test_a_removed_cluster_shows_but_for_its_rim(tile):
+    changed = remove_object(tile, Change(magnitude=0.3, density=0.3), HALF, rng())
+    distance = np.linalg.norm(changed.vanished[:, None] - changed.points, axis=2).min(axis=1)
+    assert 0 < shown(tile, changed, 0.03) == (distance > 0.03).sum() < len(changed.vanished)

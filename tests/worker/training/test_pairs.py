@@ -7,6 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tests.worker.training.conftest import HALF
+from worker.training.anomalies import move_object
 from worker.training.augmentation import (
     Augmentation,
     Nuisance,
@@ -16,12 +18,12 @@ from worker.training.augmentation import (
     turned_alike,
 )
 from worker.training.dataset import TileSet, load_tiles, save_tiles, split_tiles
-from worker.training.pairs import PairMaker, PairSettings, composition
+from worker.training.pairs import PairMaker, PairSettings, altered, composition
 
 STILL = Augmentation(jitter=0, dropout=0, shift=0, yaw=0)
 SAME_LOOK = Nuisance(yaw=0, shift=0, dropout=(0, 0), magnitude=(-0.02, -0.02))  # 0.001 + 0.05 m is 0
 PLAIN = PairSettings(
-    patch_points=512, augmentation=STILL, nuisance=SAME_LOOK, symmetries=False, rerun_share=1.0
+    patch_points=512, min_shown=0, augmentation=STILL, nuisance=SAME_LOOK, symmetries=False, rerun_share=1.0
 )
 
 
@@ -30,7 +32,35 @@ def rows(points: np.ndarray) -> set[tuple[float, ...]]:
 
 
 def test_the_classes_have_their_exact_shares():
-    assert np.bincount(composition(2000, (0.50, 0.35, 0.15))).tolist() == [1000, 700, 300]
+    groups = composition(2000, (0.50, 0.35, 0.15))
+    assert np.bincount([label for group in groups for label in group]).tolist() == [1000, 700, 300]
+
+
+def test_every_changed_pair_has_an_unchanged_one_of_its_tile_while_there_are_any():
+    assert composition(20, (0.50, 0.35, 0.15)) == [(0, 1)] * 7 + [(0,)] * 3 + [(2,)] * 3
+    assert composition(10, (0.2, 0.6, 0.2)) == [(0, 1)] * 2 + [(1,)] * 4 + [(2,)] * 2
+
+
+def test_a_changed_pair_and_its_unchanged_one_look_at_the_same_tile(tiles):
+    maker = PairMaker(tiles, replace(PLAIN, shares=(0.5, 0.5, 0.0), revisit_share=1.0))
+    batch = next(maker.batches(2, 2, np.random.default_rng(0)))
+    first, second = np.split(batch.points, np.cumsum(batch.sizes)[:-1])[:2]
+    assert sorted(batch.labels) == [0, 1]
+    assert rows(first) == rows(second)  # the references
+
+
+def test_a_change_that_would_not_show_is_drawn_again(tiles):
+    settings = replace(PLAIN, magnitude=(0.0, 0.4), density=(0.1, 0.1), min_shown=15)
+    points = tiles.points_a[0]
+    for seed in range(20):
+        result = altered(points, move_object, settings, HALF, np.random.default_rng(seed))
+        moved = (result != points).any(axis=1)
+        gone, come = points[moved], result[moved]
+        far = [
+            (np.linalg.norm(one[:, None] - other, axis=2).min(axis=1) > 0.075).sum()
+            for one, other in ((come, points), (gone, result))
+        ]
+        assert sum(far) >= 15
 
 
 def test_a_batch_holds_both_branches_end_to_end_about_their_centroids(tiles):
