@@ -10,7 +10,9 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
+from worker.detectors.spicd_net.chamfer import chamfer_statistics
 from worker.detectors.spicd_net.layers import PooledLinear
 from worker.detectors.spicd_net.network import PairOutput, SpicdNetwork
 from worker.progress import Progress, silent
@@ -21,6 +23,7 @@ from worker.training.pairs import Batch, PairMaker, PairSettings
 from worker.training.prefetch import prefetched
 from worker.training.schedule import Schedule
 
+SETTLING_PAIRS = 128  #: that the head is initialised by
 CHECKPOINT, BEST, LOG = "last.pt", "best.pt", "epochs.csv"
 
 
@@ -108,6 +111,7 @@ class Run:
             fused=True,
         )
         self._makers = PairMaker(training, settings.pairs), PairMaker(validation, settings.pairs)
+        self._settle()
         self._epochs = 0
         self._seconds = 0.0
         self._best = (-1.0, -1.0)
@@ -196,13 +200,26 @@ class Run:
         loss = float(total_loss(answers, truth, (torch.eye(3)[None],)))
         return measured(answers.softmax(dim=1).numpy(), truth.numpy(), loss)
 
+    @torch.no_grad()
+    def _settle(self) -> None:
+        """Initialise the head by the data of a few batches."""
+        rng = np.random.default_rng((self._settings.seed, 0))
+        sides, statistics = [], []
+        for batch in self._makers[0].batches(SETTLING_PAIRS, self._settings.batch, rng):
+            points, reference_sample, current_sample = self._tensors(batch)
+            sides.append(self._network.encoder(points, batch.sizes)[0].chunk(2))
+            statistics.append(chamfer_statistics(reference_sample, current_sample))
+        reference, current = (torch.cat(side) for side in zip(*sides, strict=True))
+        self._network.head.settle(reference, current, torch.cat(statistics))
+
     def _forward(self, batch: Batch) -> PairOutput:
-        points, reference_sample, current_sample = (
-            torch.from_numpy(array).to(self._device)
-            for array in (batch.points, batch.reference_sample, batch.current_sample)
-        )
+        points, reference_sample, current_sample = self._tensors(batch)
         output: PairOutput = self._network(points, batch.sizes, reference_sample, current_sample)
         return output
+
+    def _tensors(self, batch: Batch) -> list[Tensor]:
+        arrays = (batch.points, batch.reference_sample, batch.current_sample)
+        return [torch.from_numpy(array).to(self._device) for array in arrays]
 
     def _save(self, name: str, more: dict[str, Any]) -> None:
         """Written beside and moved, so that a stop in between leaves the old file whole."""

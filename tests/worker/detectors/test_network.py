@@ -9,7 +9,7 @@ from torch import nn
 from worker.detectors.spicd_net.chamfer import chamfer_statistics
 from worker.detectors.spicd_net.frozen import FrozenEncoder
 from worker.detectors.spicd_net.layers import Moments, NormedLinear, PooledLinear
-from worker.detectors.spicd_net.network import PairHead, SpicdNetwork, TransformNet
+from worker.detectors.spicd_net.network import PairHead, SpicdNetwork, TransformNet, fused
 
 SIZES = [40, 25, 60]
 
@@ -137,3 +137,19 @@ def test_the_chamfer_feature_is_gated_in_training_only():
     torch.manual_seed(0)
     gated = (head.train()(descriptors, descriptors, statistics) - in_use[0]).abs().amax(1) > 1e-6
     assert 0.12 < gated.float().mean() < 0.28  # 0.2 of 400, four sigmas either way
+
+
+def test_a_settled_head_hears_every_block_of_its_input_alike():
+    torch.manual_seed(0)
+    head = PairHead().eval()
+    base = 5 * torch.randn(600, 1024)
+    reference, current = base, base + 0.1 * torch.randn(600, 1024)
+    statistics = 0.1 + 0.02 * torch.rand(600, 8)
+    head.settle(reference, current, statistics)
+    first = head.classifier[0]
+    blocks = fused(reference, current, head.chamfer(statistics)).split([1024, 1024, 32], dim=1)
+    weights = first.weight.split([1024, 1024, 32], dim=1)
+    spread = [float((x @ w.t()).detach().std(dim=0).mean()) for x, w in zip(blocks, weights, strict=True)]
+    assert max(spread) < 2 * min(spread)
+    whole = first(torch.cat(blocks, dim=1)).mean(dim=0)
+    assert whole.abs().max() < 0.1  # the bias alone: U(-1, 1) / sqrt(2080)

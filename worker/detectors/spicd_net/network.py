@@ -105,9 +105,35 @@ class PairHead(nn.Module):
         geometry = self.chamfer(statistics)
         if self.training:
             geometry = geometry * (torch.rand(len(geometry), 1, device=geometry.device) >= CHAMFER_GATING)
-        fused = torch.cat([(reference - current).abs(), reference * current, geometry], dim=1)
-        logits: Tensor = self.classifier(fused)
+        logits: Tensor = self.classifier(fused(reference, current, geometry))
         return logits
+
+    @torch.no_grad()
+    def settle(self, reference: Tensor, current: Tensor, statistics: Tensor) -> None:
+        """Initialise by data: both first layers begin as if their inputs were standardised.
+
+        The statistics differ by centimetres and the products are some ten, so that at first the head would
+        hear of nothing but the products. Same arguments as `forward`.
+        """
+        _settle(self.chamfer[0], statistics, blocks=(STATISTICS,))
+        inputs = fused(reference, current, self.chamfer(statistics))
+        _settle(self.classifier[0], inputs, blocks=(DESCRIPTOR, DESCRIPTOR, CHAMFER_FEATURES))
+
+
+def fused(reference: Tensor, current: Tensor, geometry: Tensor) -> Tensor:
+    """(B, 1024), (B, 1024), (B, 32) -> (B, 2080)"""
+    return torch.cat([(reference - current).abs(), reference * current, geometry], dim=1)
+
+
+def _settle(layer: nn.Module, inputs: Tensor, *, blocks: tuple[int, ...]) -> None:
+    """Scale and shift a Linear for its inputs (n, C), each block of columns giving the outputs equal variance."""
+    if not isinstance(layer, nn.Linear):
+        raise TypeError(f"a linear layer is settled, not {type(layer).__name__}")
+    std = inputs.std(dim=0)
+    std = std.clamp_min(0.1 * float(std[std > 0].median()))  # columns that hardly vary are not blown up
+    shares = [torch.full((n,), (inputs.shape[1] / (len(blocks) * n)) ** 0.5) for n in blocks]
+    layer.weight.mul_(torch.cat(shares).to(std.device) / std)
+    layer.bias.sub_(layer.weight @ inputs.mean(dim=0))
 
 
 class SpicdNetwork(nn.Module):
