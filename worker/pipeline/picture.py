@@ -5,10 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch, Rectangle
+from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
 from worker.pipeline.changes import ChangeSet, TileState
@@ -17,13 +20,15 @@ from worker.pipeline.mapping import CurrentMap
 from worker.pipeline.values import Points
 
 _PIXEL = 0.05  # metres
-_INK = "#222222"
+_INK = "#1a1a1a"
+_QUIET = "#666666"
+_DARKEST_WALL = 0.5  # grey of the map, so that ink on it is seen at once
 #: of the tiles in one column of the grid, the one that is shown; the rest would lie under it
 _PRECEDENCE = (TileState.CHANGED, TileState.INCONSISTENT, TileState.UNOBSERVED, TileState.UNCHANGED)
 _FILL = {
-    TileState.CHANGED: 0.45,
-    TileState.INCONSISTENT: 0.4,
-    TileState.UNOBSERVED: 0.16,
+    TileState.CHANGED: 0.4,
+    TileState.INCONSISTENT: 0.3,
+    TileState.UNOBSERVED: 0.1,
     TileState.UNCHANGED: 0.0,
 }
 #: a second sign beside the colour, for eyes and printers without it
@@ -33,6 +38,10 @@ _HATCH = {
     TileState.UNOBSERVED: "//",
     TileState.UNCHANGED: "",
 }
+_HATCH_WIDTH = 0.5  # points
+_WIDEST, _HIGHEST, _NARROWEST = 11.0, 9.0, 6.5  # inches of the map's part of the picture
+_HEAD, _FOOT, _SIDE = 0.75, 1.0, 0.55  # inches above, below and left of it
+_ROOM_FOR_ID = 0.75  # inches; a smaller tile shows its score alone
 
 
 def draw_picture(
@@ -44,18 +53,19 @@ def draw_picture(
     """
     extent = _extent(changes)
     width, height = extent[1] - extent[0], extent[3] - extent[2]
-    scale = min(11.0 / width, 9.0 / height)
-    figure = Figure(
-        figsize=(max(width * scale, 6.5) + 0.6, height * scale + 1.9), dpi=130, layout="constrained"
-    )
-    axes = figure.add_subplot()
+    scale = min(_WIDEST / width, _HIGHEST / height)  # inches a metre
+    sheet = (max(width * scale, _NARROWEST) + 2 * _SIDE, height * scale + _HEAD + _FOOT)
+    figure = Figure(figsize=sheet, dpi=130, facecolor="white")
+    FigureCanvasAgg(figure)
+    place = (0.5 - width * scale / sheet[0] / 2, _FOOT / sheet[1])
+    axes = figure.add_axes((*place, width * scale / sheet[0], height * scale / sheet[1]))
     _draw_walls(axes, reference, current.points, extent)
-    _draw_tiles(axes, changes)
+    _draw_tiles(axes, changes, tile_inches=float(changes.pairs.reference.grid.size[0]) * scale)
     _draw_scale_bar(axes, extent)
     _dress(figure, axes, extent, changes, title)
     aside = path.with_name(path.name + ".tmp")
-    FigureCanvasAgg(figure)
-    figure.savefig(aside, format="png")
+    with rc_context({"hatch.linewidth": _HATCH_WIDTH}):
+        figure.savefig(aside, format="png")
     aside.replace(path)
 
 
@@ -74,10 +84,10 @@ def _draw_walls(
     """How much stands above each spot between knee and head, so that furniture and walls show."""
     floor = float(np.percentile(reference[:, 2], 1))
     before, now = (_standing(points, floor, extent) for points in (reference, current))
-    shade = np.clip(before / 12.0, 0, 1) * 0.75
+    shade = np.clip(before / 12.0, 0, 1) * _DARKEST_WALL
     picture = np.repeat(1 - shade[:, :, None], 3, axis=2)
     only_now = (now > 2) & ~_near(before > 0)
-    picture[only_now] = (0.1, 0.1, 0.1)
+    picture[only_now] = to_rgb(_INK)
     axes.imshow(picture, origin="lower", extent=extent, interpolation="nearest", zorder=0)
 
 
@@ -99,38 +109,62 @@ def _near(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return grown
 
 
-def _draw_tiles(axes: Axes, changes: ChangeSet) -> None:
+def _draw_tiles(axes: Axes, changes: ChangeSet, *, tile_inches: float) -> None:
     tiles = changes.pairs.reference
     lower = tiles.grid.lower(tiles.indices)
-    shown: dict[tuple[int, int], int] = {}
-    for row, (i, j, _) in enumerate(tiles.indices):
-        key, state = (int(i), int(j)), TileState(int(changes.states[row]))
-        if key not in shown or _rank(state) < _rank(TileState(int(changes.states[shown[key]]))):
-            shown[key] = row
-    for row in shown.values():
+    for row in _topmost(changes):
         state = TileState(int(changes.states[row]))
-        color = tuple(channel / 255 for channel in STATE_COLORS[state])
-        marked = state is not TileState.UNCHANGED
+        color = _color(state)
         axes.add_patch(
             Rectangle(
                 (lower[row, 0], lower[row, 1]),
                 float(tiles.grid.size[0]),
                 float(tiles.grid.size[1]),
                 facecolor=(*color, _FILL[state]),
-                edgecolor=color if marked else (0.6, 0.6, 0.6, 0.35),
-                linewidth=1.6 if state is TileState.CHANGED else 0.6,
+                edgecolor=(0.6, 0.6, 0.6, 0.35) if state is TileState.UNCHANGED else color,
+                linewidth=2.0 if state is TileState.CHANGED else 0.6,
                 hatch=_HATCH[state],
                 zorder=3 if state is TileState.CHANGED else 2,
             )
         )
         if state is TileState.CHANGED:
-            center = lower[row] + tiles.grid.size / 2
-            score = f"{changes.probabilities[row, 1]:.2f}"
-            axes.text(center[0], center[1], score, ha="center", va="center", fontsize=8, color=_INK, zorder=4)
+            _label(axes, changes, row, with_id=tile_inches >= _ROOM_FOR_ID)
 
 
-def _rank(state: TileState) -> int:
-    return _PRECEDENCE.index(state)
+def _topmost(changes: ChangeSet) -> list[int]:
+    """Of each column of the grid the row of the tile that is shown: by precedence, then by score."""
+    shown: dict[tuple[int, int], int] = {}
+    for row in sorted(range(len(changes.states)), key=lambda row: _order(changes, row)):
+        i, j, _ = changes.pairs.reference.indices[row]
+        shown.setdefault((int(i), int(j)), row)
+    return list(shown.values())
+
+
+def _order(changes: ChangeSet, row: int) -> tuple[int, float]:
+    score = float(np.nan_to_num(changes.probabilities[row, 1]))
+    return _PRECEDENCE.index(TileState(int(changes.states[row]))), -score
+
+
+def _label(axes: Axes, changes: ChangeSet, row: int, *, with_id: bool) -> None:
+    """In a corner of the tile, off what stands in it: the score, and the numbers of the id that tables name."""
+    tiles = changes.pairs.reference
+    index = tiles.indices[row]
+    x, y = tiles.grid.lower(index)[0], tiles.grid.lower(index)[1] + tiles.grid.size[1]
+    lines = [(f"{changes.probabilities[row, 1]:.2f}", 9 if with_id else 7, 4.0)]
+    if with_id:
+        lines.append(("_".join(f"{number:03d}" for number in index), 6, 14.0))
+    for text, size, down in lines:
+        axes.annotate(
+            text,
+            (float(x), float(y)),
+            xytext=(4.0, -down),
+            textcoords="offset points",
+            va="top",
+            fontsize=size,
+            color=_INK,
+            zorder=4,
+            path_effects=[withStroke(linewidth=2.0, foreground="white")],
+        )
 
 
 def _draw_scale_bar(axes: Axes, extent: tuple[float, float, float, float]) -> None:
@@ -148,24 +182,40 @@ def _dress(
 ) -> None:
     axes.set_xlim(extent[0], extent[1])
     axes.set_ylim(extent[2], extent[3])
-    axes.set_aspect("equal")
-    axes.tick_params(labelsize=7, colors="#666666")
-    axes.set_xlabel("x of the map, m", fontsize=8, color="#666666")
-    axes.set_ylabel("y of the map, m", fontsize=8, color="#666666")
+    axes.tick_params(labelsize=7, colors=_QUIET, length=2)
+    axes.set_xlabel("x of the map (m)", fontsize=8, color=_QUIET)
+    axes.set_ylabel("y of the map (m)", fontsize=8, color=_QUIET)
     for spine in axes.spines.values():
         spine.set_visible(False)
-    axes.set_title(title, loc="left", fontsize=11, color=_INK)
     counts = changes.counts()
+    said = f"{counts['changed']} of {len(changes.states)} tiles changed, at a score above {changes.threshold:.2f}"
+    above, left = figure.get_figheight(), axes.get_position().x0
+    figure.text(left, 1 - 0.3 / above, title, fontsize=12, color=_INK, va="center", weight="bold")
+    figure.text(left, 1 - 0.55 / above, said, fontsize=9, color=_QUIET, va="center")
     entries = [_legend_entry(state, counts[state.label]) for state in _PRECEDENCE]
-    entries.append(Patch(facecolor=(0.1, 0.1, 0.1), label="seen in the survey only"))
-    figure.legend(handles=entries, loc="outside lower center", ncols=5, fontsize=8, frameon=False)
+    entries.append(Patch(facecolor=_INK, label="seen in the survey only"))
+    figure.legend(
+        handles=entries,
+        loc="lower center",
+        bbox_to_anchor=(0.5, 0.2 / above),
+        ncols=5,
+        fontsize=8,
+        frameon=False,
+    )
+    note = "seen from above, between 0.15 and 2 m over the floor; of tiles above each other the first in this list is drawn"
+    figure.text(0.5, 0.14 / above, note, fontsize=6.5, color=_QUIET, ha="center", va="center")
 
 
 def _legend_entry(state: TileState, count: int) -> Patch:
-    red, green, blue = (channel / 255 for channel in STATE_COLORS[state])
+    color = _color(state)
     return Patch(
-        facecolor=(red, green, blue, max(_FILL[state], 0.05)),
-        edgecolor=(red, green, blue),
+        facecolor=(*color, max(_FILL[state], 0.05)),
+        edgecolor=color,
         hatch=_HATCH[state],
         label=f"{count} {state.label}",
     )
+
+
+def _color(state: TileState) -> tuple[float, float, float]:
+    red, green, blue = (channel / 255 for channel in STATE_COLORS[state])
+    return red, green, blue
