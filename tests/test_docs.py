@@ -1,0 +1,86 @@
+"""The pages that repeat what the code says stay in step with it."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from rq.exceptions import AbandonedJobError
+from rq.timeouts import JobTimeoutException
+
+from service.api.problems import PROBLEMS
+from service.errors import ServiceError
+from service.settings import Settings
+from worker import rq_workers
+from worker.errors import Cancelled, PipelineError
+from worker.rq_jobs import FunctionRefused
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")])
+ROW = re.compile(r"^\| `(\w+)` \| ([^|]+) \|", re.MULTILINE)
+
+
+def settings_table() -> str:
+    """What README.md says of the settings, row by row."""
+    rows = ["| variable | default | what it is |", "| --- | --- | --- |"]
+    for name, field in Settings.model_fields.items():
+        default = "" if field.default is None else f"`{field.default}`"
+        rows.append(f"| `SPICD_{name.upper()}` | {default} | {field.description} |")
+    return "\n".join(rows)
+
+
+def test_the_readme_lists_every_setting_with_its_default() -> None:
+    assert settings_table() in (ROOT / "README.md").read_text()
+
+
+def test_every_problem_code_is_explained() -> None:
+    documented = dict(ROW.findall((ROOT / "docs/problems.md").read_text()))
+    assert set(documented) == {*PROBLEMS, *codes(ServiceError), *codes(PipelineError), *codes_of_ends()} - {
+        ServiceError.code,  # of the base alone; what carries it is `internal`
+        Cancelled.code,  # never recorded
+    }
+
+
+@pytest.mark.parametrize("code", PROBLEMS)
+def test_the_status_of_each_problem_is_the_one_that_is_sent(code: str) -> None:
+    documented = dict(ROW.findall((ROOT / "docs/problems.md").read_text()))[code]
+    status, _ = PROBLEMS[code]
+    in_jobs = code in codes(PipelineError) | codes_of_ends() | {"dismissed"}
+    assert documented == " or ".join([*([str(status)] if status else []), *(["job"] if in_jobs else [])])
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_every_link_to_a_file_leads_somewhere(page: Path) -> None:
+    links = re.findall(r"\]\((?!https?://|#)([^)#\s]+)", page.read_text())
+    assert [link for link in links if not (page.parent / link).exists()] == []
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_every_file_of_ours_that_a_page_names_exists(page: Path) -> None:
+    named = re.findall(r"`((?:service|worker|tests|docker|docs|openapi)/[\w./-]*\w)/?`", page.read_text())
+    assert [name for name in named if not (ROOT / name).exists()] == []
+
+
+def test_the_readme_names_targets_that_make_has() -> None:
+    targets = set(re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+    assert set(re.findall(r"(?:^|`)make ([a-z]+)", (ROOT / "README.md").read_text(), re.MULTILINE)) <= targets
+
+
+def codes(kind: type[Exception]) -> set[str]:
+    """The codes of an error and of everything below it."""
+    return {kind.code}.union(*(codes(below) for below in kind.__subclasses__()))  # type: ignore[attr-defined]
+
+
+def codes_of_ends() -> set[str]:
+    """What a worker records of a step that could not speak for itself."""
+    ends = (
+        FunctionRefused(),
+        JobTimeoutException(),
+        AbandonedJobError(),
+        rq_workers.WorkerStopped(),
+        KeyError(),
+    )
+    step = SimpleNamespace(id="job-1-register", timeout=1)
+    return {rq_workers._problem(end, step)[0] for end in ends}  # type: ignore[arg-type]
