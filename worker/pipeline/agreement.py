@@ -2,7 +2,8 @@
 
 Fitness at a 5 cm gate counts point pairs, and so falls with the spacing of the points: two true scans of one
 room, ten metres wide, reach only 0.48 (`room_scan`). Here a point agrees when it lies on the other cloud's
-*surface*: near enough to have a neighbour there, and close to that neighbour's tangent plane.
+*surface*: near enough to have a neighbour there that was seen from the same side (the other side of a wall is
+a place the map has not seen, not a contradiction), and close to that neighbour's tangent plane.
 """
 
 from __future__ import annotations
@@ -11,18 +12,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from worker.pipeline.icp import Surface
+from worker.pipeline.icp import Surface, facing
 from worker.pipeline.poses import inverse, transformed
-from worker.pipeline.values import Floats, Matrix4
+from worker.pipeline.values import Matrix4
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Agreement:
     """Shares in 0..1, the worse side first named."""
 
-    overlap: float  #: of the scan's points with a map point within reach
+    overlap: float  #: of the scan's points with a map point within reach, seen from the same side
     forward: float  #: of those, on the map's surface
-    backward: float  #: of the map's points with a scan point within reach, on the scan's surface
+    backward: float  #: the same of the map's points on the scan's surface
 
     @property
     def mutual(self) -> float:
@@ -39,20 +40,20 @@ def agreement(
     source: Surface, target: Surface, target_from_source: Matrix4, *, reach: float, surface_distance: float
 ) -> Agreement:
     """Compare both clouds under the pose; `reach` and `surface_distance` are metres."""
-    there = transformed(source.points, target_from_source)
-    overlap, forward = _on_surface(there, target, reach, surface_distance)
-    back = transformed(target.points, inverse(target_from_source))
-    _, backward = _on_surface(back, source, reach, surface_distance)
+    overlap, forward = _on_surface(source, target, target_from_source, reach, surface_distance)
+    _, backward = _on_surface(target, source, inverse(target_from_source), reach, surface_distance)
     return Agreement(overlap=overlap, forward=forward, backward=backward)
 
 
 def _on_surface(
-    points: Floats, surface: Surface, reach: float, surface_distance: float
+    cloud: Surface, surface: Surface, surface_from_cloud: Matrix4, reach: float, surface_distance: float
 ) -> tuple[float, float]:
+    points = transformed(cloud.points, surface_from_cloud)
     distance, index = surface.nearest(points, within=reach)
     near = np.isfinite(distance)
-    if not near.any():
+    covered = facing(cloud, surface, surface_from_cloud, index, near)
+    if not covered.any():
         return 0.0, 0.0
-    gap = points[near] - surface.points[index[near]]
-    off_plane = np.abs(np.einsum("ij,ij->i", gap, surface.normals[index[near]]))
-    return float(near.mean()), float((off_plane < surface_distance).mean())
+    gap = points[covered] - surface.points[index[covered]]
+    off_plane = np.abs(np.einsum("ij,ij->i", gap, surface.normals[index[covered]]))
+    return float(covered.mean()), float((off_plane < surface_distance).mean())

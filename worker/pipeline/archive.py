@@ -36,6 +36,7 @@ def save_reference(path: Path, reference: ReferenceMap) -> None:
     arrays: Arrays = {
         "points": reference.points,
         "normals": reference.normals,
+        "oriented": reference.oriented,
         "voxel_size": np.array([reference.voxel_size]),
     }
     if reference.colors is not None:
@@ -49,6 +50,7 @@ def load_reference(path: Path) -> ReferenceMap:
     return ReferenceMap(
         points=arrays["points"],
         normals=arrays["normals"],
+        oriented=arrays["oriented"],
         colors=arrays.get("colors"),
         voxel_size=float(arrays["voxel_size"][0]),
     )
@@ -67,10 +69,10 @@ def load_current(path: Path) -> CurrentMap:
 
 
 def save_scan(path: Path, scan: RegisteredScan) -> None:
-    """Keep an accepted scan's points, pose and sensor origin: detectors that follow rays need them."""
+    """Keep an accepted scan's points, pose and sensor origin (where known): detectors that follow rays need them."""
     colors: Arrays = {} if scan.colors is None else {"colors": scan.colors}
-    pose = {"map_from_scan": scan.map_from_scan, "sensor_origin": scan.sensor_origin}
-    save_arrays(path, {"points": scan.points, **pose, **colors})
+    origin: Arrays = {} if scan.sensor_origin is None else {"sensor_origin": scan.sensor_origin}
+    save_arrays(path, {"points": scan.points, "map_from_scan": scan.map_from_scan, **origin, **colors})
 
 
 def save_tiles(path: Path, tiles: Tiles) -> None:

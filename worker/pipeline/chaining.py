@@ -84,18 +84,19 @@ def chain(
 ) -> tuple[tuple[Outcome, ...], Voxels]:
     """Place every scan in the frame of the first, and fuse them on the way.
 
-    The first scan stands at its pose prior, or at identity. A scan that finds no place gets a second try when
-    all others are in. Returns the outcomes in the order given, and the fused voxels; raises ScanError.
+    The first scan stands at its pose prior, or at identity. A scan that finds no place is tried again
+    as long as the map grows. Returns the outcomes in the order given, and the fused voxels; raises ScanError.
     """
     first = files[0].read(max_points=max_points)
     placed = as_reference(first, _start(files[0], first))
     outcomes = {0: _accepted(files[0], placed)}
-    fused = Voxels.of(placed.points, size=settings.voxel_size, colors=placed.colors)
-    tries = list(range(1, len(files)))
-    for attempt in (1, 2):
-        for done, at in enumerate(tries, start=len(files) - len(tries)):
-            target = surface_of(fused.points, settings)
-            share = done / len(files)
+    fused = placed.voxels(settings.voxel_size)
+    waiting, found_one = list(range(1, len(files))), True
+    while waiting and found_one:
+        found_one = False
+        for at in list(waiting):
+            target = surface_of(fused, settings)
+            share = 1 - len(waiting) / len(files)
 
             def tick(share: float = share) -> None:
                 progress("registering", share)
@@ -103,9 +104,9 @@ def chain(
             outcome = place(files[at], target, settings=settings, max_points=max_points, tick=tick)
             outcomes[at] = outcome
             if outcome.scan:
-                scan = outcome.scan
-                fused = fused.merged(Voxels.of(scan.points, size=settings.voxel_size, colors=scan.colors))
-        tries = [at for at in tries if outcomes[at].scan is None] if attempt == 1 else []
+                fused = fused.merged(outcome.scan.voxels(settings.voxel_size))
+                waiting.remove(at)
+                found_one = True
     progress("registering", 1.0)
     return tuple(outcomes[at] for at in range(len(files))), fused
 

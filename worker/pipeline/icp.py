@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from worker.pipeline.poses import exponential, transformed
-from worker.pipeline.values import Floats, Matrix4
+from worker.pipeline.values import Bools, Floats, Matrix4
 
 _THREADS = 2  # a query of 30,000 points gains nothing from more
 
@@ -27,13 +27,16 @@ class Surface:
 
     points: Floats  #: (M, 3) metres, target frame
     normals: Floats  #: (M, 3) unit length
+    oriented: (
+        Bools  #: (M,) whether the normal points to the side that was seen; otherwise its sign is arbitrary
+    )
     tree: cKDTree
 
     @classmethod
-    def of(cls, points: NDArray[Any], normals: NDArray[Any]) -> Surface:
+    def of(cls, points: NDArray[Any], normals: NDArray[Any], oriented: Bools) -> Surface:
         """Build the tree over points (M, 3), metres."""
         points = points.astype(np.float64)
-        return cls(points=points, normals=normals.astype(np.float64), tree=cKDTree(points))
+        return cls(points=points, normals=normals.astype(np.float64), oriented=oriented, tree=cKDTree(points))
 
     def nearest(self, points: Floats, *, within: float = np.inf) -> tuple[Floats, NDArray[np.intp]]:
         """Distance (N,) in metres and index (N,) of the nearest point; inf and M where none is near enough."""
@@ -54,36 +57,62 @@ class IcpResult:
 
 
 def icp(
-    source: Floats,
+    source: Surface,
     target: Surface,
     start: Matrix4,
     *,
     max_correspondence_distance: float,
     max_iterations: int = 30,
     tolerance: float = 1e-4,
+    soft: bool = False,
+    every: int = 1,
     tick: Callable[[], None] = lambda: None,
 ) -> IcpResult:
-    """Minimise the squared distances of source points (N, 3) to the tangent planes of their nearest neighbours.
+    """Minimise the squared distances of the source's points to the tangent planes of their nearest neighbours.
 
-    `start` is target_from_source; `tolerance` ends the loop, in radians and metres of one step. `tick` is
-    called before every iteration and may raise to stop the work.
+    `start` is target_from_source; `tolerance` ends the loop, in radians and metres of one step. `soft`
+    weighs pairs down towards the gate (Tukey's biweight), for wide gates where many are wrong. `every` takes
+    one point of so many. `tick` is called before every iteration and may raise to stop the work.
+    Pairs that face opposite ways are the two sides of one wall, and are left out.
     """
+    points = source.points[::every]
     pose, converged, iterations = start, False, 0
     while iterations < max_iterations and not converged:
         tick()
         iterations += 1
-        moved = transformed(source, pose)
+        moved = transformed(points, pose)
         distance, index = target.nearest(moved, within=max_correspondence_distance)
-        inlier = np.isfinite(distance)
-        if inlier.sum() < 6:
+        pair = facing(source, target, pose, index, np.isfinite(distance), every=every)
+        if pair.sum() < 6:
             break
-        jacobian, residual = _linearised(moved[inlier], target, index[inlier])
+        jacobian, residual = _linearised(moved[pair], target, index[pair])
+        weighted = jacobian
+        if soft:
+            weighted = jacobian * ((1 - (distance[pair] / max_correspondence_distance) ** 2) ** 2)[:, None]
         # 1e-9 keeps a scene without constraint in some direction solvable: the step there is zero
-        normal_matrix = jacobian.T @ jacobian + 1e-9 * len(residual) * np.eye(6)
-        step: Floats = -np.linalg.solve(normal_matrix, jacobian.T @ residual).astype(np.float64)
+        normal_matrix = weighted.T @ jacobian + 1e-9 * len(residual) * np.eye(6)
+        step: Floats = -np.linalg.solve(normal_matrix, weighted.T @ residual).astype(np.float64)
         pose = exponential(step) @ pose
         converged = bool(np.abs(step).max() < tolerance)
-    return _evaluated(source, target, pose, max_correspondence_distance, converged, iterations)
+    return _evaluated(points, target, pose, max_correspondence_distance, converged, iterations)
+
+
+def facing(
+    source: Surface,
+    target: Surface,
+    target_from_source: Matrix4,
+    index: NDArray[np.intp],
+    paired: Bools,
+    *,
+    every: int = 1,
+) -> Bools:
+    """(N,) which pairs (source point, target point `index`) may be one surface: not two sides of one wall."""
+    oriented = paired & source.oriented[::every]
+    oriented[oriented] = target.oriented[index[oriented]]
+    normals = source.normals[::every][oriented] @ target_from_source[:3, :3].T
+    same = paired.copy()
+    same[oriented] = np.einsum("ij,ij->i", normals, target.normals[index[oriented]]) > 0
+    return same
 
 
 def _linearised(moved: Floats, target: Surface, index: NDArray[np.intp]) -> tuple[Floats, Floats]:
@@ -93,15 +122,15 @@ def _linearised(moved: Floats, target: Surface, index: NDArray[np.intp]) -> tupl
 
 
 def _evaluated(
-    source: Floats, target: Surface, pose: Matrix4, gate: float, converged: bool, iterations: int
+    points: Floats, target: Surface, pose: Matrix4, gate: float, converged: bool, iterations: int
 ) -> IcpResult:
-    distance, _ = target.nearest(transformed(source, pose), within=gate)
+    distance, _ = target.nearest(transformed(points, pose), within=gate)
     inliers = distance[np.isfinite(distance)]
     return IcpResult(
         target_from_source=pose,
         converged=converged,
         iterations=iterations,
         num_inliers=len(inliers),
-        fitness=len(inliers) / max(len(source), 1),
+        fitness=len(inliers) / max(len(points), 1),
         inlier_rmse=float(np.sqrt(np.mean(inliers**2))) if len(inliers) else float("inf"),
     )

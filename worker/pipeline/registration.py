@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,9 +14,10 @@ from worker.pipeline.constraint import constraint
 from worker.pipeline.global_search import candidate_poses
 from worker.pipeline.icp import IcpResult, Surface, icp
 from worker.pipeline.normals import estimate_normals
-from worker.pipeline.poses import transformed
+from worker.pipeline.poses import difference, exponential, transformed
 from worker.pipeline.scan import Scan
 from worker.pipeline.values import Floats, Matrix4, Points
+from worker.pipeline.visibility import ENOUGH, share_in_front
 from worker.pipeline.voxels import Voxels
 
 REACH = 0.3  #: metres; farther from the map than this, a point is where the map has nothing to say
@@ -56,7 +57,17 @@ class RegistrationSettings(BaseModel):
     min_agreement: float = Field(
         0.8, ge=0, le=1, description="share of the overlap on a common surface, both ways"
     )
+    min_agreement_unvouched: float = Field(
+        0.85,
+        ge=0,
+        le=1,
+        description="the same where no prior vouches for the pose and the sensor's place is known",
+    )
+    sure_agreement: float = Field(0.9, ge=0, le=1, description="enough to search no further")
     min_overlap: float = Field(0.5, ge=0, le=1, description="share of the scan that the map covers")
+    min_overlap_vouched: float = Field(0.3, ge=0, le=1, description="the same near a prior")
+    prior_distance: float = Field(1.0, ge=0, description="metres; how far a given prior may be off")
+    prior_angle: float = Field(0.26, ge=0, description="radians; likewise (15 degrees)")
     min_constraint: float = Field(0.002, ge=0, description="smallest eigenvalue of the scene's normal matrix")
     min_points: int = Field(500, ge=6, description="voxels that a scan needs to be registered at all")
 
@@ -69,12 +80,16 @@ class RegisteredScan:
     points: Points  #: (N, 3) float32, metres, map frame
     colors: np.ndarray | None  #: (N, 3) uint8
     map_from_scan: Matrix4  #: (4, 4) rigid
-    sensor_origin: Floats  #: (3,) metres, map frame
+    sensor_origin: Floats | None  #: (3,) metres, map frame; None where the points contradict the file's
     fitness: float  #: share of the scan's voxels with a correspondence at the last gate, 0..1
     inlier_rmse: float  #: metres
     overlap: float  #: share of the scan that the map covers, 0..1
     agreement: float  #: share of the overlap on a common surface, worse direction, 0..1
     searched: bool  #: the given start did not do; the pose comes from the global search
+
+    def voxels(self, size: float) -> Voxels:
+        """Its points in cells of `size` metres of the map frame."""
+        return Voxels.of(self.points, size=size, origin=self.sensor_origin, colors=self.colors)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -82,6 +97,8 @@ class _Candidate:
     found: IcpResult
     seen: Agreement
     searched: bool
+    vouched: bool  #: near a given prior
+    oriented: bool  #: which side of its surfaces the scan saw is known, so that agreement says more
 
 
 def register(
@@ -92,39 +109,75 @@ def register(
     settings: RegistrationSettings,
     tick: Callable[[], None] = lambda: None,
 ) -> RegisteredScan:
-    """Find map_from_scan by ICP from `start` (map_from_scan; identity if None), else by global search.
+    """Find map_from_scan by ICP from `start` (a prior of map_from_scan; identity if None), else by global search.
 
-    Accepted is what passes Table 1 (fitness and inlier RMSE), or, because fitness falls with the spacing of
-    the points, what lies on common surfaces from both sides (`min_agreement`, `min_overlap`).
+    Table 1 alone accepts wrong poses (a room laid over the next one reaches fitness 0.60) and refuses true ones
+    of sparse scans (0.48). So both clouds must lie on common surfaces, seen from either side, over half of the
+    scan or with Table 1's fitness. A pose near a given prior needs less of it; one far from it is not taken,
+    because buildings repeat themselves. See docs/decisions.
 
     Raises ScanRejected with the best numbers reached, or where the scene cannot hold a pose.
     """
     source = _source_surface(scan, settings)
-    begin = np.eye(4) if start is None else start
-    best = _refined(source, target, begin, searched=False, settings=settings, tick=tick)
-    if not _passes_table_1(best.found, settings):
-        for pose in candidate_poses(source.points, target.points, resolutions=settings.search_resolutions):
+    best = _refined(source, target, start, None, settings=settings, tick=tick)
+    if not _is_accepted(best, settings):
+        for pose in _search(source, target, settings):
             tick()
-            other = _refined(source, target, pose, searched=True, settings=settings, tick=tick)
-            best = max(best, other, key=lambda candidate: candidate.seen.score)
-            if best.searched and _is_accepted(best, settings):
+            other = _refined(source, target, start, pose, settings=settings, tick=tick)
+            if start is None or other.vouched:
+                best = max(best, other, key=lambda candidate: candidate.seen.score)
+            if _is_accepted(best, settings) and best.seen.mutual >= settings.sure_agreement:
                 break
+        else:
+            best = _best_turn(source, target, best, settings=settings, tick=tick)
     if not _is_accepted(best, settings):
         raise _rejected(scan.name, best, _why_not(best, settings))
     _require_held(scan.name, source, target, best, settings)
     return _placed(scan, best)
 
 
-def surface_of(points: Points, settings: RegistrationSettings) -> Surface:
-    """Points (N, 3), already at voxel spacing, with normals of Table 1 and a tree."""
+def _search(source: Surface, target: Surface, settings: RegistrationSettings) -> Iterator[Matrix4]:
+    return candidate_poses(source.points, target.points, resolutions=settings.search_resolutions)
+
+
+def _best_turn(
+    source: Surface,
+    target: Surface,
+    best: _Candidate,
+    *,
+    settings: RegistrationSettings,
+    tick: Callable[[], None],
+) -> _Candidate:
+    """A rectangular room fits itself turned by quarters: try those before a pose is believed."""
+    if best.vouched or not _is_accepted(best, settings):
+        return best
+    pose = best.found.target_from_source
+    middle = transformed(source.points, pose)
+    center = (middle.min(axis=0) + middle.max(axis=0)) / 2
+    for quarter in (1, 2, 3):
+        turn = exponential(np.array([0.0, 0.0, quarter * np.pi / 2, 0.0, 0.0, 0.0]))
+        turn[:3, 3] = center - turn[:3, :3] @ center
+        other = _refined(source, target, None, turn @ pose, settings=settings, tick=tick)
+        best = max(best, other, key=lambda candidate: candidate.seen.score)
+    return best
+
+
+def surface_of(voxels: Voxels, settings: RegistrationSettings) -> Surface:
+    """The voxels as a target of ICP: normals of Table 1, turned to the side they were seen from."""
+    points = voxels.points
     normals = estimate_normals(
         points, radius=settings.normal_radius, max_neighbors=settings.normal_max_neighbors
     )
-    return Surface.of(points, normals)
+    views = voxels.views
+    normals[np.einsum("ij,ij->i", normals, views) < 0] *= -1
+    # seen from nowhere known, or from both sides: a board thinner than a voxel
+    oriented = np.linalg.norm(views, axis=1) > 0.3
+    return Surface.of(points, normals, oriented)
 
 
 def _source_surface(scan: Scan, settings: RegistrationSettings) -> Surface:
-    points = Voxels.of(scan.points, size=settings.voxel_size).points
+    voxels = Voxels.of(scan.points, size=settings.voxel_size, origin=_trusted_origin(scan))
+    points = voxels.points
     if len(points) < settings.min_points:
         raise ScanRejected(
             f"scan {scan.name}: {len(points)} voxels of {settings.voxel_size:g} m are left, "
@@ -136,60 +189,70 @@ def _source_surface(scan: Scan, settings: RegistrationSettings) -> Surface:
             f"scan {scan.name}: its surfaces leave a motion free (constraint {held:.4f}, at least "
             f"{settings.min_constraint:g} is needed), as a bare plane does; scan a place with more structure"
         )
-    return surface_of(points, settings)
+    return surface_of(voxels, settings)
+
+
+def _trusted_origin(scan: Scan) -> Floats | None:
+    """(3,) metres, scan frame: where the sensor stood, if all points can have been seen from there."""
+    origin: Floats = scan.sensor_pose[:3, 3]
+    return origin if share_in_front(scan.points, origin) >= ENOUGH else None
 
 
 def _refined(
     source: Surface,
     target: Surface,
-    start: Matrix4,
+    prior: Matrix4 | None,
+    candidate: Matrix4 | None,
     *,
-    searched: bool,
     settings: RegistrationSettings,
     tick: Callable[[], None],
 ) -> _Candidate:
-    """ICP through ever smaller gates; the wide ones need only a part of the points."""
-    pose = start
-    gates = [gate for gate in settings.coarse_distances if gate > settings.max_correspondence_distance]
-    for level, gate in enumerate(gates):
-        some = source.points[:: 2 ** (len(gates) - level)]
-        coarse = icp(
-            some,
+    """ICP from the candidate, or else the prior, or else identity, through ever smaller gates.
+
+    The wide gates need only a part of the points.
+    """
+    pose = next((start for start in (candidate, prior) if start is not None), np.eye(4))
+    last = settings.max_correspondence_distance
+    gates = [gate for gate in settings.coarse_distances if gate > last]
+    for level, gate in enumerate([*gates, last]):
+        found = icp(
+            source,
             target,
             pose,
             max_correspondence_distance=gate,
             max_iterations=settings.max_iterations,
+            soft=gate > last,
+            every=2 ** (len(gates) - level),
             tick=tick,
         )
-        pose = coarse.target_from_source
-    found = icp(
-        source.points,
-        target,
-        pose,
-        max_correspondence_distance=settings.max_correspondence_distance,
-        max_iterations=settings.max_iterations,
-        tick=tick,
+        pose = found.target_from_source
+    return _Candidate(
+        found=found,
+        seen=agreement(source, target, pose, reach=REACH, surface_distance=last),
+        searched=candidate is not None,
+        vouched=prior is not None and _is_near(pose, prior, settings),
+        oriented=bool(source.oriented.mean() > 0.5),
     )
-    seen = agreement(
-        source,
-        target,
-        found.target_from_source,
-        reach=REACH,
-        surface_distance=settings.max_correspondence_distance,
-    )
-    return _Candidate(found=found, seen=seen, searched=searched)
 
 
-def _passes_table_1(found: IcpResult, settings: RegistrationSettings) -> bool:
-    return found.fitness > settings.min_fitness and found.inlier_rmse < settings.max_inlier_rmse
+def _is_near(pose: Matrix4, prior: Matrix4, settings: RegistrationSettings) -> bool:
+    distance, angle = difference(pose, prior)
+    return distance <= settings.prior_distance and angle <= settings.prior_angle
 
 
 def _is_accepted(candidate: _Candidate, settings: RegistrationSettings) -> bool:
-    seen = candidate.seen
-    on_common_surfaces = seen.mutual >= settings.min_agreement and seen.overlap >= settings.min_overlap
-    return _passes_table_1(candidate.found, settings) or (
-        on_common_surfaces and candidate.found.inlier_rmse < settings.max_inlier_rmse
+    found, seen = candidate.found, candidate.seen
+    overlap = settings.min_overlap_vouched if candidate.vouched else settings.min_overlap
+    return (
+        (found.fitness > settings.min_fitness or seen.overlap >= overlap)
+        and found.inlier_rmse < settings.max_inlier_rmse
+        and seen.mutual >= _needed(candidate, settings)
     )
+
+
+def _needed(candidate: _Candidate, settings: RegistrationSettings) -> float:
+    strict = candidate.oriented and not candidate.vouched
+    return settings.min_agreement_unvouched if strict else settings.min_agreement
 
 
 def _rejected(name: str, best: _Candidate, reason: str) -> ScanRejected:
@@ -205,7 +268,7 @@ def _why_not(best: _Candidate, settings: RegistrationSettings) -> str:
     return (
         f"fitness {best.found.fitness:.2f} (over {settings.min_fitness:g} is accepted), "
         f"inlier RMSE {best.found.inlier_rmse * 100:.1f} cm, agreement {best.seen.mutual:.2f} "
-        f"(at least {settings.min_agreement:g}) over {best.seen.overlap:.0%} of the scan; "
+        f"(at least {_needed(best, settings):g}) over {best.seen.overlap:.0%} of the scan; "
         "give an initial pose, or check that the place is in the map"
     )
 
@@ -225,13 +288,13 @@ def _require_held(
 
 
 def _placed(scan: Scan, best: _Candidate) -> RegisteredScan:
-    pose = best.found.target_from_source
+    pose, origin = best.found.target_from_source, _trusted_origin(scan)
     return RegisteredScan(
         name=scan.name,
         points=transformed(scan.points, pose).astype(np.float32),
         colors=scan.colors,
         map_from_scan=pose,
-        sensor_origin=(pose @ scan.sensor_pose)[:3, 3],
+        sensor_origin=None if origin is None else transformed(origin[None], pose)[0],
         fitness=best.found.fitness,
         inlier_rmse=best.found.inlier_rmse,
         overlap=best.seen.overlap,
@@ -251,4 +314,4 @@ def as_reference(scan: Scan, pose: Matrix4) -> RegisteredScan:
         inlier_rmse=0.0,
     )
     seen = Agreement(overlap=1.0, forward=1.0, backward=1.0)
-    return _placed(scan, _Candidate(found=perfect, seen=seen, searched=False))
+    return _placed(scan, _Candidate(found=perfect, seen=seen, searched=False, vouched=True, oriented=True))

@@ -24,16 +24,25 @@ class Voxels:
     size: float  #: metres
     keys: NDArray[np.int64]  #: (M,) packed cell indices, ascending
     counts: NDArray[np.int64]  #: (M,) points summed
-    sums: NDArray[np.float64]  #: (M, 3) metres, or (M, 6) with red, green, blue behind
+    sums: NDArray[np.float64]  #: (M, 6) x y z, direction to the sensor; (M, 9) with red, green, blue behind
 
     @classmethod
-    def of(cls, points: NDArray[Any], *, size: float, colors: Colors | None = None) -> Voxels:
-        """Sort points (N, 3), metres, into cells of `size` metres; colours are averaged beside them."""
+    def of(
+        cls,
+        points: NDArray[Any],
+        *,
+        size: float,
+        origin: NDArray[Any] | None = None,
+        colors: Colors | None = None,
+    ) -> Voxels:
+        """Sort points (N, 3), metres, into cells of `size` metres; what is given beside them is averaged too.
+
+        `origin` (3,) is where they were seen from, in their frame.
+        """
         cells = np.floor(points / size).astype(np.int64) + (1 << (_BITS - 1))
         keys = (cells[:, 0] << (2 * _BITS)) | (cells[:, 1] << _BITS) | cells[:, 2]
-        values = (
-            points.astype(np.float64) if colors is None else np.hstack([points, colors]).astype(np.float64)
-        )
+        columns = [points, _directions(points, origin)] + ([] if colors is None else [colors])
+        values = np.hstack(columns).astype(np.float64)
         return _summed(size, keys, np.ones(len(keys), np.int64), values)
 
     def merged(self, other: Voxels) -> Voxels:
@@ -52,11 +61,24 @@ class Voxels:
         return (self.sums[:, :3] / self.counts[:, None]).astype(np.float32)
 
     @property
+    def views(self) -> NDArray[np.float64]:
+        """(M, 3) mean direction to the sensors that saw the cell; 0 where no origin was given."""
+        return self.sums[:, 3:6] / self.counts[:, None]
+
+    @property
     def colors(self) -> Colors | None:
         """(M, 3) uint8, or None where no colours were given."""
-        if self.sums.shape[1] == 3:
+        if self.sums.shape[1] == 6:
             return None
-        return np.rint(self.sums[:, 3:] / self.counts[:, None]).astype(np.uint8)
+        return np.rint(self.sums[:, 6:] / self.counts[:, None]).astype(np.uint8)
+
+
+def _directions(points: NDArray[Any], origin: NDArray[Any] | None) -> NDArray[Any]:
+    if origin is None:
+        return np.zeros(points.shape)
+    away = origin - points
+    unit: NDArray[Any] = away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-9)
+    return unit
 
 
 def _summed(
