@@ -1,0 +1,70 @@
+"""From a checkpoint to a model that the service opens."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+import torch
+
+from worker.detectors.store import open_detector
+from worker.errors import DetectorUnavailable
+from worker.evaluation.publish import change_scores, publish
+from worker.training.calibration import best_threshold, survey_pairs
+from worker.training.dataset import save_tiles, split_tiles
+from worker.training.pairs import PairSettings
+from worker.training.trainer import TrainSettings, train
+
+SHORT = TrainSettings(
+    epochs=1, batch=8, train_pairs=8, validation_pairs=8, held_out=0.2, pairs=PairSettings(patch_points=256)
+)
+
+
+@pytest.fixture(scope="module")
+def store(tiles, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("publish")
+    save_tiles(tiles, folder / "tiles.npz")
+    best = train(SHORT, folder / "tiles.npz", folder / "run")
+    publish(
+        best,
+        folder / "tiles.npz",
+        folder / "store",
+        unseen=folder / "tiles.npz",
+        version="3",
+        summary="for tests",
+        command="pytest",
+    )
+    return folder / "store"
+
+
+def test_a_published_model_opens_and_its_card_says_how_it_was_made(store):
+    card = open_detector(store, "spicd-net/3", device="cpu").card
+    assert card.preprocessing.patch_points == 256
+    assert card.training["command"] == "pytest"
+    assert card.training["settings"]["train_pairs"] == 8
+    assert card.training["best_epoch"] == 1
+    assert set(card.evaluation) == {"validation", "unseen buildings", "pairs"}
+
+
+def test_the_threshold_is_the_best_on_the_held_out_tiles(store, tiles):
+    detector = open_detector(store, "spicd-net/3", device="cpu")
+    pairs = survey_pairs(split_tiles(tiles, share=0.2)[1], PairSettings(), seed=SHORT.seed)
+    chosen = best_threshold(change_scores(detector, pairs), pairs)
+    assert detector.card.threshold == pytest.approx(chosen.threshold, abs=0.03)  # float16 tiles in the file
+    assert detector.card.evaluation["validation"]["f1"] == pytest.approx(chosen.f1, abs=0.05)
+
+
+def test_a_published_model_holds_the_checkpoints_weights(store):
+    state = torch.load(store.parent / "run" / "best.pt", weights_only=True)["network"]
+    opened = open_detector(store, "spicd-net/3", device="cpu")
+    for name, tensor in opened._network.state_dict().items():
+        assert torch.equal(tensor, state[name])
+
+
+def test_another_cards_weights_are_refused(store):
+    card = store / "spicd-net" / "3" / "card.json"
+    text = card.read_text()
+    card.write_text(json.dumps({**json.loads(text), "sha256": "0" * 64}))
+    with pytest.raises(DetectorUnavailable, match="sha256"):
+        open_detector(store, "spicd-net/3")
+    card.write_text(text)
