@@ -37,11 +37,12 @@ def model_store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     if (shipped / MODEL / "card.json").exists():
         return shipped
     store = tmp_path_factory.mktemp("models")
-    _make_untrained(store / MODEL)
+    make_untrained(store / MODEL)
     return store
 
 
-def _make_untrained(folder: Path) -> None:
+def make_untrained(folder: Path) -> None:
+    """A model that knows nothing, in `model_store/<name>/<version>`."""
     import torch
     from safetensors.torch import save
 

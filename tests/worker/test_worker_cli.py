@@ -1,0 +1,214 @@
+"""`spicd-worker`: files in, files and words out."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.acceptance.conftest import make_untrained
+from worker.cli import main
+from worker.evaluation.scenes import rigid
+from worker.pipeline.pcd import write_pcd
+from worker.pipeline.scan import read_scan
+from worker.progress import Progress
+from worker.training.dataset import TileSet, load_tiles, save_tiles
+from worker.training.trainer import TrainSettings
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("models")
+    make_untrained(folder / "spicd-net" / "1")
+    return folder
+
+
+@pytest.fixture
+def room() -> np.ndarray:
+    """(N, 3) floor and walls of 4 x 3 x 2.5 m at 3 cm with a box in a corner; nothing is symmetric."""
+    rng = np.random.default_rng(0)
+
+    def sheet(low: tuple[float, float, float], high: tuple[float, float, float]) -> np.ndarray:
+        size = np.array(high) - low
+        area = np.prod(size[size > 0])
+        return low + rng.random((int(area * 2500), 3)) * size
+
+    walls = [sheet((0, 0, 0), (0, 3, 2.5)), sheet((4, 0, 0), (4, 3, 2.5)), sheet((0, 0, 0), (4, 0, 2.5))]
+    box = [
+        sheet((0, 2, 0.8), (0.7, 3, 0.8)),
+        sheet((0.7, 2, 0), (0.7, 3, 0.8)),
+        sheet((0, 2, 0), (0.7, 2, 0.8)),
+    ]
+    return np.concatenate([sheet((0, 0, 0), (4, 3, 0)), *walls, *box])
+
+
+@pytest.fixture
+def files(tmp_path: Path, room: np.ndarray) -> tuple[str, str]:
+    """The room, and a later scan of it, 8 cm and 2 degrees off, which saw nothing beyond x = 2 m."""
+    pose = rigid(0.08, -0.05, 0.0, yaw=2.0)
+    seen = room[room[:, 0] < 2.0] @ pose[:3, :3].T + pose[:3, 3]
+    write_pcd(tmp_path / "before.pcd", room)
+    write_pcd(tmp_path / "after.pcd", seen + np.random.default_rng(1).normal(0, 0.003, seen.shape))
+    return str(tmp_path / "before.pcd"), str(tmp_path / "after.pcd")
+
+
+def run(*words: str) -> int:
+    try:
+        main(list(words))
+    except SystemExit as end:
+        return int(end.code or 0)
+    return 0
+
+
+def test_detect_writes_features_a_cloud_and_a_picture_and_tells_where(
+    files: tuple[str, str], store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    assert run("detect", *files, "--out", str(out), "--model-store", str(store), "--json") == 0
+    told = json.loads(capsys.readouterr().out)
+    features = json.loads((out / "tiles.geojson").read_text())["features"]
+    states = Counter(feature["properties"]["state"] for feature in features)
+    assert told["counts"]["tiles"] == len(features) == sum(told["counts"].values()) // 2 > 0
+    assert {state: count for state, count in told["counts"].items() if state in states} == states
+    for feature in features:
+        about = feature["properties"]
+        if about["center"][0] > 3:  # not seen again
+            assert (about["state"], about["score"]) == ("unobserved", None)
+        assert about["center"][2] == pytest.approx(
+            (feature["place"]["lower"] + feature["place"]["upper"]) / 2
+        )
+    assert read_scan(Path(told["files"]["cloud"])).points[:, 0].max() < 2.2
+    assert Path(told["files"]["picture"]).read_bytes().startswith(b"\x89PNG")
+
+
+def test_detect_says_by_how_much_the_later_scan_was_off(
+    files: tuple[str, str], store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run("detect", *files, "--out", str(tmp_path), "--model-store", str(store), "--json") == 0
+    found = json.loads(capsys.readouterr().out)["current"][0]
+    undone = np.array(found["map_from_scan"]) @ rigid(0.08, -0.05, 0.0, yaw=2.0)
+    np.testing.assert_allclose(undone, np.eye(4), atol=0.01)
+
+
+def test_every_seen_tile_is_changed_at_threshold_0_and_none_at_1(
+    files: tuple[str, str], store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    changed = {}
+    for threshold in ("0", "1"):
+        words = ["--out", str(tmp_path), "--model-store", str(store), "--threshold", threshold, "--json"]
+        assert run("detect", *files, *words) == 0
+        told = json.loads(capsys.readouterr().out)
+        changed[threshold] = told["counts"]["changed"]
+        assert len(told["changed"]) == told["counts"]["changed"]
+    assert changed["0"] == told["counts"]["tiles"] - told["counts"]["unobserved"] > 0
+    assert changed["1"] == 0
+
+
+def test_more_reference_files_are_part_of_the_map(
+    files: tuple[str, str], store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["--reference", files[0], "--out", str(tmp_path), "--model-store", str(store)]
+    assert run("detect", *files, *words) == 0
+    shown = capsys.readouterr().out
+    assert len(re.findall("before.pcd", shown)) == 2
+    assert re.search(r"\d+ tiles, \d+ unchanged, \d+ changed", shown)
+
+
+@pytest.mark.parametrize(
+    ("spoilt", "sentence"),
+    [
+        ("missing.pcd", "missing.pcd: No such file"),
+        ("text.pcd", "neither PLY nor PCD"),
+    ],
+)
+def test_a_bad_file_ends_in_one_sentence_that_names_it(
+    files: tuple[str, str],
+    store: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    spoilt: str,
+    sentence: str,
+) -> None:
+    (tmp_path / "text.pcd").write_text("hello")
+    words = ["detect", files[0], str(tmp_path / spoilt), "--model-store", str(store)]
+    assert run(*words, "--out", str(tmp_path / "out")) == 1
+    told = capsys.readouterr()
+    assert told.out == ""
+    assert len(told.err.strip().splitlines()) == 1
+    assert spoilt in told.err
+    assert sentence in told.err
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_model_that_is_not_there_is_named(
+    files: tuple[str, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run("detect", *files, "--model-store", str(tmp_path), "--model", "other/9") == 1
+    assert "other/9" in capsys.readouterr().err
+
+
+@pytest.fixture
+def trainings(monkeypatch: pytest.MonkeyPatch) -> list[tuple[TrainSettings, Path, Path]]:
+    """What was to be trained, instead of training."""
+    asked: list[tuple[TrainSettings, Path, Path]] = []
+
+    def remember(settings: TrainSettings, dataset: Path, out: Path, progress: Progress) -> Path:
+        asked.append((settings, dataset, out))
+        return out / "best.pt"
+
+    monkeypatch.setattr("worker.training.trainer.train", remember)
+    return asked
+
+
+def test_train_simulates_the_set_that_is_not_there_and_trains_on_it(
+    tmp_path: Path, trainings: list[tuple[TrainSettings, Path, Path]]
+) -> None:
+    assert run("train", str(tmp_path), "--rooms", "1", "--offices", "0", "--corridors", "0") == 0
+    assert [(dataset, out) for _, dataset, out in trainings] == [(tmp_path / "tiles.npz", tmp_path)]
+    tiles = load_tiles(tmp_path / "tiles.npz")
+    assert len(tiles) > 5
+    assert set(tiles.buildings) == {0}
+
+
+def test_train_keeps_defaults_but_for_what_was_given(
+    tmp_path: Path,
+    trainings: list[tuple[TrainSettings, Path, Path]],
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    _save_small_set(tmp_path / "tiles.npz")
+    words = ["--minutes", "7", "--batch", "8", "--density", "0.05", "0.3", "--device", "cpu"]
+    assert run("train", str(tmp_path / "run"), "--tiles", str(tmp_path / "tiles.npz"), *words) == 0
+    default = TrainSettings()
+    wanted = replace(default, minutes=7, batch=8, pairs=replace(default.pairs, density=(0.05, 0.3)))
+    assert trainings == [(wanted, tmp_path / "tiles.npz", tmp_path / "run")]
+    assert "best.pt" in capsys.readouterr().out
+
+
+def test_train_refuses_to_simulate_over_a_set_that_is_there(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    _save_small_set(tmp_path / "tiles.npz")
+    before = (tmp_path / "tiles.npz").read_bytes()
+    assert run("train", str(tmp_path), "--rooms", "1", "--epochs", "1") == 1
+    assert "tiles.npz is there already" in capsys.readouterr().err
+    assert (tmp_path / "tiles.npz").read_bytes() == before
+
+
+def _save_small_set(path: Path) -> None:
+    """Twenty tiles in a row, far enough apart to be different places."""
+    rng = np.random.default_rng(0)
+    clouds = tuple((rng.uniform(-0.5, 0.5, (600, 3)) * (1.5, 1.5, 0.2)).astype(np.float32) for _ in range(20))
+    tiles = TileSet(
+        points_a=clouds,
+        points_b=clouds,
+        centres=np.array([[4.0 * number, 0, 0] for number in range(20)]),
+        buildings=np.zeros(20, np.int32),
+        tile_size=(1.5, 1.5, 1.0),
+        source="a test",
+    )
+    save_tiles(tiles, path)
