@@ -119,13 +119,15 @@ def test_misses_and_false_alarms_are_told(judged: Any) -> None:
 def test_placement_is_measured_against_the_true_poses(story: Story) -> None:
     found = story.first[1].world_from_sensor.copy()
     found[0, 3] += 0.02
+    exact = story.first[2].world_from_sensor
     outcomes = [
         {"accepted": False},
         {"accepted": True, "fitness": 0.8, "map_from_scan": found.tolist()},
-        {"accepted": False},
+        {"accepted": True, "fitness": 0.9, "map_from_scan": exact.tolist()},
     ]
     line = placement_line("map", outcomes, story.first)
-    assert line.startswith("map: 1 of 3 scans placed, fitness 0.80; off by 2.0 cm and 0.0°")
+    assert line.startswith("map: 2 of 3 scans placed, median fitness 0.85; off by 1.0 cm and 0.0°")
+    assert "at worst 2.0 cm and 0.0°" in line
 
 
 def test_a_service_that_cannot_start_is_told_with_its_own_words(

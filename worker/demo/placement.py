@@ -9,7 +9,7 @@ import numpy as np
 
 from worker.evaluation.sensor import SimulatedScan
 from worker.pipeline.poses import difference
-from worker.pipeline.values import Matrix4
+from worker.pipeline.values import Floats, Matrix4
 
 
 def placement_line(visit: str, outcomes: Sequence[dict[str, Any]], scans: Sequence[SimulatedScan]) -> str:
@@ -21,9 +21,16 @@ def placement_line(visit: str, outcomes: Sequence[dict[str, Any]], scans: Sequen
     before = _errors([(scan.prior, scan.world_from_sensor) for _, scan in placed])
     after = _errors([(np.array(out["map_from_scan"]), scan.world_from_sensor) for out, scan in placed])
     fitness = np.median([outcome["fitness"] for outcome, _ in placed])
-    return f"{line}, fitness {fitness:.2f}; off by {after}, by the robot's own odometry {before}"
+    return (
+        f"{line}, median fitness {fitness:.2f}; off by {_said(np.median(after, axis=0))}, "
+        f"at worst {_said(after.max(axis=0))}; the robot's own odometry: {_said(np.median(before, axis=0))}"
+    )
 
 
-def _errors(pairs: list[tuple[Matrix4, Matrix4]]) -> str:
-    metres, radians = np.median([difference(found, true) for found, true in pairs], axis=0)
-    return f"{metres * 100:.1f} cm and {np.degrees(radians):.1f}°"
+def _errors(pairs: list[tuple[Matrix4, Matrix4]]) -> Floats:
+    """(N, 2) metres and radians between what was found and what is true."""
+    return np.array([difference(found, true) for found, true in pairs])
+
+
+def _said(error: Floats) -> str:
+    return f"{error[0] * 100:.1f} cm and {np.degrees(error[1]):.1f}°"

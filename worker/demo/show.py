@@ -65,11 +65,13 @@ def _counts(judgement: Judgement) -> str:
     counts = judgement.counts()
     hits, misses, alarms = (counts[v] for v in (Verdict.HIT, Verdict.MISS, Verdict.FALSE_ALARM))
     unseen, quiet = counts[Verdict.UNOBSERVED], counts[Verdict.RIGHT]
-    parts = [f"{hits} hits, {misses} missed, {alarms} false alarms, {quiet} rightly quiet"]
+    lines = [
+        f"{len(judgement.tiles)} tiles: {hits} hits, {misses} missed, {alarms} false alarms, {quiet} rightly quiet"
+    ]
     if alarms > MOST_FALSE_ALARMS:
-        parts.append(f"{alarms - MOST_FALSE_ALARMS} of the false alarms are not listed above")
+        lines.append(f"{alarms - MOST_FALSE_ALARMS} of the false alarms are not listed above")
     if unseen:
-        parts.append(f"{unseen} changed tiles were not seen well enough to say")
+        lines.append(f"{unseen} changed tiles were not seen well enough to say")
     if judgement.outside:
-        parts.append(f"{judgement.outside} more changed where the map holds too few points for a tile")
-    return f"{len(judgement.tiles)} tiles: " + "; ".join(parts)
+        lines.append(f"{judgement.outside} more changed where the map holds too few points for a tile")
+    return "\n".join(lines)
