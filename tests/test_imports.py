@@ -70,7 +70,6 @@ ONLY_IN = {
     "rq": ("service.queue", "worker.__main__", "worker.jobs", "worker.rq_jobs", "worker.rq_workers"),
     "redis": ("service.queue", "service.embedded_redis", "worker.__main__", "worker.rq_workers"),
     "open3d": ("worker.pipeline", "worker.evaluation"),
-    "kiss_matcher": ("worker.pipeline",),
     "torch": ("worker.detectors", "worker.training", "worker.evaluation", "worker.cli"),
     "sqlalchemy": ("service.catalog",),
     "obstore": ("service.catalog",),

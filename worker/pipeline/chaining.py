@@ -88,7 +88,8 @@ def chain(
     as long as the map grows. Returns the outcomes in the order given, and the fused voxels; raises ScanError.
     """
     first = files[0].read(max_points=max_points)
-    placed = as_reference(first, _start(files[0], first))
+    start = _start(files[0], first)
+    placed = as_reference(first, np.eye(4) if start is None else start)
     outcomes = {0: _accepted(files[0], placed)}
     fused = placed.voxels(settings.voxel_size)
     waiting, found_one = list(range(1, len(files))), True
@@ -111,10 +112,10 @@ def chain(
     return tuple(outcomes[at] for at in range(len(files))), fused
 
 
-def _start(file: ScanFile, scan: Scan) -> Matrix4:
-    """map_from_scan to begin with: the prior speaks of the sensor, the file may know where that stood."""
+def _start(file: ScanFile, scan: Scan) -> Matrix4 | None:
+    """map_from_scan as the prior has it, which speaks of the sensor; the file may know where that stood."""
     if file.pose is None:
-        return np.eye(4)
+        return None
     map_from_scan: Matrix4 = file.pose @ inverse(scan.sensor_pose)
     return map_from_scan
 

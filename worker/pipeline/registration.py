@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
@@ -52,8 +53,9 @@ class RegistrationSettings(BaseModel):
     )
     max_iterations: int = Field(30, ge=1, le=1000, description="of ICP at each gate")
     search_resolutions: tuple[float, ...] = Field(
-        (0.1, 0.2, 0.3, 0.15), description="metres; of the global search, in this order; () switches it off"
+        (0.3, 0.2, 0.15), description="metres; of the global search, in this order; () switches it off"
     )
+    search_seeds: int = Field(3, ge=1, description="draws at each resolution")
     min_agreement: float = Field(
         0.8, ge=0, le=1, description="share of the overlap on a common surface, both ways"
     )
@@ -63,7 +65,7 @@ class RegistrationSettings(BaseModel):
         le=1,
         description="the same where no prior vouches for the pose and the sensor's place is known",
     )
-    sure_agreement: float = Field(0.9, ge=0, le=1, description="enough to search no further")
+    sure_margin: float = Field(0.03, ge=0, le=1, description="agreement over the least; the search then ends")
     min_overlap: float = Field(0.5, ge=0, le=1, description="share of the scan that the map covers")
     min_overlap_vouched: float = Field(0.3, ge=0, le=1, description="the same near a prior")
     prior_distance: float = Field(1.0, ge=0, description="metres; how far a given prior may be off")
@@ -98,6 +100,7 @@ class _Candidate:
     seen: Agreement
     searched: bool
     vouched: bool  #: near a given prior
+    contradicts_prior: bool  #: far from a given prior
     oriented: bool  #: which side of its surfaces the scan saw is known, so that agreement says more
 
 
@@ -119,47 +122,52 @@ def register(
     Raises ScanRejected with the best numbers reached, or where the scene cannot hold a pose.
     """
     source = _source_surface(scan, settings)
-    best = _refined(source, target, start, None, settings=settings, tick=tick)
+    refine = functools.partial(_refined, source, target, start, settings=settings, tick=tick)
+    best = refine(None)
     if not _is_accepted(best, settings):
-        for pose in _search(source, target, settings):
-            tick()
-            other = _refined(source, target, start, pose, settings=settings, tick=tick)
-            if start is None or other.vouched:
-                best = max(best, other, key=lambda candidate: candidate.seen.score)
-            if _is_accepted(best, settings) and best.seen.mutual >= settings.sure_agreement:
-                break
-        else:
-            best = _best_turn(source, target, best, settings=settings, tick=tick)
+        best = _searched(source, target, best, start, refine, settings)
     if not _is_accepted(best, settings):
         raise _rejected(scan.name, best, _why_not(best, settings))
     _require_held(scan.name, source, target, best, settings)
     return _placed(scan, best)
 
 
-def _search(source: Surface, target: Surface, settings: RegistrationSettings) -> Iterator[Matrix4]:
-    return candidate_poses(source.points, target.points, resolutions=settings.search_resolutions)
-
-
-def _best_turn(
+def _searched(
     source: Surface,
     target: Surface,
     best: _Candidate,
-    *,
+    prior: Matrix4 | None,
+    refine: Callable[[Matrix4], _Candidate],
     settings: RegistrationSettings,
-    tick: Callable[[], None],
 ) -> _Candidate:
-    """A rectangular room fits itself turned by quarters: try those before a pose is believed."""
-    if best.vouched or not _is_accepted(best, settings):
-        return best
-    pose = best.found.target_from_source
-    middle = transformed(source.points, pose)
-    center = (middle.min(axis=0) + middle.max(axis=0)) / 2
+    """The best pose of the global search, or what was there before it."""
+    seeds = settings.search_seeds if prior is None else 1
+    candidates = candidate_poses(source, target, resolutions=settings.search_resolutions, seeds=seeds)
+    for pose in candidates:
+        if prior is not None and not _is_near(pose, prior, settings):
+            continue
+        best = _better(best, refine(pose))
+        if _is_accepted(best, settings) and best.seen.mutual > _needed(best, settings) + settings.sure_margin:
+            return best
+    if best.searched and not best.vouched and _is_accepted(best, settings):
+        for pose in _quarter_turns(source, best.found.target_from_source):
+            best = _better(best, refine(pose))
+    return best
+
+
+def _better(best: _Candidate, other: _Candidate) -> _Candidate:
+    """The one that agrees with the map over more of the scan; where there is a prior, one near it."""
+    return max(best, other, key=lambda each: (not each.contradicts_prior, each.seen.score))
+
+
+def _quarter_turns(source: Surface, pose: Matrix4) -> Iterator[Matrix4]:
+    """A rectangular room fits itself turned about its middle: those poses are tried before one is believed."""
+    there = transformed(source.points, pose)
+    center = (there.min(axis=0) + there.max(axis=0)) / 2
     for quarter in (1, 2, 3):
         turn = exponential(np.array([0.0, 0.0, quarter * np.pi / 2, 0.0, 0.0, 0.0]))
         turn[:3, 3] = center - turn[:3, :3] @ center
-        other = _refined(source, target, None, turn @ pose, settings=settings, tick=tick)
-        best = max(best, other, key=lambda candidate: candidate.seen.score)
-    return best
+        yield turn @ pose
 
 
 def surface_of(voxels: Voxels, settings: RegistrationSettings) -> Surface:
@@ -226,11 +234,13 @@ def _refined(
             tick=tick,
         )
         pose = found.target_from_source
+    near = prior is not None and _is_near(pose, prior, settings)
     return _Candidate(
         found=found,
         seen=agreement(source, target, pose, reach=REACH, surface_distance=last),
         searched=candidate is not None,
-        vouched=prior is not None and _is_near(pose, prior, settings),
+        vouched=near,
+        contradicts_prior=prior is not None and not near,
         oriented=bool(source.oriented.mean() > 0.5),
     )
 
@@ -244,7 +254,8 @@ def _is_accepted(candidate: _Candidate, settings: RegistrationSettings) -> bool:
     found, seen = candidate.found, candidate.seen
     overlap = settings.min_overlap_vouched if candidate.vouched else settings.min_overlap
     return (
-        (found.fitness > settings.min_fitness or seen.overlap >= overlap)
+        not candidate.contradicts_prior
+        and (found.fitness > settings.min_fitness or seen.overlap >= overlap)
         and found.inlier_rmse < settings.max_inlier_rmse
         and seen.mutual >= _needed(candidate, settings)
     )
@@ -269,15 +280,22 @@ def _why_not(best: _Candidate, settings: RegistrationSettings) -> str:
         f"fitness {best.found.fitness:.2f} (over {settings.min_fitness:g} is accepted), "
         f"inlier RMSE {best.found.inlier_rmse * 100:.1f} cm, agreement {best.seen.mutual:.2f} "
         f"(at least {_needed(best, settings):g}) over {best.seen.overlap:.0%} of the scan; "
-        "give an initial pose, or check that the place is in the map"
+        + _ADVICE[best.contradicts_prior]
     )
+
+
+_ADVICE = {
+    False: "give an initial pose, or check that the place is in the map",
+    True: "it ends far from the pose prior that was given; check the prior, or leave it out",
+}
 
 
 def _require_held(
     name: str, source: Surface, target: Surface, best: _Candidate, settings: RegistrationSettings
 ) -> None:
     """A scan may be rich and yet share only a plane with the map."""
-    distance, _ = target.nearest(transformed(source.points, best.found.target_from_source), within=REACH)
+    there = transformed(source.points, best.found.target_from_source)
+    distance, _ = target.nearest(there, within=2 * settings.max_correspondence_distance)
     held = constraint(source.points[np.isfinite(distance)])
     if held < settings.min_constraint:
         reason = (
@@ -314,4 +332,9 @@ def as_reference(scan: Scan, pose: Matrix4) -> RegisteredScan:
         inlier_rmse=0.0,
     )
     seen = Agreement(overlap=1.0, forward=1.0, backward=1.0)
-    return _placed(scan, _Candidate(found=perfect, seen=seen, searched=False, vouched=True, oriented=True))
+    return _placed(
+        scan,
+        _Candidate(
+            found=perfect, seen=seen, searched=False, vouched=True, contradicts_prior=False, oriented=True
+        ),
+    )

@@ -1,0 +1,168 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rooms import Room, as_scan
+
+from worker.evaluation.scenes import random_room
+from worker.evaluation.visits import visit
+from worker.pipeline.constraint import constraint
+from worker.pipeline.poses import difference, exponential
+from worker.pipeline.registration import (
+    RegisteredScan,
+    RegistrationSettings,
+    ScanRejected,
+    register,
+    surface_of,
+)
+from worker.pipeline.scan import read_scan
+from worker.pipeline.voxels import Voxels
+
+SETTINGS = RegistrationSettings()
+
+
+def _off(found: RegisteredScan, truth: np.ndarray) -> tuple[float, float]:
+    metres, radians = difference(found.map_from_scan, truth)
+    return metres * 100, float(np.degrees(radians))
+
+
+def test_defaults_are_those_of_table_1() -> None:
+    assert SETTINGS.voxel_size == 0.05
+    assert SETTINGS.max_correspondence_distance == 0.05
+    assert (SETTINGS.normal_radius, SETTINGS.normal_max_neighbors) == (0.10, 30)
+    assert (SETTINGS.min_fitness, SETTINGS.max_inlier_rmse) == (0.55, 0.05)
+
+
+@pytest.mark.parametrize("number", [0, 1])
+def test_register_finds_a_drifted_scan_to_a_centimetre(room: Room, number: int) -> None:
+    truth = room.after[number].world_from_sensor
+    drift = exponential(np.array([0.0, 0.0, np.radians(4), 0.2, -0.15, 0.02]))
+    found = register(room.scan(number), room.target, start=truth @ drift, settings=SETTINGS)
+    centimetres, degrees = _off(found, truth)
+    assert centimetres < 1.5
+    assert degrees < 0.3
+    assert not found.searched
+
+
+def test_register_finds_a_scan_with_no_start_at_all(room: Room) -> None:
+    found = register(room.scan(), room.target, settings=SETTINGS)
+    centimetres, degrees = _off(found, room.after[0].world_from_sensor)
+    assert centimetres < 1.5
+    assert degrees < 0.3
+    assert found.searched
+
+
+def test_registered_points_and_sensor_stand_in_the_map_frame(room: Room) -> None:
+    truth = room.after[0].world_from_sensor
+    found = register(room.scan(), room.target, start=truth, settings=SETTINGS)
+    assert found.sensor_origin == pytest.approx(truth[:3, 3], abs=0.02)
+    assert found.points == pytest.approx(room.after[0].world_points, abs=0.06)
+
+
+def test_a_scan_of_another_place_is_rejected_with_its_numbers(room: Room) -> None:
+    elsewhere = visit(random_room(11), 1, seed=5)[0]
+    with pytest.raises(
+        ScanRejected, match=r"scan foreign\.pcd: fitness 0\.\d\d .*agreement 0\.\d\d"
+    ) as error:
+        register(as_scan(elsewhere.points, name="foreign.pcd"), room.target, settings=SETTINGS)
+    assert error.value.fitness is not None
+    assert 0 <= error.value.fitness < 0.9
+
+
+def test_a_pose_far_from_a_given_prior_is_not_taken(room: Room) -> None:
+    wrong = room.after[0].world_from_sensor @ exponential(np.array([0, 0, np.pi / 2, 2.5, 0.0, 0.0]))
+    with pytest.raises(ScanRejected):
+        register(room.scan(), room.target, start=wrong, settings=SETTINGS)
+
+
+def test_a_bare_plane_is_refused_before_it_can_slide() -> None:
+    rng = np.random.default_rng(0)
+    plane = np.column_stack([rng.uniform(-4, 4, (40_000, 2)), rng.normal(-0.4, 0.015, 40_000)])
+    target = surface_of(Voxels.of(plane, size=0.05), SETTINGS)
+    with pytest.raises(ScanRejected, match="leave a motion free"):
+        register(as_scan(plane.astype(np.float32)), target, settings=SETTINGS)
+
+
+def test_a_scan_that_shares_only_a_floor_with_the_map_is_refused(room: Room) -> None:
+    points = room.target.points
+    low, high = points.min(axis=0) + 0.6, points.max(axis=0) - 0.6
+    inner = ((points > low) & (points < high))[:, :2].all(axis=1)
+    floor = points[inner & (np.abs(points[:, 2]) < 0.04)]
+    target = surface_of(Voxels.of(floor, size=0.05), SETTINGS)
+    start = room.after[0].world_from_sensor
+    settings = SETTINGS.model_copy(update={"min_overlap_vouched": 0.05, "min_agreement": 0.5})
+    with pytest.raises(ScanRejected, match="shares with the map leaves a motion free"):
+        register(room.scan(), target, start=start, settings=settings)
+
+
+def test_too_few_points_are_refused_with_their_number() -> None:
+    few = as_scan(np.random.default_rng(0).uniform(0, 5, (60, 3)).astype(np.float32), name="few.ply")
+    target = surface_of(Voxels.of(few.points, size=0.05), SETTINGS)
+    with pytest.raises(ScanRejected, match=r"few\.ply: 60 voxels .* 500 are needed"):
+        register(few, target, settings=SETTINGS)
+
+
+def test_a_wall_seen_from_its_other_side_does_not_pull_the_scan_over() -> None:
+    """Two rooms share a wall 12 cm thick; the map knows one of them and, through the door, a little more."""
+    from worker.evaluation.scenes import small_office
+
+    scene = small_office(1)
+    scans = visit(scene, 14, seed=1, prior_error=(0.1, 2.0))
+    fused: Voxels | None = None
+    for each in scans[:4]:
+        origin = each.world_from_sensor[:3, 3]
+        voxels = Voxels.of(each.world_points, size=0.05, origin=origin)
+        fused = voxels if fused is None else fused.merged(voxels)
+    assert fused is not None
+    target = surface_of(fused, SETTINGS)
+    found = register(as_scan(scans[4].points), target, start=scans[4].prior, settings=SETTINGS)
+    assert _off(found, scans[4].world_from_sensor)[0] < 2.0
+
+
+@pytest.mark.parametrize(("size", "expected"), [(1, 0.0), (2, 0.0003)])
+def test_constraint_of_one_and_two_planes_is_next_to_nothing(size: int, expected: float) -> None:
+    rng = np.random.default_rng(0)
+    planes = [np.column_stack([rng.uniform(-4, 4, (30_000, 2)), rng.normal(0, 0.015, 30_000)])]
+    if size == 2:
+        planes.append(planes[0][:, [0, 2, 1]] + (0, 4, 2))
+    assert constraint(np.concatenate(planes)) <= expected
+
+
+def test_constraint_of_a_furnished_room_is_firm(room: Room) -> None:
+    assert constraint(room.after[0].points) > 10 * SETTINGS.min_constraint
+
+
+REAL_PAIRS = {
+    "room_scan": ("room_scan2.pcd", "room_scan1.pcd", "T_scan2_to_scan1.txt"),
+    "ipad_rooms 808": ("pix4d_user_808_user.ply", "pix4d_database_808_db.ply", "T_user_to_db_808.txt"),
+    "ipad_rooms 560": ("pix4d_user_560_user.ply", "pix4d_database_560_db.ply", "T_user_to_db_560.txt"),
+    "corridor_pair": ("cloud_1.ply", "cloud_0.ply", "T_cloud1_to_cloud0.txt"),
+}
+
+
+@pytest.mark.parametrize("pair", REAL_PAIRS)
+def test_real_pairs_land_within_3_cm_and_half_a_degree_with_no_start(shared_data: Path, pair: str) -> None:
+    folder = shared_data / pair.split(maxsplit=1)[0]
+    current, reference, transform = (folder / name for name in REAL_PAIRS[pair])
+    base = read_scan(reference)
+    voxels = Voxels.of(base.points, size=SETTINGS.voxel_size)
+    found = register(read_scan(current), surface_of(voxels, SETTINGS), settings=SETTINGS)
+    centimetres, degrees = _off(found, np.loadtxt(transform))
+    assert centimetres < 3.0
+    assert degrees < 0.5
+
+
+@pytest.mark.parametrize(
+    ("current", "reference"),
+    [
+        ("ipad_rooms/pix4d_user_560_user.ply", "room_scan/room_scan1.pcd"),
+        ("ipad_rooms/pix4d_user_808_user.ply", "ipad_rooms/pix4d_database_560_db.ply"),
+        ("corridor_pair/cloud_1.ply", "room_scan/room_scan1.pcd"),
+    ],
+)
+def test_real_scans_of_different_places_are_rejected(shared_data: Path, current: str, reference: str) -> None:
+    voxels = Voxels.of(read_scan(shared_data / reference).points, size=SETTINGS.voxel_size)
+    with pytest.raises(ScanRejected):
+        register(read_scan(shared_data / current), surface_of(voxels, SETTINGS), settings=SETTINGS)
