@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
@@ -61,7 +62,7 @@ def draw_picture(
     axes = figure.add_axes((*place, width * scale / sheet[0], height * scale / sheet[1]))
     _draw_walls(axes, reference, current.points, extent)
     _draw_tiles(axes, changes, tile_inches=float(changes.pairs.reference.grid.size[0]) * scale)
-    _draw_scale_bar(axes, extent)
+    _draw_scale_bar(figure, extent, scale)
     _dress(figure, axes, extent, changes, title)
     aside = path.with_name(path.name + ".tmp")
     with rc_context({"hatch.linewidth": _HATCH_WIDTH}):
@@ -167,14 +168,15 @@ def _label(axes: Axes, changes: ChangeSet, row: int, *, with_id: bool) -> None:
         )
 
 
-def _draw_scale_bar(axes: Axes, extent: tuple[float, float, float, float]) -> None:
-    left, right, bottom, _ = extent
-    length = next(size for size in (20.0, 10.0, 5.0, 2.0, 1.0, 0.5) if size <= max((right - left) / 4, 0.5))
-    x, y = left + 0.25, bottom + 0.18
-    axes.plot([x, x + length], [y, y], color=_INK, linewidth=3, solid_capstyle="butt", zorder=5)
-    axes.text(
-        x + length / 2, y + 0.06, f"{length:g} m", ha="center", va="bottom", fontsize=8, color=_INK, zorder=5
-    )
+def _draw_scale_bar(figure: Figure, extent: tuple[float, float, float, float], scale: float) -> None:
+    """At the head, on the right; `scale` is inches a metre."""
+    wide, high = figure.get_size_inches()
+    longest = max((extent[1] - extent[0]) / 4, 0.5)
+    length = next(size for size in (20.0, 10.0, 5.0, 2.0, 1.0, 0.5) if size <= longest)
+    right, y = 1 - _SIDE / wide, 1 - 0.6 / high
+    left = right - length * scale / wide
+    figure.add_artist(Line2D((left, right), (y, y), color=_INK, linewidth=3, solid_capstyle="butt"))
+    figure.text((left + right) / 2, y + 0.06 / high, f"{length:g} m", ha="center", fontsize=8, color=_INK)
 
 
 def _dress(
@@ -189,7 +191,7 @@ def _dress(
         spine.set_visible(False)
     counts = changes.counts()
     said = f"{counts['changed']} of {len(changes.states)} tiles changed, at a score above {changes.threshold:.2f}"
-    above, left = figure.get_figheight(), axes.get_position().x0
+    above, left = figure.get_figheight(), _SIDE / figure.get_figwidth()
     figure.text(left, 1 - 0.3 / above, title, fontsize=12, color=_INK, va="center", weight="bold")
     figure.text(left, 1 - 0.55 / above, said, fontsize=9, color=_QUIET, va="center")
     entries = [_legend_entry(state, counts[state.label]) for state in _PRECEDENCE]
