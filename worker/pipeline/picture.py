@@ -10,39 +10,32 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.patches import Patch, Rectangle
+from matplotlib.patches import Rectangle
 from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
 from worker.pipeline.changes import ChangeSet, TileState
-from worker.pipeline.export import STATE_COLORS
 from worker.pipeline.mapping import CurrentMap
+from worker.pipeline.picture_frame import (
+    FILL,
+    FOOT,
+    HATCH,
+    HATCH_WIDTH,
+    HEAD,
+    INK,
+    PRECEDENCE,
+    SIDE,
+    Extent,
+    color_of,
+    draw_scale_bar,
+    dress,
+)
 from worker.pipeline.values import Points
 
 _PIXEL = 0.05  # metres
-_INK = "#1a1a1a"
-_QUIET = "#666666"
 _DARKEST_WALL = 0.5  # grey of the map, so that ink on it is seen at once
-#: of the tiles in one column of the grid, the one that is shown; the rest would lie under it
-_PRECEDENCE = (TileState.CHANGED, TileState.INCONSISTENT, TileState.UNOBSERVED, TileState.UNCHANGED)
-_FILL = {
-    TileState.CHANGED: 0.4,
-    TileState.INCONSISTENT: 0.3,
-    TileState.UNOBSERVED: 0.1,
-    TileState.UNCHANGED: 0.0,
-}
-#: a second sign beside the colour, for eyes and printers without it
-_HATCH = {
-    TileState.CHANGED: "",
-    TileState.INCONSISTENT: "xx",
-    TileState.UNOBSERVED: "//",
-    TileState.UNCHANGED: "",
-}
-_HATCH_WIDTH = 0.5  # points
-_WIDEST, _HIGHEST, _NARROWEST = 11.0, 9.0, 6.5  # inches of the map's part of the picture
-_HEAD, _FOOT, _SIDE = 0.75, 1.0, 0.55  # inches above, below and left of it
 _ROOM_FOR_ID = 0.75  # inches; a smaller tile shows its score alone
+_WIDEST, _HIGHEST, _NARROWEST = 11.0, 9.0, 6.5  # inches of the map's part of the picture
 
 
 def draw_picture(
@@ -55,22 +48,22 @@ def draw_picture(
     extent = _extent(changes)
     width, height = extent[1] - extent[0], extent[3] - extent[2]
     scale = min(_WIDEST / width, _HIGHEST / height)  # inches a metre
-    sheet = (max(width * scale, _NARROWEST) + 2 * _SIDE, height * scale + _HEAD + _FOOT)
+    sheet = (max(width * scale, _NARROWEST) + 2 * SIDE, height * scale + HEAD + FOOT)
     figure = Figure(figsize=sheet, dpi=130, facecolor="white")
     FigureCanvasAgg(figure)
-    place = (0.5 - width * scale / sheet[0] / 2, _FOOT / sheet[1])
+    place = (0.5 - width * scale / sheet[0] / 2, FOOT / sheet[1])
     axes = figure.add_axes((*place, width * scale / sheet[0], height * scale / sheet[1]))
     _draw_walls(axes, reference, current.points, extent)
     _draw_tiles(axes, changes, tile_inches=float(changes.pairs.reference.grid.size[0]) * scale)
-    _draw_scale_bar(figure, extent, scale)
-    _dress(figure, axes, extent, changes, title)
+    draw_scale_bar(figure, extent, scale)
+    dress(figure, axes, extent, changes, title)
     aside = path.with_name(path.name + ".tmp")
-    with rc_context({"hatch.linewidth": _HATCH_WIDTH}):
+    with rc_context({"hatch.linewidth": HATCH_WIDTH}):
         figure.savefig(aside, format="png")
     aside.replace(path)
 
 
-def _extent(changes: ChangeSet) -> tuple[float, float, float, float]:
+def _extent(changes: ChangeSet) -> Extent:
     """left, right, bottom, top in metres: all tiles, and half a metre around."""
     tiles = changes.pairs.reference
     lower = tiles.grid.lower(tiles.indices)
@@ -79,20 +72,18 @@ def _extent(changes: ChangeSet) -> tuple[float, float, float, float]:
     return float(left), float(right), float(bottom), float(top)
 
 
-def _draw_walls(
-    axes: Axes, reference: Points, current: Points, extent: tuple[float, float, float, float]
-) -> None:
+def _draw_walls(axes: Axes, reference: Points, current: Points, extent: Extent) -> None:
     """How much stands above each spot between knee and head, so that furniture and walls show."""
     floor = float(np.percentile(reference[:, 2], 1))
     before, now = (_standing(points, floor, extent) for points in (reference, current))
     shade = np.clip(before / 12.0, 0, 1) * _DARKEST_WALL
     picture = np.repeat(1 - shade[:, :, None], 3, axis=2)
     only_now = (now > 2) & ~_near(before > 0)
-    picture[only_now] = to_rgb(_INK)
+    picture[only_now] = to_rgb(INK)
     axes.imshow(picture, origin="lower", extent=extent, interpolation="nearest", zorder=0)
 
 
-def _standing(points: Points, floor: float, extent: tuple[float, float, float, float]) -> NDArray[np.float64]:
+def _standing(points: Points, floor: float, extent: Extent) -> NDArray[np.float64]:
     """(rows, columns) voxels from 15 cm to 2 m above the floor in each pixel."""
     body = points[(points[:, 2] > floor + 0.15) & (points[:, 2] < floor + 2.0)]
     left, right, bottom, top = extent
@@ -115,16 +106,16 @@ def _draw_tiles(axes: Axes, changes: ChangeSet, *, tile_inches: float) -> None:
     lower = tiles.grid.lower(tiles.indices)
     for row in _topmost(changes):
         state = TileState(int(changes.states[row]))
-        color = _color(state)
+        color = color_of(state)
         axes.add_patch(
             Rectangle(
                 (lower[row, 0], lower[row, 1]),
                 float(tiles.grid.size[0]),
                 float(tiles.grid.size[1]),
-                facecolor=(*color, _FILL[state]),
+                facecolor=(*color, FILL[state]),
                 edgecolor=(0.6, 0.6, 0.6, 0.35) if state is TileState.UNCHANGED else color,
                 linewidth=2.0 if state is TileState.CHANGED else 0.6,
-                hatch=_HATCH[state],
+                hatch=HATCH[state],
                 zorder=3 if state is TileState.CHANGED else 2,
             )
         )
@@ -143,7 +134,7 @@ def _topmost(changes: ChangeSet) -> list[int]:
 
 def _order(changes: ChangeSet, row: int) -> tuple[int, float]:
     score = float(np.nan_to_num(changes.probabilities[row, 1]))
-    return _PRECEDENCE.index(TileState(int(changes.states[row]))), -score
+    return PRECEDENCE.index(TileState(int(changes.states[row]))), -score
 
 
 def _label(axes: Axes, changes: ChangeSet, row: int, *, with_id: bool) -> None:
@@ -162,62 +153,7 @@ def _label(axes: Axes, changes: ChangeSet, row: int, *, with_id: bool) -> None:
             textcoords="offset points",
             va="top",
             fontsize=size,
-            color=_INK,
+            color=INK,
             zorder=4,
             path_effects=[withStroke(linewidth=2.0, foreground="white")],
         )
-
-
-def _draw_scale_bar(figure: Figure, extent: tuple[float, float, float, float], scale: float) -> None:
-    """At the head, on the right; `scale` is inches a metre."""
-    wide, high = figure.get_size_inches()
-    longest = max((extent[1] - extent[0]) / 4, 0.5)
-    length = next(size for size in (20.0, 10.0, 5.0, 2.0, 1.0, 0.5) if size <= longest)
-    right, y = 1 - _SIDE / wide, 1 - 0.6 / high
-    left = right - length * scale / wide
-    figure.add_artist(Line2D((left, right), (y, y), color=_INK, linewidth=3, solid_capstyle="butt"))
-    figure.text((left + right) / 2, y + 0.06 / high, f"{length:g} m", ha="center", fontsize=8, color=_INK)
-
-
-def _dress(
-    figure: Figure, axes: Axes, extent: tuple[float, float, float, float], changes: ChangeSet, title: str
-) -> None:
-    axes.set_xlim(extent[0], extent[1])
-    axes.set_ylim(extent[2], extent[3])
-    axes.tick_params(labelsize=7, colors=_QUIET, length=2)
-    axes.set_xlabel("x of the map (m)", fontsize=8, color=_QUIET)
-    axes.set_ylabel("y of the map (m)", fontsize=8, color=_QUIET)
-    for spine in axes.spines.values():
-        spine.set_visible(False)
-    counts = changes.counts()
-    said = f"{counts['changed']} of {len(changes.states)} tiles changed, at a score above {changes.threshold:.2f}"
-    above, left = figure.get_figheight(), _SIDE / figure.get_figwidth()
-    figure.text(left, 1 - 0.3 / above, title, fontsize=12, color=_INK, va="center", weight="bold")
-    figure.text(left, 1 - 0.55 / above, said, fontsize=9, color=_QUIET, va="center")
-    entries = [_legend_entry(state, counts[state.label]) for state in _PRECEDENCE]
-    entries.append(Patch(facecolor=_INK, label="seen in the survey only"))
-    figure.legend(
-        handles=entries,
-        loc="lower center",
-        bbox_to_anchor=(0.5, 0.2 / above),
-        ncols=5,
-        fontsize=8,
-        frameon=False,
-    )
-    note = "seen from above, between 0.15 and 2 m over the floor; of tiles above each other the first in this list is drawn"
-    figure.text(0.5, 0.14 / above, note, fontsize=6.5, color=_QUIET, ha="center", va="center")
-
-
-def _legend_entry(state: TileState, count: int) -> Patch:
-    color = _color(state)
-    return Patch(
-        facecolor=(*color, max(_FILL[state], 0.05)),
-        edgecolor=color,
-        hatch=_HATCH[state],
-        label=f"{count} {state.label}",
-    )
-
-
-def _color(state: TileState) -> tuple[float, float, float]:
-    red, green, blue = (channel / 255 for channel in STATE_COLORS[state])
-    return red, green, blue
