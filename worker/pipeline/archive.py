@@ -135,4 +135,4 @@ def _ragged(name: str, parts: Sequence[Points]) -> Arrays:
 
 
 def _unragged(name: str, arrays: Arrays) -> tuple[Points, ...]:
-    return tuple(np.split(arrays[f"{name}_points"], arrays[f"{name}_ends"][:-1]))
+    return tuple(np.split(arrays[f"{name}_points"], arrays[f"{name}_ends"])[:-1])  # behind the last: nothing

@@ -46,10 +46,15 @@ def decide(pairs: TilePairs, scores: TileScores, *, threshold: float) -> ChangeS
     """Call a tile changed above the threshold of class 1, and inconsistent where class 2 wins below it.
 
     The paper only knows the first; a tile that looks like another place is no proof of "no change" either.
+    Raises ValueError where an observed tile has no score: that is a fault of the detector, and no state fits it.
     """
-    probabilities = scores.probabilities
+    observed = pairs.observed
+    unscored = int(np.isnan(scores.probabilities[observed]).any(axis=1).sum())
+    if unscored:
+        raise ValueError(f"{unscored} of {int(observed.sum())} observed tiles were given NaN by the detector")
+    probabilities = np.where(observed[:, None], scores.probabilities, np.float32(np.nan))
     states = np.full(len(probabilities), TileState.UNCHANGED, np.uint8)
     states[np.nan_to_num(probabilities).argmax(axis=1) == 2] = TileState.INCONSISTENT
     states[probabilities[:, 1] > threshold] = TileState.CHANGED
-    states[~pairs.observed] = TileState.UNOBSERVED
+    states[~observed] = TileState.UNOBSERVED
     return ChangeSet(pairs=pairs, probabilities=probabilities, states=states, threshold=threshold)
