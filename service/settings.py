@@ -17,9 +17,13 @@ class Settings(BaseSettings):
     host: str = Field("127.0.0.1", description="address that the API listens on")
     port: int = Field(8000, ge=0, le=65535, description="port of the API; 0 takes a free one")
     data_dir: Path = Field(Path("data"), description="everything that the embedded parts keep")
-    redis_url: str | None = Field(None, description="Redis or Valkey; unset: an embedded server in the data folder")
+    redis_url: str | None = Field(
+        None, description="Redis or Valkey; unset: an embedded server in the data folder"
+    )
     database_url: str | None = Field(None, description="SQLAlchemy URL; unset: SQLite in the data folder")
-    blob_url: str | None = Field(None, description="`file:///...` or `s3://bucket/prefix`; unset: data folder")
+    blob_url: str | None = Field(
+        None, description="`file:///...` or `s3://bucket/prefix`; unset: data folder"
+    )
     device: Literal["auto", "cpu", "cuda"] = Field("auto", description="where the network runs")
     model_store: Path = Field(Path("model_store"), description="folder of the models and their cards")
     model: str = Field("spicd-net/1", description="model used where a request names none")

@@ -1,0 +1,83 @@
+"""`spicd-worker register`: where one file was taken in another, with the numbers that say how sure that is."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.table import Table
+
+from worker.cli import terminal
+
+
+def register(commands: typer.Typer) -> None:
+    """Add `register` to the command line."""
+    commands.command("register")(register_files)
+
+
+def register_files(
+    reference: Annotated[Path, typer.Argument(help="PLY or PCD that sets the frame.")],
+    current: Annotated[Path, typer.Argument(help="PLY or PCD to be placed in it.")],
+    start: Annotated[
+        Path | None, typer.Option(help="4x4 text file, reference from current: where to begin.")
+    ] = None,
+    truth: Annotated[
+        Path | None, typer.Option(help="4x4 text file of the same kind: the error is given too.")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Results as JSON on stdout.")] = False,
+) -> None:
+    """Register CURRENT to REFERENCE as a survey is registered to a map."""
+    # Not at the head of the file: Open3D takes a second, which `--help` need not wait for.
+    import numpy as np  # noqa: PLC0415
+
+    from worker.pipeline.chaining import ScanFile, chain, place  # noqa: PLC0415
+    from worker.pipeline.poses import difference  # noqa: PLC0415
+    from worker.pipeline.registration import (  # noqa: PLC0415
+        RegistrationSettings,
+        ScanRejected,
+        surface_of,
+    )
+
+    settings, most = RegistrationSettings(), 50_000_000
+    _, fused = chain([ScanFile(name=reference.name, path=reference)], settings=settings, max_points=most)
+    target = surface_of(fused, settings)
+    pose = None if start is None else np.loadtxt(start)
+    begun = time.perf_counter()
+    outcome = place(
+        ScanFile(name=current.name, path=current, pose=pose), target, settings=settings, max_points=most
+    )
+    seconds = time.perf_counter() - begun
+    if outcome.scan is None:
+        raise ScanRejected(str(outcome.reason))
+    scan = outcome.scan
+    result: dict[str, Any] = {
+        "reference_from_current": scan.map_from_scan.tolist(),
+        "fitness": scan.fitness,
+        "inlier_rmse": scan.inlier_rmse,
+        "overlap": scan.overlap,
+        "agreement": scan.agreement,
+        "searched": scan.searched,
+        "seconds": seconds,
+    }
+    if truth is not None:
+        metres, radians = difference(np.loadtxt(truth), scan.map_from_scan)
+        result["error"] = {"metres": metres, "degrees": float(np.degrees(radians))}
+    if as_json:
+        terminal.print_json(result)
+    else:
+        terminal.output().print(_table(result), highlight=False)
+
+
+def _table(result: dict[str, Any]) -> Table:
+    table = Table(show_header=False)
+    table.add_row("fitness", f"{result['fitness']:.3f}")
+    table.add_row("inlier RMSE", f"{result['inlier_rmse'] * 100:.1f} cm")
+    table.add_row("agreement", f"{result['agreement']:.2f} over {result['overlap']:.0%} of the scan")
+    table.add_row("start", "global search" if result["searched"] else "as given, or identity")
+    if "error" in result:
+        error = result["error"]
+        table.add_row("off the truth", f"{error['metres'] * 100:.2f} cm, {error['degrees']:.3f} degrees")
+    table.add_row("seconds", f"{result['seconds']:.2f}")
+    return table

@@ -1,0 +1,272 @@
+"""`make bench`: seconds in each stage of a map and of a survey, and what the network costs.
+
+A simulated corridor of 25 scans with about 100,000 points each. Timings on a shared machine are worth little by
+themselves, so the ways of running the network are repeated in turn within one run and given as ratios too.
+"""
+
+from __future__ import annotations
+
+import json
+import platform
+import resource
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+import torch
+
+from worker.detectors.spicd_net.detector import SpicdNet
+from worker.detectors.store import open_detector
+from worker.evaluation.scenes import corridor
+from worker.evaluation.sensor import SimulatedScan
+from worker.evaluation.visits import visit
+from worker.pipeline import archive
+from worker.pipeline.chaining import Outcome, ScanFile, chain, place
+from worker.pipeline.changes import decide
+from worker.pipeline.export import tile_results, write_coloured_cloud
+from worker.pipeline.flow import PipelineSettings
+from worker.pipeline.mapping import ReferenceMap, current_map, reference_map
+from worker.pipeline.pcd import write_pcd
+from worker.pipeline.picture import draw_picture
+from worker.pipeline.poses import difference, inverse
+from worker.pipeline.tiling import TilePairs, Tiles, cut, grid_over, pair_tiles
+from worker.pipeline.values import Arrays, Matrix4
+from worker.pipeline.voxels import Voxels
+from worker.progress import Progress, silent
+
+PAPER_TILES = 172  # of the paper's map; its GTX 1650 takes 22.4 s for them (Table 6)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class BenchSettings:
+    """What is simulated."""
+
+    scans: int = 25
+    seed: int = 1
+    prior_error: tuple[float, float] = (0.1, 2.0)  #: sigma of the odometry, metres and degrees
+    repeats: int = 3  #: of each way of running the network, in turn
+    model_store: Path = Path("model_store")
+    model: str = "spicd-net/1"
+
+
+@dataclass(slots=True)
+class Stopwatch:
+    """Seconds by stage, in the order they were run."""
+
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Time what runs within; a name that comes back adds up."""
+        begun = time.perf_counter()
+        yield
+        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - begun
+
+
+def bench(settings: BenchSettings, progress: Progress = silent) -> dict[str, Any]:
+    """Run everything once and return the figures, JSON-ready; seconds unless the name says otherwise."""
+    detector = open_detector(settings.model_store, settings.model)
+    if not isinstance(detector, SpicdNet):
+        raise ValueError(
+            f"bench compares two ways of running SPICD-Net; {settings.model} is another detector"
+        )
+    pipeline = PipelineSettings().for_model(detector.card.preprocessing)
+    with TemporaryDirectory(prefix="spicd-bench-") as folder:
+        scratch = Path(folder)
+        progress("simulating", 0.0)
+        scene = corridor(settings.seed)
+        first = visit(scene, settings.scans, seed=settings.seed, prior_error=settings.prior_error)
+        second = visit(scene, settings.scans, seed=settings.seed + 1, prior_error=settings.prior_error)
+        files = [_written(scratch / f"map-{number}.pcd", scan) for number, scan in enumerate(first)]
+        built = _map(files, detector, pipeline, progress)
+        one = _written(scratch / "survey.pcd", second[settings.scans // 2])
+        progress("one-scan survey", 0.0)
+        with_prior = _survey(one, built, detector, pipeline, scratch)
+        without = _survey(replace(one, pose=None), built, detector, pipeline, scratch)
+        network = _network(_full_visit(second, first, built), detector, settings, progress)
+    return {
+        "machine": _machine(),
+        "scene": {
+            "scans": len(first),
+            "points_per_scan": round(float(np.mean([len(scan.points) for scan in first]))),
+            "map_points": len(built.reference.points),
+            "tiles": len(built.tiles.points),
+        },
+        "map": built.seconds | {"total": sum(built.seconds.values())},
+        "map_poses": _pose_errors(first, built.outcomes, built.map_from_world(first)),
+        "survey_with_prior": with_prior,
+        "survey_without_prior": without,
+        "network": network,
+        "peak_memory_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024),
+    }
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class _Built:
+    reference: ReferenceMap
+    tiles: Tiles
+    description: Arrays
+    outcomes: tuple[Outcome, ...]
+    seconds: dict[str, float]
+
+    def map_from_world(self, scans: tuple[SimulatedScan, ...]) -> Matrix4:
+        """By the first scan, which set the map's frame."""
+        first = self.outcomes[0].scan
+        if first is None:
+            raise ValueError("the first scan sets the frame and cannot be left out")
+        return first.map_from_scan @ inverse(scans[0].world_from_sensor)
+
+
+def _written(path: Path, scan: SimulatedScan) -> ScanFile:
+    write_pcd(path, scan.points)
+    return ScanFile(name=path.name, path=path, pose=scan.prior)
+
+
+def _map(files: list[ScanFile], detector: SpicdNet, settings: PipelineSettings, progress: Progress) -> _Built:
+    watch = Stopwatch()
+    with watch.stage("read and register"):
+        outcomes, fused = chain(
+            files, settings=settings.registration, max_points=settings.max_scan_points, progress=progress
+        )
+    with watch.stage("normals"):
+        reference = reference_map(fused, settings=settings.registration)
+    with watch.stage("tile"):
+        grid = grid_over(reference.points, tile_size=settings.tiling.tile_size, voxel_size=fused.size)
+        tiles = cut(reference.points, grid, min_points=settings.tiling.min_points)
+    with watch.stage("describe"):
+        description = detector.describe(tiles, progress=progress)
+    return _Built(
+        reference=reference,
+        tiles=tiles,
+        description=description,
+        outcomes=outcomes,
+        seconds=watch.seconds,
+    )
+
+
+def _survey(
+    file: ScanFile, built: _Built, detector: SpicdNet, settings: PipelineSettings, scratch: Path
+) -> dict[str, Any]:
+    """A survey of one scan from file to files, as the jobs run it."""
+    watch = Stopwatch()
+    archive.save_reference(scratch / "reference.npz", built.reference)
+    with watch.stage("load map"):
+        reference = archive.load_reference(scratch / "reference.npz")
+        surface = reference.surface()
+    with watch.stage("read and register"):
+        outcome = place(file, surface, settings=settings.registration, max_points=settings.max_scan_points)
+    if outcome.scan is None:
+        return {"rejected": outcome.reason, **watch.seconds}
+    with watch.stage("fuse and tile"):
+        current = current_map([outcome.scan], voxel_size=reference.voxel_size)
+        pairs = pair_tiles(built.tiles, current.points, settings=settings.tiling)
+    with watch.stage("score"):
+        scores = detector.score(pairs, description=built.description)
+    with watch.stage("decide and export"):
+        changes = decide(pairs, scores, threshold=detector.card.threshold)
+        write_coloured_cloud(scratch / "cloud.ply", current, changes)
+        tile_results(changes)
+    with watch.stage("picture"):
+        draw_picture(scratch / "picture.png", reference.points, current, changes, title="bench")
+    total = sum(watch.seconds.values())
+    return {"observed_tiles": int(pairs.observed.sum()), **watch.seconds, "total": total}
+
+
+def _full_visit(
+    second: tuple[SimulatedScan, ...], first: tuple[SimulatedScan, ...], built: _Built
+) -> TilePairs:
+    """The second visit at its true poses, so that nearly every tile is observed; cut to the paper's number."""
+    map_from_world = built.map_from_world(first)
+    points = np.concatenate([scan.world_points for scan in second])
+    moved = points @ map_from_world[:3, :3].T + map_from_world[:3, 3]
+    fused = Voxels.of(moved, size=built.reference.voxel_size)
+    pairs = pair_tiles(built.tiles, fused.points, settings=PipelineSettings().tiling)
+    chosen = np.resize(np.flatnonzero(pairs.observed), PAPER_TILES)
+    reference = pairs.reference
+    return TilePairs(
+        reference=Tiles(
+            grid=reference.grid,
+            indices=reference.indices[chosen],
+            points=tuple(reference.points[tile] for tile in chosen),
+        ),
+        current=tuple(pairs.current[tile] for tile in chosen),
+        observed=np.ones(len(chosen), bool),
+    )
+
+
+def _network(
+    pairs: TilePairs, detector: SpicdNet, settings: BenchSettings, progress: Progress
+) -> dict[str, Any]:
+    """172 tiles: our way, without the cached reference, and the paper's way (padded patches, both branches)."""
+    description = detector.describe(pairs.reference)
+    ways: dict[str, Callable[[], Any]] = {
+        "cached_distinct": lambda: detector.score(pairs, description=description),
+        "uncached_distinct": lambda: detector.score(pairs),
+        "uncached_padded": lambda: detector.score(pairs, padded=True),
+    }
+    seconds: dict[str, list[float]] = {name: [] for name in ways}
+    scores: dict[str, Any] = {}
+    for turn in range(settings.repeats):
+        for number, (name, run) in enumerate(ways.items()):
+            progress("network", (turn + number / len(ways)) / settings.repeats)
+            begun = time.perf_counter()
+            scores[name] = run().probabilities
+            seconds[name].append(time.perf_counter() - begun)
+    plain = scores["uncached_padded"]
+    return {
+        "tiles": len(pairs.observed),
+        "distinct_points_per_tile": round(float(np.mean([len(points) for points in pairs.current]))),
+        "seconds": {name: _spread(values) for name, values in seconds.items()},
+        "times_faster_than_padded": {
+            name: round(float(np.median(seconds["uncached_padded"]) / np.median(values)), 1)
+            for name, values in seconds.items()
+        },
+        "largest_score_difference": float(max(np.abs(other - plain).max() for other in scores.values())),
+    }
+
+
+def _spread(values: list[float]) -> dict[str, float]:
+    return {"median": float(np.median(values)), "least": min(values), "most": max(values)}
+
+
+def _pose_errors(
+    scans: tuple[SimulatedScan, ...], outcomes: tuple[Outcome, ...], map_from_world: Matrix4
+) -> dict[str, Any]:
+    off = [
+        difference(outcome.scan.map_from_scan, map_from_world @ scan.world_from_sensor)
+        for scan, outcome in zip(scans, outcomes, strict=True)
+        if outcome.scan
+    ]
+    metres, radians = np.array(off).T
+    return {
+        "accepted": len(off),
+        "of": len(scans),
+        "centimetres": {"median": float(np.median(metres) * 100), "most": float(metres.max() * 100)},
+        "degrees": {
+            "median": float(np.degrees(np.median(radians))),
+            "most": float(np.degrees(radians.max())),
+        },
+    }
+
+
+def _machine() -> dict[str, Any]:
+    return {
+        "processor": platform.processor() or platform.machine(),
+        "cores": torch.get_num_threads(),
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+        "device": "cuda" if torch.cuda.is_available() else "cpu",
+    }
+
+
+def save(figures: dict[str, Any], path: Path) -> None:
+    """Write the figures as JSON, aside and renamed."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    aside = path.with_name(path.name + ".tmp")
+    aside.write_text(json.dumps(figures, indent=2) + "\n")
+    aside.replace(path)
