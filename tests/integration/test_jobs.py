@@ -1,0 +1,469 @@
+"""The steps of a job, called in order in this process on a real catalog, with a network of random weights."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import json
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import save
+
+from service.catalog import keys
+from service.catalog.catalog import Catalog, open_catalog
+from service.catalog.jobs import Jobs
+from service.catalog.records import JobRecord, ScanRecord, SurveyRecord
+from service.catalog.steps import STEPS, JobKind
+from service.settings import Settings
+from worker.detectors.card import Card, Preprocessing
+from worker.detectors.spicd_net.network import SpicdNetwork
+from worker.errors import DetectorUnavailable, MapFailed, ScanError
+from worker.evaluation.scenes import random_room
+from worker.evaluation.sensor import SimulatedScan
+from worker.evaluation.visits import visit
+from worker.pipeline.flow import NoScanAccepted
+from worker.pipeline.pcd import write_pcd
+from worker.pipeline.poses import difference
+from worker.pipeline.scan import read_scan
+
+MODEL, SAME_CUT, OTHER_CUT = "spicd-net/1", "spicd-net/2", "spicd-net/3"
+MAP = "lobby"
+#: no global search: priors are given, and what does not fit shall fail soon
+SETTINGS = {"registration": {"search_resolutions": [], "max_iterations": 10}}
+SEEN_TO = 2.4  # metres along x of the room; the survey is blind beyond
+
+
+@dataclass(frozen=True)
+class Material:
+    """What was made once: the models, the scans, and a data folder with a map that is ready."""
+
+    model_store: Path
+    data: Path
+    before: tuple[SimulatedScan, ...]
+    after: SimulatedScan
+    foreign: SimulatedScan
+
+
+@dataclass(frozen=True)
+class House:
+    """A data folder of one test's own, with the map built."""
+
+    catalog: Catalog
+    settings: Settings
+    folder: Path
+    material: Material
+
+    def add(
+        self, name: str, scan: SimulatedScan, *, seen_to: float = np.inf, pose: bool = True
+    ) -> ScanRecord:
+        path = self.folder / name
+        write_pcd(path, scan.points[scan.world_points[:, 0] < seen_to])
+        return self.add_file(name, path.read_bytes(), pose=scan.world_from_sensor if pose else None)
+
+    def add_file(self, name: str, content: bytes, *, pose: Any = None) -> ScanRecord:
+        path = self.folder / name
+        path.write_bytes(content)
+        record, _ = self.catalog.scans.add(
+            path,
+            filename=name,
+            format="pcd",
+            size=len(content),
+            sha256=hashlib.sha256(content).hexdigest(),
+            pose=None if pose is None else pose.tolist(),
+        )
+        return record
+
+    def map_of(self, *scans: ScanRecord, map_id: str) -> JobRecord:
+        ids = [scan.scan_id for scan in scans]
+        return self.catalog.maps.create(scan_ids=ids, model=MODEL, map_id=map_id, settings=SETTINGS)[1]
+
+    def survey_of(self, *scans: ScanRecord, model: str = MODEL, threshold: float | None = None) -> JobRecord:
+        ids = [scan.scan_id for scan in scans]
+        return self.catalog.surveys.create(MAP, scan_ids=ids, model=model, threshold=threshold)[1]
+
+    def survey(self, job: JobRecord) -> SurveyRecord:
+        assert job.survey_id is not None
+        return self.catalog.surveys.get(job.survey_id)
+
+    def files(self) -> dict[str, str]:
+        """Every blob with the hash of its bytes."""
+        root = self.settings.data_dir / "blobs"
+        return {
+            str(path.relative_to(root)): hashlib.sha256(path.read_bytes()).hexdigest()
+            for path in root.rglob("*")
+            if path.is_file()
+        }
+
+    def tiles(self, survey_id: str) -> list[dict[str, Any]]:
+        return [change.tile.model_dump() for change in self.catalog.changes.of_survey(survey_id)]
+
+
+def run(job: JobRecord, *names: str) -> None:
+    """The steps of the job, or those named, as a worker would call them."""
+    for step in STEPS[job.kind]:
+        if not names or step.name in names:
+            module, function = step.function.rsplit(".", 1)
+            getattr(importlib.import_module(module), function)(job.job_id)
+
+
+def _models(folder: Path) -> None:
+    torch.manual_seed(0)
+    weights = save(SpicdNetwork().state_dict())
+    for name, tile in ((MODEL, 1.5), (SAME_CUT, 1.5), (OTHER_CUT, 2.0)):
+        card = Card(
+            name="spicd-net",
+            version=name.split("/")[1],
+            detector="spicd-net",
+            summary="never trained",
+            threshold=0.4,
+            preprocessing=Preprocessing(
+                voxel_size=0.05, tile_size=(tile, tile, 1.0), patch_points=512, min_points=512, seed=42
+            ),
+            weights="weights.safetensors",
+            sha256=hashlib.sha256(weights).hexdigest(),
+        )
+        (folder / name).mkdir(parents=True)
+        (folder / name / "weights.safetensors").write_bytes(weights)
+        (folder / name / "card.json").write_text(card.model_dump_json())
+
+
+def _environment(patch: pytest.MonkeyPatch, data: Path, model_store: Path) -> Settings:
+    for name in Settings.model_fields:
+        patch.delenv(f"SPICD_{name.upper()}", raising=False)
+    patch.setenv("SPICD_DATA_DIR", str(data))
+    patch.setenv("SPICD_MODEL_STORE", str(model_store))
+    patch.setenv("SPICD_DEVICE", "cpu")
+    return Settings()
+
+
+@pytest.fixture(scope="module")
+def material(tmp_path_factory: pytest.TempPathFactory) -> Material:
+    folder = tmp_path_factory.mktemp("material")
+    _models(folder / "models")
+    scene = random_room(3)
+    made = Material(
+        model_store=folder / "models",
+        data=folder / "data",
+        before=visit(scene, 2, seed=1),
+        after=visit(scene, 1, seed=2)[0],
+        foreign=visit(random_room(11), 1, seed=5)[0],
+    )
+    with pytest.MonkeyPatch.context() as patch:
+        settings = _environment(patch, made.data, made.model_store)
+        catalog = open_catalog(settings)
+        house = House(catalog=catalog, settings=settings, folder=folder, material=made)
+        scans = [house.add(f"before-{number}.pcd", scan) for number, scan in enumerate(made.before)]
+        run(house.map_of(*scans, map_id=MAP))
+        catalog.close()
+    return made
+
+
+@pytest.fixture
+def house(material: Material, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[House]:
+    shutil.copytree(material.data, tmp_path / "data")
+    settings = _environment(monkeypatch, tmp_path / "data", material.model_store)
+    catalog = open_catalog(settings, migrate=False)
+    yield House(catalog=catalog, settings=settings, folder=tmp_path, material=material)
+    catalog.close()
+
+
+@pytest.fixture
+def visited(house: House) -> JobRecord:
+    """A survey that waits: one scan of a later visit, which saw the half of the room."""
+    return house.survey_of(house.add("after.pcd", house.material.after, seen_to=SEEN_TO))
+
+
+def run_until_killed(job: JobRecord, name: str) -> None:
+    """The step in a process that is killed when all is written and the job is not yet marked as done."""
+
+    def killed(self: Jobs, job_id: str) -> bool:
+        raise KeyboardInterrupt
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Jobs, "succeed", killed)
+        with pytest.raises(KeyboardInterrupt):
+            run(job, name)
+
+
+def failed(house: House, job: JobRecord, code: str) -> str:
+    """The sentence of a job that failed with this code."""
+    found = house.catalog.jobs.get(job.job_id)
+    assert found.status == "failed"
+    assert found.problem is not None
+    assert found.problem.code == code
+    return found.problem.detail
+
+
+def test_a_map_is_ready_with_its_counts_scans_and_files(house: House) -> None:
+    found = house.catalog.maps.ready(MAP)
+    assert house.catalog.jobs.get(found.job_id).progress == 100
+    assert found.counts["scans"] == found.counts["accepted"] == 2
+    assert found.counts["tiles"] > 15
+    for outcome, scan in zip(found.scans, house.material.before, strict=True):
+        assert outcome.accepted
+        assert difference(np.array(outcome.map_from_scan), scan.world_from_sensor)[0] < 0.015
+        assert house.catalog.blobs.exists(keys.map_scan(MAP, outcome.scan_id))
+    with house.catalog.blobs.local(keys.map_cloud(MAP)) as path:
+        assert len(read_scan(path).points) == found.counts["points"]
+    listing = json.loads(house.catalog.blobs.get_bytes(keys.map_manifest(MAP)))
+    assert listing["n_valid_patches"] == found.counts["tiles"]
+    assert found.bounds is not None
+    assert found.bounds.max == pytest.approx(listing["map_bounds"]["max"])
+    assert house.catalog.blobs.exists(keys.map_description(MAP, MODEL))
+
+
+def test_a_survey_is_ready_with_a_state_for_every_tile_of_the_map(house: House, visited: JobRecord) -> None:
+    run(visited)
+    job, survey = house.catalog.jobs.get(visited.job_id), house.survey(visited)
+    assert (job.status, job.progress, survey.status) == ("successful", 100, "ready")
+    assert survey.threshold == 0.4  # the card's
+    assert survey.scans[0].accepted
+    truth = house.material.after.world_from_sensor
+    assert difference(np.array(survey.scans[0].map_from_scan), truth)[0] < 0.02
+    tiles = house.tiles(survey.survey_id)
+    assert len(tiles) == survey.counts["tiles"] == house.catalog.maps.get(MAP).counts["tiles"]
+    states = [tile["state"] for tile in tiles]
+    assert {state: states.count(state) for state in set(states)}.items() <= survey.counts.items()
+    blind = [tile["state"] for tile in tiles if tile["bounds"]["min"][0] > SEEN_TO]
+    assert blind
+    assert set(blind) == {"unobserved"}
+    assert any(state != "unobserved" for state in states)
+
+
+def test_a_survey_leaves_a_cloud_a_picture_and_its_scan(house: House, visited: JobRecord) -> None:
+    run(visited)
+    survey, blobs = house.survey(visited), house.catalog.blobs
+    assert blobs.get_bytes(keys.survey_picture(survey.survey_id)).startswith(b"\x89PNG")
+    with blobs.local(keys.survey_cloud(survey.survey_id)) as path:
+        cloud = read_scan(path)
+    assert cloud.points[:, 0].max() < SEEN_TO + 0.1
+    assert cloud.colors is not None
+    assert blobs.exists(keys.survey_scan(survey.survey_id, survey.scans[0].scan_id))
+
+
+def test_a_threshold_of_0_finds_every_observed_tile_changed(house: House) -> None:
+    job = house.survey_of(house.add("after.pcd", house.material.after), threshold=0.0)
+    run(job)
+    survey = house.survey(job)
+    assert survey.threshold == 0.0
+    assert survey.counts["changed"] > 0
+    assert survey.counts["changed"] + survey.counts["unobserved"] == survey.counts["tiles"]
+
+
+def test_a_model_that_cuts_alike_scores_a_map_that_was_described_for_another(
+    house: House, visited: JobRecord
+) -> None:
+    other = house.survey_of(house.add("after.pcd", house.material.after, seen_to=SEEN_TO), model=SAME_CUT)
+    for job in (visited, other):
+        run(job)
+    ours, theirs = (house.tiles(house.survey(job).survey_id) for job in (visited, other))
+    assert not house.catalog.blobs.exists(keys.map_description(MAP, SAME_CUT))
+    for one, two in zip(ours, theirs, strict=True):  # the same weights under another name
+        assert one["state"] == two["state"]
+        assert one["score"] == pytest.approx(two["score"], abs=1e-4)
+
+
+def test_progress_never_falls_and_names_the_stages_in_order(
+    house: House, visited: JobRecord, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: list[tuple[str, float]] = []
+    real = Jobs.report
+
+    def heard(self: Jobs, job_id: str, *, message: str, progress: float) -> bool:
+        told.append((message, progress))
+        return real(self, job_id, message=message, progress=progress)
+
+    monkeypatch.setattr(Jobs, "report", heard)
+    run(visited)
+    shares = [share for _, share in told]
+    assert shares == sorted(shares)
+    stages = list(dict.fromkeys(stage for stage, _ in told))
+    assert stages == ["registering", "tiling", "saving", "scoring", "exporting"]
+
+
+def test_each_step_of_a_survey_may_run_twice(house: House, visited: JobRecord) -> None:
+    for name in ("register", "score"):
+        run(visited, name)
+        once = house.files(), house.survey(visited).scans
+        run(visited, name)
+        assert (house.files(), house.survey(visited).scans) == once
+    run_until_killed(visited, "export")
+    survey = house.survey(visited)
+    assert survey.status == "running"
+    files, tiles = house.files(), house.tiles(survey.survey_id)
+    assert tiles
+    run(visited, "export")
+    assert house.files() == files
+    assert house.tiles(survey.survey_id) == tiles
+    assert house.survey(visited).status == "ready"
+
+
+def test_each_step_of_a_map_may_run_twice(house: House) -> None:
+    job = house.map_of(
+        *(house.catalog.scans.get(outcome.scan_id) for outcome in house.catalog.maps.get(MAP).scans),
+        map_id="again",
+    )
+    run(job, "register")
+    files, record = house.files(), house.catalog.maps.get("again")
+    run(job, "register")
+    assert house.files() == files
+    assert house.catalog.maps.get("again").model_dump(exclude={"updated"}) == record.model_dump(
+        exclude={"updated"}
+    )
+    run_until_killed(job, "describe")
+    files = house.files()
+    run(job, "describe")
+    assert house.files() == files
+    made = {name.removeprefix("maps/again/"): found for name, found in files.items() if "maps/again/" in name}
+    first = {
+        name.removeprefix(f"maps/{MAP}/"): found for name, found in files.items() if f"maps/{MAP}/" in name
+    }
+    assert made == first  # the same scans give the same map, to the byte
+
+
+def test_a_finished_job_is_left_alone(house: House, visited: JobRecord) -> None:
+    run(visited)
+    files, job = house.files(), house.catalog.jobs.get(visited.job_id)
+    run(visited)
+    assert house.files() == files
+    assert house.catalog.jobs.get(visited.job_id) == job
+
+
+def test_no_step_of_a_dismissed_job_does_anything(house: House, visited: JobRecord) -> None:
+    built = house.map_of(house.add("one.pcd", house.material.before[1]), map_id="hall")
+    for job in (visited, built):
+        house.catalog.jobs.dismiss(job.job_id)
+    files = house.files()
+    for job in (visited, built):
+        run(job)
+        assert house.catalog.jobs.get(job.job_id).status == "dismissed"
+    assert house.files() == files
+    assert house.survey(visited).scans[0].accepted is None
+    assert house.catalog.maps.get("hall").scans[0].accepted is None
+
+
+@pytest.mark.parametrize("name", ["register", "score", "export"])
+def test_a_job_dismissed_while_a_step_works_stops_there(
+    house: House, visited: JobRecord, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    before = [step.name for step in STEPS["survey"]]
+    for earlier in before[: before.index(name)]:
+        run(visited, earlier)
+    real, files = Jobs.report, house.files()
+
+    def dismissed_meanwhile(self: Jobs, job_id: str, *, message: str, progress: float) -> bool:
+        self.dismiss(job_id)
+        return real(self, job_id, message=message, progress=progress)
+
+    monkeypatch.setattr(Jobs, "report", dismissed_meanwhile)
+    run(visited, name)
+    assert house.catalog.jobs.get(visited.job_id).status == "dismissed"
+    assert house.files() == files
+    assert house.tiles(house.survey(visited).survey_id) == []
+
+
+def test_a_job_of_a_deleted_map_does_nothing(house: House, visited: JobRecord) -> None:
+    house.catalog.maps.delete(MAP)
+    files = house.files()
+    run(visited)
+    assert house.files() == files
+
+
+@pytest.mark.parametrize("kind", ["map", "survey"])
+def test_a_broken_scan_fails_the_job_and_is_named(house: House, kind: JobKind) -> None:
+    whole = house.add("whole.pcd", house.material.after)
+    with house.catalog.blobs.local(whole.key) as path:
+        content = path.read_bytes()
+    cut = house.add_file("cut short.pcd", content[: len(content) // 2])
+    job = house.map_of(whole, cut, map_id="hall") if kind == "map" else house.survey_of(whole, cut)
+    with pytest.raises(ScanError):
+        run(job, "register")
+    assert failed(house, job, "scan_unreadable").startswith("cut short.pcd: ")
+    status = house.catalog.maps.get("hall").status if kind == "map" else house.survey(job).status
+    assert status == "failed"
+    run(job)  # what still stood in the queue
+    failed(house, job, "scan_unreadable")
+
+
+def test_a_survey_of_another_place_fails_and_lists_each_scans_numbers(house: House) -> None:
+    job = house.survey_of(house.add("foreign.pcd", house.material.foreign, pose=False))
+    with pytest.raises(NoScanAccepted):
+        run(job)
+    assert "foreign.pcd: fitness 0." in failed(house, job, "registration_failed")
+    survey = house.survey(job)
+    assert survey.status == "failed"
+    (outcome,) = survey.scans
+    assert outcome.accepted is False
+    assert outcome.reason is not None
+    assert "foreign.pcd" in outcome.reason
+    assert outcome.fitness is not None
+    assert outcome.map_from_scan is None
+    assert house.tiles(survey.survey_id) == []  # never "no change"
+
+
+def test_a_foreign_scan_beside_a_good_one_is_listed_and_left_out(house: House) -> None:
+    good = house.add("after.pcd", house.material.after)
+    job = house.survey_of(house.add("foreign.pcd", house.material.foreign, pose=False), good)
+    run(job)
+    survey = house.survey(job)
+    assert [outcome.accepted for outcome in survey.scans] == [False, True]
+    kept = [
+        house.catalog.blobs.exists(keys.survey_scan(survey.survey_id, outcome.scan_id))
+        for outcome in survey.scans
+    ]
+    assert kept == [False, True]
+
+
+def test_a_model_that_cuts_otherwise_than_the_map_was_is_refused(house: House) -> None:
+    job = house.survey_of(house.add("after.pcd", house.material.after), model=OTHER_CUT)
+    with pytest.raises(DetectorUnavailable):
+        run(job)
+    assert "spicd-net/3 needs voxels of 0.05 m and tiles of (2.0, 2.0, 1.0)" in failed(
+        house, job, "detector_unavailable"
+    )
+
+
+def test_a_model_that_is_not_there_fails_the_job(house: House) -> None:
+    job = house.survey_of(house.add("after.pcd", house.material.after), model="spicd-net/99")
+    with pytest.raises(DetectorUnavailable):
+        run(job)
+    failed(house, job, "detector_unavailable")
+
+
+def test_scans_too_thin_for_a_tile_make_no_map_but_are_listed(house: House) -> None:
+    write_pcd(house.folder / "thin", np.random.default_rng(0).uniform(0, 5, (900, 3)).astype(np.float32))
+    job = house.map_of(house.add_file("thin.pcd", (house.folder / "thin").read_bytes()), map_id="thin")
+    with pytest.raises(MapFailed):
+        run(job)
+    assert "no tile holds 512 points" in failed(house, job, "map_failed")
+    assert house.catalog.maps.get("thin").scans[0].accepted
+
+
+def test_a_step_before_its_turn_is_harmless(house: House, visited: JobRecord) -> None:
+    with pytest.raises(FileNotFoundError):
+        run(visited, "score")
+    with pytest.raises(FileNotFoundError):
+        run(visited, "export")
+    assert house.catalog.jobs.get(visited.job_id).status == "running"
+    run(visited)
+    tiles = house.tiles(house.survey(visited).survey_id)
+    again = house.survey_of(house.catalog.scans.get(house.survey(visited).scans[0].scan_id))
+    run(again)
+    assert house.tiles(house.survey(again).survey_id) == tiles
+
+
+def test_a_step_leaves_nothing_in_the_temporary_folder(
+    house: House, visited: JobRecord, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    temporary = house.folder / "temporary"
+    temporary.mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(temporary))
+    run(visited)
+    assert list(temporary.iterdir()) == []
