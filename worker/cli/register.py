@@ -34,11 +34,8 @@ def register_files(
 
     from worker.pipeline.chaining import ScanFile, chain, place  # noqa: PLC0415
     from worker.pipeline.poses import difference  # noqa: PLC0415
-    from worker.pipeline.registration import (  # noqa: PLC0415
-        RegistrationSettings,
-        ScanRejected,
-        surface_of,
-    )
+    from worker.pipeline.registration import ScanRejected, surface_of  # noqa: PLC0415
+    from worker.pipeline.registration_settings import RegistrationSettings  # noqa: PLC0415
 
     settings, most = RegistrationSettings(), 50_000_000
     _, fused = chain([ScanFile(name=reference.name, path=reference)], settings=settings, max_points=most)

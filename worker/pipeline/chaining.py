@@ -14,14 +14,8 @@ import numpy as np
 
 from worker.pipeline.icp import Surface
 from worker.pipeline.poses import inverse
-from worker.pipeline.registration import (
-    RegisteredScan,
-    RegistrationSettings,
-    ScanRejected,
-    as_reference,
-    register,
-    surface_of,
-)
+from worker.pipeline.registration import RegisteredScan, ScanRejected, as_reference, register, surface_of
+from worker.pipeline.registration_settings import RegistrationSettings
 from worker.pipeline.scan import Scan, read_scan
 from worker.pipeline.values import Matrix4
 from worker.pipeline.voxels import Voxels

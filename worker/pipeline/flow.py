@@ -13,7 +13,7 @@ from worker.errors import RegistrationFailed
 from worker.pipeline.chaining import Outcome, ScanFile, chain, place
 from worker.pipeline.changes import ChangeSet, decide
 from worker.pipeline.mapping import CurrentMap, ReferenceMap, current_map, reference_map
-from worker.pipeline.registration import RegistrationSettings
+from worker.pipeline.registration_settings import RegistrationSettings
 from worker.pipeline.tiling import TilePairs, Tiles, TilingSettings, cut, grid_over, pair_tiles
 from worker.pipeline.values import Arrays
 from worker.progress import Progress, silent

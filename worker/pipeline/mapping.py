@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 from worker.errors import MapFailed
 from worker.pipeline.icp import Surface
-from worker.pipeline.registration import RegisteredScan, RegistrationSettings, surface_of
+from worker.pipeline.registration import RegisteredScan, surface_of
+from worker.pipeline.registration_settings import RegistrationSettings
 from worker.pipeline.values import Bools, Colors, Normals, Points
 from worker.pipeline.voxels import Voxels
 

@@ -35,7 +35,8 @@ def test_fitness_and_rmse_are_those_of_the_gate() -> None:
     points = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [3, 0, 0]])
     up, known = np.tile([0.0, 0, 1], (4, 1)), np.ones(4, bool)
     target = Surface.of(points, up, known)
-    source = Surface.of(points + [[0, 0.03, 0], [0, 0.04, 0], [0, 0.2, 0], [0, 0.3, 0]], up, known)
+    aside = np.array([[0, 0.03, 0], [0, 0.04, 0], [0, 0.2, 0], [0, 0.3, 0]])
+    source = Surface.of(points + aside, up, known)
     found = icp(source, target, np.eye(4), max_correspondence_distance=0.05)
     assert found.fitness == 0.5
     assert found.num_inliers == 2

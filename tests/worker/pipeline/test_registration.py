@@ -10,13 +10,8 @@ from worker.evaluation.scenes import random_room
 from worker.evaluation.visits import visit
 from worker.pipeline.constraint import constraint
 from worker.pipeline.poses import difference, exponential
-from worker.pipeline.registration import (
-    RegisteredScan,
-    RegistrationSettings,
-    ScanRejected,
-    register,
-    surface_of,
-)
+from worker.pipeline.registration import RegisteredScan, ScanRejected, register, surface_of
+from worker.pipeline.registration_settings import RegistrationSettings
 from worker.pipeline.scan import read_scan
 from worker.pipeline.voxels import Voxels
 
@@ -92,7 +87,8 @@ def test_a_scan_that_shares_only_a_floor_with_the_map_is_refused(room: Room) -> 
     floor = points[inner & (np.abs(points[:, 2]) < 0.04)]
     target = surface_of(Voxels.of(floor, size=0.05), SETTINGS)
     start = room.after[0].world_from_sensor
-    settings = SETTINGS.model_copy(update={"min_overlap_vouched": 0.05, "min_agreement": 0.5})
+    lenient = {"min_overlap_vouched": 0.05, "min_agreement": 0.5, "prior_distance": 99.0, "prior_angle": 3.2}
+    settings = SETTINGS.model_copy(update=lenient)
     with pytest.raises(ScanRejected, match="shares with the map leaves a motion free"):
         register(room.scan(), target, start=start, settings=settings)
 
@@ -121,7 +117,7 @@ def test_a_wall_seen_from_its_other_side_does_not_pull_the_scan_over() -> None:
     assert _off(found, scans[4].world_from_sensor)[0] < 2.0
 
 
-@pytest.mark.parametrize(("size", "expected"), [(1, 0.0), (2, 0.0003)])
+@pytest.mark.parametrize(("size", "expected"), [(1, 1e-4), (2, 0.001)])
 def test_constraint_of_one_and_two_planes_is_next_to_nothing(size: int, expected: float) -> None:
     rng = np.random.default_rng(0)
     planes = [np.column_stack([rng.uniform(-4, 4, (30_000, 2)), rng.normal(0, 0.015, 30_000)])]

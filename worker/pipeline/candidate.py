@@ -1,0 +1,132 @@
+"""A candidate: a pose refined by ICP, with what speaks for it and against it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from worker.pipeline.agreement import Agreement, agreement
+from worker.pipeline.global_search import candidate_poses
+from worker.pipeline.icp import IcpResult, Surface, icp
+from worker.pipeline.poses import difference, exponential, transformed
+from worker.pipeline.registration_settings import RegistrationSettings
+from worker.pipeline.values import Matrix4
+
+REACH = 0.3  #: metres; farther from the map than this, a point is where the map has nothing to say
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Candidate:
+    """A refined pose; everything that decides whether it is believed."""
+
+    found: IcpResult
+    seen: Agreement
+    searched: bool  #: from the global search, not from the given start
+    vouched: bool  #: near a given prior
+    contradicts_prior: bool  #: far from a given prior
+    oriented: bool  #: which side of its surfaces the scan saw is known, so that agreement says more
+
+
+def searched(
+    source: Surface,
+    target: Surface,
+    best: Candidate,
+    prior: Matrix4 | None,
+    refine: Callable[[Matrix4], Candidate],
+    settings: RegistrationSettings,
+) -> Candidate:
+    """The best pose of the global search, or what was there before it; `prior` is map_from_scan."""
+    seeds = settings.search_seeds if prior is None else 1
+    candidates = candidate_poses(source, target, resolutions=settings.search_resolutions, seeds=seeds)
+    for pose in candidates:
+        if prior is not None and not _is_near(pose, prior, settings):
+            continue
+        best = _better(best, refine(pose))
+        if (
+            is_accepted(best, settings)
+            and best.seen.mutual > needed_agreement(best, settings) + settings.sure_margin
+        ):
+            return best
+    if best.searched and not best.vouched and is_accepted(best, settings):
+        for pose in _quarter_turns(source, best.found.target_from_source):
+            best = _better(best, refine(pose))
+    return best
+
+
+def _better(best: Candidate, other: Candidate) -> Candidate:
+    """The one that agrees with the map over more of the scan; where there is a prior, one near it."""
+    return max(best, other, key=lambda each: (not each.contradicts_prior, each.seen.score))
+
+
+def _quarter_turns(source: Surface, pose: Matrix4) -> Iterator[Matrix4]:
+    """A rectangular room fits itself turned about its middle: those poses are tried before one is believed."""
+    there = transformed(source.points, pose)
+    center = (there.min(axis=0) + there.max(axis=0)) / 2
+    for quarter in (1, 2, 3):
+        turn = exponential(np.array([0.0, 0.0, quarter * np.pi / 2, 0.0, 0.0, 0.0]))
+        turn[:3, 3] = center - turn[:3, :3] @ center
+        yield turn @ pose
+
+
+def refined(
+    source: Surface,
+    target: Surface,
+    prior: Matrix4 | None,
+    candidate: Matrix4 | None,
+    *,
+    settings: RegistrationSettings,
+    tick: Callable[[], None],
+) -> Candidate:
+    """ICP from the candidate, or else the prior, or else identity, through ever smaller gates.
+
+    The wide gates need only a part of the points.
+    """
+    pose = next((start for start in (candidate, prior) if start is not None), np.eye(4))
+    last = settings.max_correspondence_distance
+    gates = [gate for gate in settings.coarse_distances if gate > last]
+    for level, gate in enumerate([*gates, last]):
+        found = icp(
+            source,
+            target,
+            pose,
+            max_correspondence_distance=gate,
+            max_iterations=settings.max_iterations,
+            soft=gate > last,
+            every=2 ** (len(gates) - level),
+            tick=tick,
+        )
+        pose = found.target_from_source
+    near = prior is not None and _is_near(pose, prior, settings)
+    return Candidate(
+        found=found,
+        seen=agreement(source, target, pose, reach=REACH, surface_distance=last),
+        searched=candidate is not None,
+        vouched=near,
+        contradicts_prior=prior is not None and not near,
+        oriented=bool(source.oriented.mean() > 0.5),
+    )
+
+
+def _is_near(pose: Matrix4, prior: Matrix4, settings: RegistrationSettings) -> bool:
+    distance, angle = difference(pose, prior)
+    return distance <= settings.prior_distance and angle <= settings.prior_angle
+
+
+def is_accepted(candidate: Candidate, settings: RegistrationSettings) -> bool:
+    """Table 1's RMSE, enough of the scan in the map, and agreement from both sides; never against a prior."""
+    found, seen = candidate.found, candidate.seen
+    overlap = settings.min_overlap_vouched if candidate.vouched else settings.min_overlap
+    return (
+        not candidate.contradicts_prior
+        and (found.fitness > settings.min_fitness or seen.overlap >= overlap)
+        and found.inlier_rmse < settings.max_inlier_rmse
+        and seen.mutual >= needed_agreement(candidate, settings)
+    )
+
+
+def needed_agreement(candidate: Candidate, settings: RegistrationSettings) -> float:
+    """More is asked where the sides are known, which raises it, and no prior speaks for the pose."""
+    strict = candidate.oriented and not candidate.vouched
+    return settings.min_agreement_unvouched if strict else settings.min_agreement
