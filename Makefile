@@ -37,7 +37,7 @@ clean: ## remove the environment and everything made
 
 $(INSTALLED): pyproject.toml docker/constraints.txt docker/system-libraries.sh
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "SPICD needs Python 3.11 or later; name one: make PYTHON=python3.12")'
-	@echo "Making $(VENV) and installing (about 1 GB on disk; a few minutes the first time) ..."
+	@echo "Making $(VENV) and installing (about 2.6 GB on disk; a few minutes the first time) ..."
 	@$(PYTHON) -m venv $(VENV)
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -c docker/constraints.txt -e '.[worker,dev]'
 	@PYTHON=$(BIN)/python sh docker/system-libraries.sh
