@@ -42,7 +42,7 @@ class Outcome:
     name: str
     scan: RegisteredScan | None
     reason: str | None = None
-    fitness: float | None = None  #: 0..1, the best reached; None before ICP
+    fitness: float | None = None  #: 0..1, the best reached; None where there was nothing to fit to
     inlier_rmse: float | None = None  #: metres
 
 
@@ -84,7 +84,7 @@ def chain(
     first = files[0].read(max_points=max_points)
     start = _start(files[0], first)
     placed = as_reference(first, np.eye(4) if start is None else start)
-    outcomes = {0: _accepted(files[0], placed)}
+    outcomes = {0: Outcome(name=files[0].name, scan=placed)}  # it fits itself: no numbers
     fused = placed.voxels(settings.voxel_size)
     waiting, found_one = list(range(1, len(files))), True
     while waiting and found_one:
