@@ -6,6 +6,10 @@ from pathlib import Path
 
 import pytest
 
+from worker.threads import wait_passively
+
+wait_passively()  # before any test imports torch
+
 
 @pytest.fixture(scope="session")
 def shared_data() -> Path:

@@ -17,6 +17,7 @@ from service.lifetime import end_with_parent
 from service.logs import set_up_logging
 from service.settings import Settings
 from worker.rq_workers import GeometryWorker, InferenceWorker, OnDeath
+from worker.threads import wait_passively
 
 log = logging.getLogger("worker")
 
@@ -37,6 +38,7 @@ def main(arguments: list[str] | None = None) -> int:
             "no queue to work on: set SPICD_REDIS_URL, or start everything with `spicd up`", file=sys.stderr
         )
         return 2
+    wait_passively()
     for module in WARM_MODULES[options.queue]:
         importlib.import_module(module)
     log.info("%s worker is ready", options.queue)

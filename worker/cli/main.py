@@ -9,10 +9,12 @@ import typer
 from worker.cli import bench, demo, detect, register, terminal, train
 from worker.demo.failure import DemoFailed
 from worker.errors import PipelineError
+from worker.threads import wait_passively
 
 
 def main(arguments: list[str] | None = None) -> None:
     """Run one command; ends the process with status 0, 1 where it failed, 2 where it was called wrongly."""
+    wait_passively()
     try:
         _commands()(args=sys.argv[1:] if arguments is None else arguments, prog_name="spicd-worker")
     except (PipelineError, DemoFailed, ValueError, ArithmeticError) as error:
