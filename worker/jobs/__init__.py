@@ -1,0 +1,10 @@
+"""The shell of each step: load from the catalog, call the pipeline, save, report.
+
+Every step takes the job's id alone and may run twice: it reads what the step before it left, and replaces what
+an earlier run of itself left. A step of a job that has ended does nothing.
+"""
+
+from worker.jobs.maps import describe_map, register_map
+from worker.jobs.surveys import export_survey, register_survey, score_survey
+
+__all__ = ["describe_map", "export_survey", "register_map", "register_survey", "score_survey"]
