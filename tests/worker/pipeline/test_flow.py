@@ -28,7 +28,7 @@ from worker.pipeline.flow import (
 )
 from worker.pipeline.pcd import write_pcd
 from worker.pipeline.poses import difference, inverse, transformed
-from worker.pipeline.registration import RegistrationSettings
+from worker.pipeline.registration_settings import RegistrationSettings
 from worker.pipeline.tiling import TilePairs, Tiles
 from worker.pipeline.values import Arrays, Floats
 from worker.progress import Progress, silent
@@ -215,7 +215,7 @@ def test_the_detector_is_given_what_the_map_kept_for_it() -> None:
 def test_a_survey_of_another_place_is_refused_with_every_scans_numbers(told: Told, tmp_path: Path) -> None:
     files = []
     for number, scan in enumerate(visit(random_room(11), 2, seed=5)):
-        write_pcd(tmp_path / f"foreign-{number}.pcd", scan.points)
+        write_pcd(tmp_path / f"foreign-{number}.pcd", scan.points[::3])
         files.append(ScanFile(name=f"foreign-{number}.pcd", path=tmp_path / f"foreign-{number}.pcd"))
     with pytest.raises(NoScanAccepted, match=r"foreign-0\.pcd: .*; scan foreign-1\.pcd: ") as error:
         locate_survey(files, told.built.reference, told.built.tiles, settings=SETTINGS)
@@ -231,7 +231,7 @@ def test_a_foreign_scan_leaves_the_survey_as_it_is_without_it(
     told: Told, files: list[ScanFile], tmp_path: Path
 ) -> None:
     scan = visit(random_room(11), 1, seed=5)[0]
-    write_pcd(tmp_path / "foreign.pcd", scan.points)
+    write_pcd(tmp_path / "foreign.pcd", scan.points[::3])
     foreign = ScanFile(name="foreign.pcd", path=tmp_path / "foreign.pcd")
     found = locate_survey(
         [files[0], foreign, files[1]], told.built.reference, told.built.tiles, settings=SETTINGS

@@ -5,7 +5,8 @@ import pytest
 
 from worker.errors import MapFailed
 from worker.pipeline.mapping import current_map, fuse, reference_map
-from worker.pipeline.registration import RegisteredScan, RegistrationSettings
+from worker.pipeline.registration import RegisteredScan
+from worker.pipeline.registration_settings import RegistrationSettings
 from worker.pipeline.values import Colors, Floats
 
 SETTINGS = RegistrationSettings()
