@@ -43,7 +43,7 @@ def searched(
     for pose in candidates:
         if prior is not None and not _is_near(pose, prior, settings):
             continue
-        best = _better(best, refine(pose))
+        best = better(best, refine(pose))
         if (
             is_accepted(best, settings)
             and best.seen.mutual > needed_agreement(best, settings) + settings.sure_margin
@@ -51,11 +51,11 @@ def searched(
             return best
     if best.searched and not best.vouched and is_accepted(best, settings):
         for pose in _quarter_turns(source, best.found.target_from_source):
-            best = _better(best, refine(pose))
+            best = better(best, refine(pose))
     return best
 
 
-def _better(best: Candidate, other: Candidate) -> Candidate:
+def better(best: Candidate, other: Candidate) -> Candidate:
     """The one that agrees with the map over more of the scan; where there is a prior, one near it."""
     return max(best, other, key=lambda each: (not each.contradicts_prior, each.seen.score))
 

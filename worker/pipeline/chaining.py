@@ -6,6 +6,7 @@ Each scan is registered to what is fused so far, starting from its pose prior; t
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -86,22 +87,23 @@ def chain(
     placed = as_reference(first, np.eye(4) if start is None else start)
     outcomes = {0: Outcome(name=files[0].name, scan=placed)}  # it fits itself: no numbers
     fused = placed.voxels(settings.voxel_size)
-    waiting, found_one = list(range(1, len(files))), True
-    while waiting and found_one:
-        found_one = False
-        for at in list(waiting):
-            target = surface_of(fused, settings)
-            share = 1 - len(waiting) / len(files)
+    target = surface_of(fused, settings)
+    waiting, in_vain = deque(range(1, len(files))), 0
+    while in_vain < len(waiting):  # ends when every scan that waits has met this very map
+        at = waiting.popleft()
+        share = 1 - (len(waiting) + 1) / len(files)
 
-            def tick(share: float = share) -> None:
-                progress("registering", share)
+        def tick(share: float = share) -> None:
+            progress("registering", share)
 
-            outcome = place(files[at], target, settings=settings, max_points=max_points, tick=tick)
-            outcomes[at] = outcome
-            if outcome.scan:
-                fused = fused.merged(outcome.scan.voxels(settings.voxel_size))
-                waiting.remove(at)
-                found_one = True
+        outcome = place(files[at], target, settings=settings, max_points=max_points, tick=tick)
+        outcomes[at] = outcome
+        if outcome.scan:
+            fused = fused.merged(outcome.scan.voxels(settings.voxel_size))
+            target, in_vain = surface_of(fused, settings), 0
+        else:
+            waiting.append(at)
+            in_vain += 1
     progress("registering", 1.0)
     return tuple(outcomes[at] for at in range(len(files))), fused
 

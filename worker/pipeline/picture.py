@@ -80,7 +80,7 @@ def _draw_walls(axes: Axes, reference: Points, current: Points, extent: Extent) 
     picture = np.repeat(1 - shade[:, :, None], 3, axis=2)
     only_now = (now > 2) & ~_near(before > 0)
     picture[only_now] = to_rgb(INK)
-    axes.imshow(picture, origin="lower", extent=extent, interpolation="nearest", zorder=0)
+    axes.imshow(picture, origin="lower", extent=extent, interpolation="antialiased", zorder=0)
 
 
 def _standing(points: Points, floor: float, extent: Extent) -> NDArray[np.float64]:

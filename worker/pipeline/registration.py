@@ -10,7 +10,7 @@ import numpy as np
 
 from worker.errors import RegistrationFailed
 from worker.pipeline.agreement import Agreement
-from worker.pipeline.candidate import Candidate, is_accepted, needed_agreement, refined, searched
+from worker.pipeline.candidate import Candidate, better, is_accepted, needed_agreement, refined, searched
 from worker.pipeline.constraint import constraint
 from worker.pipeline.icp import IcpResult, Surface
 from worker.pipeline.normals import estimate_normals
@@ -73,6 +73,10 @@ def register(
     source = _source_surface(scan, settings)
     refine = functools.partial(refined, source, target, start, settings=settings, tick=tick)
     best = refine(None)
+    if start is not None and not is_accepted(best, settings):
+        # where little is shared the wide gates may drag a good prior away
+        narrow = settings.model_copy(update={"coarse_distances": settings.coarse_distances[-1:]})
+        best = better(best, refined(source, target, start, None, settings=narrow, tick=tick))
     if not is_accepted(best, settings):
         best = searched(source, target, best, start, refine, settings)
     if not is_accepted(best, settings):
@@ -146,7 +150,7 @@ def _require_held(
 ) -> None:
     """A scan may be rich and yet share only a plane with the map."""
     there = transformed(source.points, best.found.target_from_source)
-    distance, _ = target.nearest(there, within=2 * settings.max_correspondence_distance)
+    distance, _ = target.nearest(there, within=settings.max_correspondence_distance)
     held = constraint(source.points[np.isfinite(distance)])
     if held < settings.min_constraint:
         reason = (

@@ -25,7 +25,7 @@ class RegistrationSettings(BaseModel):
     search_resolutions: tuple[float, ...] = Field(
         (0.3, 0.2, 0.15), description="metres; of the global search, in this order; () switches it off"
     )
-    search_seeds: int = Field(3, ge=1, description="draws at each resolution")
+    search_seeds: int = Field(2, ge=1, description="draws at each resolution")
     min_agreement: float = Field(
         0.8, ge=0, le=1, description="share of the overlap on a common surface, both ways"
     )
