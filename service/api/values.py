@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 from datetime import UTC, datetime
 from typing import Annotated, Any
@@ -12,7 +13,7 @@ from pydantic import AfterValidator, BeforeValidator, Field, WithJsonSchema
 from service.catalog.records import Matrix
 
 RIGID_TOLERANCE = 1e-3  #: of R Rᵀ against the identity; poses written with four decimals pass
-LARGEST_SHIFT = 1e6  #: metres
+LARGEST_SHIFT = 10_000.0  #: metres; further out the workers take no point of a scan either
 
 _RFC3339 = re.compile(r"\d{4}-\d\d-\d\d[Tt ]\d\d:\d\d:\d\d(\.\d+)?([Zz]|[+-]\d\d:\d\d)")
 
@@ -61,8 +62,12 @@ def rigid(matrix: Matrix) -> Matrix:
     (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = rows
     if xx * (yy * zz - yz * zy) - xy * (yx * zz - yz * zx) + xz * (yx * zy - yy * zx) < 0:
         raise ValueError("the pose mirrors: its determinant is negative")
-    if any(abs(row[3]) > LARGEST_SHIFT for row in matrix[:3]):
-        raise ValueError(f"the pose shifts by more than {LARGEST_SHIFT:.0f} m")
+    shift = math.hypot(*(row[3] for row in matrix[:3]))
+    if shift > LARGEST_SHIFT:
+        raise ValueError(
+            f"the pose shifts by {shift:.0f} m, more than {LARGEST_SHIFT:.0f} m; give it in metres, and in a "
+            "frame whose origin lies at the building"
+        )
     return matrix
 
 

@@ -115,10 +115,11 @@ def test_a_form_that_ends_early_leaves_nothing(client, catalog, settings, cut):
         (json.dumps([[2, 0, 0, 0], *IDENTITY[1:]]), "rigid"),
         (json.dumps([[-1, 0, 0, 0], *IDENTITY[1:]]), "mirrors"),
         (json.dumps([*IDENTITY[:3], [1, 0, 0, 1]]), "last row"),
+        (json.dumps([[1, 0, 0, 8000], [0, 1, 0, -7000], *IDENTITY[2:]]), "shifts by 10630 m"),
         ("[[NaN,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]", "finite"),
     ],
 )
-def test_a_pose_that_is_not_rigid_is_refused_with_its_place(client, pose, told):
+def test_a_pose_that_is_not_rigid_or_far_away_is_refused_with_its_place(client, pose, told):
     for answer in (
         client.post("/scans", content=ply(), headers=RAW, params={"pose": pose}),
         client.post("/scans", data={"pose": pose}, files={"file": ("hall.ply", ply())}),
@@ -126,6 +127,12 @@ def test_a_pose_that_is_not_rigid_is_refused_with_its_place(client, pose, told):
         assert answer.status_code == 422
         assert told in answer.json()["detail"]
         assert ".pose" in answer.json()["errors"][0]["place"]
+
+
+def test_a_pose_ten_kilometres_away_is_taken(client):
+    pose = [[1, 0, 0, 6000], [0, 1, 0, -8000], *(list(row) for row in IDENTITY[2:])]
+    answer = client.post("/scans", content=ply(), headers=RAW, params={"pose": json.dumps(pose)})
+    assert (answer.status_code, answer.json()["pose"]) == (201, pose)
 
 
 @pytest.mark.parametrize("when", ["2026-03-01", "2026-03-01T12:00:00", "1700000000", "noon"])
