@@ -12,9 +12,12 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
+from uuid import uuid4
 
 import obstore
 from obstore.store import LocalStore, ObjectStore, from_url
+
+from service.catalog import keys
 
 CHUNK = 1 << 20  #: bytes handed on at a time
 _PARTS_AT_ONCE = 2  #: obstore holds 12 parts of 5 MB by default, more than an upload may cost
@@ -104,8 +107,10 @@ class Blobs:
 
     def ping(self) -> None:
         """Write and remove a small blob, as an upload would. Raises what the store raises."""
-        self.put_bytes("health/ping", b"ping")
-        obstore.delete(self._store, "health/ping")
+        key = keys.probe(uuid4().hex)
+        self.put_bytes(key, b"ping")
+        with contextlib.suppress(FileNotFoundError):
+            obstore.delete(self._store, key)
 
 
 def _renamed(source: Path, target: Path) -> bool:

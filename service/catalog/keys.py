@@ -26,6 +26,11 @@ def scan_file(scan_id: str, filename: str) -> str:
     return scan_folder(scan_id) + safe_name(filename)
 
 
+def probe(token: str) -> str:
+    """What a look at the store writes and removes; two looks at once have a token each."""
+    return f"health/{token}"
+
+
 def map_folder(map_id: str) -> str:
     """The prefix of everything kept for a map."""
     return f"maps/{map_id}/"

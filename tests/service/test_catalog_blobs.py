@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+
 import pytest
 
 from service.catalog import keys
@@ -73,6 +75,13 @@ def test_a_copy_from_elsewhere_goes_when_it_was_read():
     with elsewhere.local("a/b.bin") as path:
         assert path.name == "b.bin"
     assert not path.exists()
+
+
+def test_many_looks_at_once_find_the_store_well_and_leave_nothing(blobs, tmp_path):
+    with ThreadPoolExecutor(8) as threads:
+        looks = [threads.submit(blobs.ping) for _ in range(200)]
+    assert [look.exception() for look in looks if look.exception()] == []
+    assert list((tmp_path / "blobs" / "health").iterdir()) == []
 
 
 def test_a_prefix_takes_its_blobs_and_no_others(either):
