@@ -7,6 +7,7 @@ from typing import Annotated, Any
 import typer
 from rich.console import Group
 from rich.table import Table
+from rich.text import Text
 
 from service.cli.scans import Captured, Device
 from service.cli.terminal import Terminal, columns
@@ -15,6 +16,8 @@ from service.client import Document
 Scans = Annotated[list[str], typer.Argument(help="Files, which are uploaded, or ids of scans.")]
 Wait = Annotated[bool, typer.Option("--wait", help="Follow the job to its end.")]
 Model = Annotated[str | None, typer.Option(help="`name/version`; `spicd models` lists them.")]
+
+_ACCEPTED = {True: Text("yes", style="green"), False: Text("no", style="red")}
 
 
 def register(commands: typer.Typer) -> None:
@@ -85,7 +88,7 @@ def facts(rows: list[tuple[str, Any]]) -> Table:
     table = Table(show_header=False, box=None)
     for name, value in rows:
         if value not in (None, "", {}):
-            table.add_row(f"[bold]{name}", str(value))
+            table.add_row(Text(name, style="bold"), str(value))
     return table
 
 
@@ -100,10 +103,9 @@ def scan_table(scans: list[Document]) -> Table:
     """How each scan was registered."""
     table = columns("scan", "accepted", "fitness", "rmse (m)", "reason")
     for scan in scans:
-        accepted = {True: "[green]yes", False: "[red]no"}.get(scan.get("accepted"), "")  # type: ignore[arg-type]
         table.add_row(
             scan["scan_id"],
-            accepted,
+            _ACCEPTED.get(scan.get("accepted"), Text()),
             number(scan.get("fitness"), 2),
             number(scan.get("rmse"), 3),
             scan.get("reason"),

@@ -38,8 +38,13 @@ class Terminal:
 
     url: str
     as_json: bool
-    out: Console = field(default_factory=lambda: Console(width=None if sys.stdout.isatty() else PIPE_WIDTH))
-    err: Console = field(default_factory=lambda: Console(stderr=True))
+    # No markup and no emoji codes: what is printed are names that people and files have, brackets and all.
+    out: Console = field(
+        default_factory=lambda: Console(
+            width=None if sys.stdout.isatty() else PIPE_WIDTH, markup=False, emoji=False
+        )
+    )
+    err: Console = field(default_factory=lambda: Console(stderr=True, markup=False, emoji=False))
 
     @contextmanager
     def client(self) -> Iterator[Client]:
@@ -50,7 +55,7 @@ class Terminal:
     def show(self, document: Any, table: Callable[[], Any]) -> None:
         """Print a result: the document itself with `--json`, otherwise what `table` makes of it."""
         if self.as_json:
-            sys.stdout.write(json.dumps(document, indent=2, ensure_ascii=False) + "\n")
+            self._print_json(document)
         else:
             self.out.print(table())
 
@@ -60,13 +65,18 @@ class Terminal:
 
     def fail(self, text: str) -> None:
         """Say in one line what went wrong."""
-        self.err.print(text, style="bold red", highlight=False, markup=False, soft_wrap=True)
+        self.err.print(text, style="bold red", highlight=False, soft_wrap=True)
 
     def upload(self, client: Client, path: Path, **about: Any) -> Document:
-        """Send one file under a progress bar."""
-        with self._bar(TextColumn("[bold]{task.description}"), BarColumn(), DownloadColumn()) as bar:
-            task = bar.add_task(path.name, total=path.stat().st_size)
-            return client.upload_scan(path, on_sent=lambda sent, _: bar.update(task, completed=sent), **about)
+        """Send one file under a progress bar. Raises `ClientError`, also where the file cannot be read."""
+        with self._bar(_description(), BarColumn(), DownloadColumn()) as bar:
+            task = bar.add_task(path.name, total=None)
+            try:
+                return client.upload_scan(
+                    path, on_sent=lambda sent, size: bar.update(task, completed=sent, total=size), **about
+                )
+            except OSError as error:
+                raise ClientError(f"{path}: the file cannot be read ({error.strerror})") from error
 
     def scan_ids(self, client: Client, names: Sequence[str], **about: Any) -> list[str]:
         """Ids of the named scans: files are uploaded first, other names are taken as ids."""
@@ -79,25 +89,34 @@ class Terminal:
         ]
 
     def wait(self, client: Client, job_id: str) -> Document:
-        """Follow a job under a progress bar; Ctrl-C stops the looking, not the job."""
-        columns = (
-            TextColumn("[bold]{task.description}"),
-            BarColumn(),
-            TaskProgressColumn(),
-            TimeElapsedColumn(),
-        )
+        """Follow a job under a progress bar; Ctrl-C stops the looking, not the job.
+
+        Raises `JobFailed`; with `--json` the job's document is printed first, for it is the only result there is.
+        """
+        columns = (_description(), BarColumn(), TaskProgressColumn(), TimeElapsedColumn())
         try:
             with self._bar(*columns) as bar:
                 return client.wait(job_id, _advance(bar))
-        except JobFailed:
+        except JobFailed as failed:
+            if self.as_json:
+                self._print_json(failed.job)
             raise
         except KeyboardInterrupt:
             self.note(f"job {job_id} goes on; `spicd jobs {job_id}` shows it, `--cancel` stops it")
             raise typer.Exit(130) from None
 
+    @staticmethod
+    def _print_json(document: Any) -> None:
+        sys.stdout.write(json.dumps(document, indent=2, ensure_ascii=False) + "\n")
+
     def _bar(self, *columns: Any) -> Progress:
         hidden = self.as_json or not self.err.is_terminal
         return Progress(*columns, console=self.err, transient=True, disable=hidden)
+
+
+def _description() -> TextColumn:
+    """What a bar is about, as it is: a file name may look like markup."""
+    return TextColumn("{task.description}", style="bold", markup=False)
 
 
 def columns(*names: str) -> Table:

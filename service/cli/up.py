@@ -58,7 +58,12 @@ def up(
 
     def ready(running: Running) -> None:
         if ready_file is not None:
-            running.write(ready_file)
+            try:
+                running.write(ready_file)
+            except OSError as error:
+                raise LaunchFailed(
+                    f"the ready file {ready_file} cannot be written ({error.strerror})"
+                ) from error
         if terminal.as_json:
             sys.stdout.write(
                 json.dumps(running.document()) + "\n"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import io
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -9,9 +11,13 @@ from typing import Any
 
 import httpx
 import pytest
+from rich.console import Console
 
+from service import launcher
 from service.cli import main, terminal
+from service.cli.terminal import Terminal
 from service.client import Client
+from service.settings import Settings
 
 Answer = Callable[[httpx.Request], httpx.Response]
 
@@ -151,7 +157,7 @@ def test_waiting_follows_the_job_and_shows_the_map(
     assert "0.021" in shown
 
 
-def test_a_failed_job_is_one_sentence_on_stderr_and_status_1(
+def test_a_failed_job_is_one_sentence_on_stderr_status_1_and_with_json_its_document(
     service: Service, capsys: pytest.CaptureFixture[str]
 ) -> None:
     problem = {"title": "No scan could be registered", "detail": "scan 1: fitness 0.10 is below 0.30"}
@@ -160,8 +166,63 @@ def test_a_failed_job_is_one_sentence_on_stderr_and_status_1(
     assert spicd("surveys", "submit", "lobby", "scan-2", "--wait", "--threshold", "0.4", "--json") == 1
     assert json.loads(service.requests[0].content) == {"scan_ids": ["scan-2"], "threshold": 0.4}
     said = capsys.readouterr()
-    assert said.out == ""
+    assert json.loads(said.out) == job("failed", 30, problem=problem)
     assert said.err.split() == f"{problem['title']}: {problem['detail']}".split()
+
+
+@pytest.mark.parametrize("name", ["a[/]b", "[old] hall", "[red]x", ":smile:"])
+def test_names_that_look_like_markup_are_printed_as_they_are(
+    service: Service, tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
+) -> None:
+    scan = {**MAP["scans"][0], "accepted": False, "reason": name}
+    service.on("GET /maps", {"maps": [{**MAP, "name": name}], "links": []})
+    service.on("GET /maps/lobby", {**MAP, "name": "Lobby", "scans": [scan]})
+    service.on("GET /models", {"models": [{"name": "m", "version": "1", "summary": name}]})
+    service.on("POST /scans", {**SCAN, "filename": name}, status=201)
+    file = tmp_path / f"{name.replace('/', '')}.ply"
+    file.write_bytes(b"ply\n")
+    calls = (["maps", "list"], ["maps", "show", "lobby"], ["models"], ["scans", "add", str(file)])
+    for words in calls:
+        assert spicd(*words) == 0
+        assert name in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("name", ["a[/]b.ply", "[old].ply"])
+def test_a_bar_shows_a_file_name_that_looks_like_markup_as_it_is(name: str) -> None:
+    shown = Terminal(url="", as_json=False, err=Console(file=io.StringIO(), force_terminal=True))
+    with shown._bar(terminal._description()) as bar:
+        bar.add_task(name)
+        assert bar.columns[0].render(bar.tasks[0]).plain == name
+
+
+def test_a_file_that_cannot_be_read_is_one_sentence(
+    service: Service, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def refuse(path: Path, *_: Any) -> Any:
+        raise PermissionError(errno.EACCES, "Permission denied", str(path))
+
+    (tmp_path / "hall.ply").write_bytes(b"ply\n")
+    monkeypatch.setattr(Path, "open", refuse)
+    service.on("POST /scans", SCAN, status=201)
+    assert spicd("maps", "create", str(tmp_path / "hall.ply")) == 1
+    said = capsys.readouterr().err.strip()
+    assert said == f"{tmp_path / 'hall.ply'}: the file cannot be read (Permission denied)"
+
+
+def test_a_ready_file_that_cannot_be_written_ends_up_with_one_sentence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def launch(settings: Settings, *, on_ready: Callable[[launcher.Running], None]) -> None:
+        on_ready(
+            launcher.Running(url="", docs="", data_dir="", pid=1, redis_url=None, redis_pid=None, workers=[])
+        )
+
+    monkeypatch.setattr(launcher, "up", launch)
+    monkeypatch.setenv("COLUMNS", "200")
+    assert spicd("up", "--ready-file", str(tmp_path / "missing" / "x")) == 1
+    said = capsys.readouterr().err
+    assert "Traceback" not in said
+    assert said.strip().endswith("cannot be written (No such file or directory)")
 
 
 def test_surveys_submit_waits_and_shows_what_was_left_out(

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from tests.acceptance.conftest import make_untrained
-from worker.cli import main
+from worker.cli import detect, main
 from worker.evaluation.scenes import rigid
 from worker.pipeline.pcd import write_pcd
 from worker.pipeline.scan import read_scan
@@ -143,6 +143,24 @@ def test_a_bad_file_ends_in_one_sentence_that_names_it(
     assert spoilt in told.err
     assert sentence in told.err
     assert not (tmp_path / "out").exists()
+
+
+def test_the_summary_prints_names_that_look_like_markup_as_they_are(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    scan = {"accepted": False, "fitness": None, "rmse": None, "reason": "too far"}
+    result = {
+        "model": "spicd-net/1",
+        "threshold": 0.5,
+        "counts": {"tiles": 0},
+        "reference": [{**scan, "name": "[old]/hall.pcd"}],
+        "current": [{**scan, "name": "a[/]b.pcd"}],
+        "changed": [],
+        "files": {"tiles": "[new]/tiles.geojson"},
+    }
+    detect._show(result)
+    shown = capsys.readouterr().out
+    assert all(name in shown for name in ("[old]/hall.pcd", "a[/]b.pcd", "[new]/tiles.geojson"))
 
 
 def test_a_model_that_is_not_there_is_named(

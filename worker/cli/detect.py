@@ -54,7 +54,12 @@ def detect(
     if as_json:
         terminal.print_json(result)
     else:
-        terminal.output().print(_summary(result), highlight=False)
+        _show(result)
+
+
+def _show(result: dict[str, Any]) -> None:
+    # Names of files are printed as they are, brackets and all.
+    terminal.output().print(_summary(result), highlight=False, markup=False)
 
 
 def _summary(result: dict[str, Any]) -> Group:
