@@ -38,6 +38,7 @@ class ScanList(Document):
         200: {"model": ScanDocument, "description": "The same bytes from the same device were here already"},
         **documented(
             "incomplete_body",
+            "conflict",
             "too_large",
             "wrong_media_type",
             "bad_request",
@@ -55,7 +56,9 @@ async def upload_scan(
 ) -> ScanDocument:
     """One PLY or PCD, as the raw body or as the field `file` of a form; it is read later, by the job that uses it.
 
-    What is said of the scan stands in the query, or in the form, which wins.
+    What is said of the scan stands in the query, or in the form, which wins. The same bytes from the same device
+    are one scan: sent again with another `pose` or `captured_at`, it is corrected while no map or survey rests on it,
+    and refused (409) once one does.
     """
     said = asked.model_dump(exclude_none=True)
     checked(ScanRequest, said, place="query")  # before a long upload
@@ -104,7 +107,7 @@ def _keep(catalog: Catalog, body: Body, said: ScanRequest) -> tuple[ScanRecord, 
     if len(body.uploads) != 1:
         raise BadRequest(f"{len(body.uploads)} files in the form; send one, in the field 'file'")
     upload = body.uploads[0]
-    return catalog.scans.add(
+    record, is_new = catalog.scans.add(
         upload.path,
         filename=said.filename or upload.filename,
         format=upload.format,
@@ -114,3 +117,6 @@ def _keep(catalog: Catalog, body: Body, said: ScanRequest) -> tuple[ScanRecord, 
         captured_at=said.captured_at,
         pose=said.pose,
     )
+    if not is_new:
+        record = catalog.scans.correct(record.scan_id, captured_at=said.captured_at, pose=said.pose)
+    return record, is_new

@@ -10,8 +10,8 @@ from datetime import datetime
 from service.api.incoming import Upload
 from service.api.services import Services
 from service.catalog.catalog import Catalog
-from service.catalog.records import JobRecord
-from service.errors import Conflict, NotFound, QueueUnavailable, ServiceError
+from service.catalog.records import JobRecord, ScanRecord
+from service.errors import QueueUnavailable, ServiceError
 
 log = logging.getLogger(__name__)
 
@@ -29,7 +29,7 @@ def kept_scans(
 
     When the block raises, files that were new are forgotten again.
     """
-    new: list[str] = []
+    new: list[ScanRecord] = []
     ids = list(scan_ids)
     try:
         for upload in uploads:
@@ -43,14 +43,13 @@ def kept_scans(
                 captured_at=captured_at,
             )
             if is_new:
-                new.append(scan.scan_id)
+                new.append(scan)
             if scan.scan_id not in ids:
                 ids.append(scan.scan_id)
         yield tuple(ids)
     except BaseException:
-        for scan_id in new:
-            with contextlib.suppress(Conflict, NotFound):  # another request took it up meanwhile
-                catalog.scans.delete(scan_id)
+        for scan in new:
+            catalog.scans.take_back(scan)
         raise
 
 

@@ -16,14 +16,14 @@ def safe_name(filename: str) -> str:
     return name[-100:].lstrip(".") or "scan"
 
 
-def scan_folder(scan_id: str) -> str:
-    """The prefix of everything kept for a scan."""
-    return f"scans/{scan_id}/"
+def scan_file(scan_id: str, token: str, filename: str) -> str:
+    """The uploaded bytes, as they came; `token` is of this upload alone, for the same bytes may come again meanwhile."""
+    return f"scans/{scan_id}-{token}/{safe_name(filename)}"
 
 
-def scan_file(scan_id: str, filename: str) -> str:
-    """The uploaded bytes, as they came."""
-    return scan_folder(scan_id) + safe_name(filename)
+def folder_of(key: str) -> str:
+    """The prefix of a key and of what lies beside it."""
+    return key.rsplit("/", 1)[0] + "/"
 
 
 def probe(token: str) -> str:

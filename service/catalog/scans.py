@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 from collections.abc import Sequence
 from datetime import datetime
 from pathlib import Path
+from uuid import uuid4
 
-from sqlalchemy import select
+from sqlalchemy import ColumnElement, delete, exists, select, update
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
@@ -47,14 +49,12 @@ class Scans:
     ) -> tuple[ScanRecord, bool]:
         """Keep the file at `path` (moved when it can be) and say whether it is new.
 
-        A scan that is known stays as it was first recorded: its id names its bytes, and maps rest on its pose.
+        A scan that is known stays as it was recorded, but notes that it was sent again; `correct` changes it.
         """
         scan_id = scan_id_of(sha256, device_id)
-        with self._database.read() as session:
-            known = session.get(tables.Scan, scan_id)
-            if known is not None:
-                return _record(known), False
-        key = keys.scan_file(scan_id, filename)
+        if known := self._sent_again(scan_id):
+            return known, False
+        key = keys.scan_file(scan_id, uuid4().hex, filename)
         self._blobs.put_file(key, path, move=True)
         row = tables.Scan(
             id=scan_id,
@@ -74,7 +74,39 @@ class Scans:
                 session.flush()
                 return _record(row), True
         except IntegrityError:  # the same upload, a moment earlier
-            return self.get(scan_id), False
+            self._blobs.delete_prefix(keys.folder_of(key))
+            if known := self._sent_again(scan_id):
+                return known, False
+            raise Conflict(
+                f"scan {scan_id!r} was deleted while it was sent again; send it once more"
+            ) from None
+
+    def correct(
+        self, scan_id: str, *, captured_at: datetime | None = None, pose: Matrix | None = None
+    ) -> ScanRecord:
+        """Change what is said of a scan; what is None stays. Raises NotFound.
+
+        Raises Conflict where it would change under a map or survey that rests on it.
+        """
+        with self._database.write() as session:
+            row = session.get(tables.Scan, scan_id, with_for_update=True)
+            if row is None:
+                raise NotFound(f"no scan {scan_id!r}; upload it with POST /scans")
+            known = _record(row)
+            new_time = captured_at is not None and captured_at != known.captured_at
+            new_pose = pose is not None and pose != known.pose
+            if not (new_time or new_pose):
+                return known
+            if session.scalar(select(_in_use(scan_id))):
+                what = " and ".join(["pose"] * new_pose + ["captured_at"] * new_time)
+                raise Conflict(
+                    f"scan {scan_id!r} has the same bytes, another {what}, and belongs to a map or survey; delete "
+                    "what rests on it, then the scan, and send it again"
+                )
+            row.captured_at = captured_at or known.captured_at
+            row.pose = row.pose if pose is None else [list(line) for line in pose]
+            session.flush()
+            return _record(row)
 
     def get(self, scan_id: str) -> ScanRecord:
         """One scan. Raises NotFound."""
@@ -100,14 +132,31 @@ class Scans:
     def delete(self, scan_id: str) -> None:
         """Forget a scan and its file. Raises NotFound, and Conflict while a map or survey rests on it."""
         try:
-            with self._database.write() as session:
-                row = session.get(tables.Scan, scan_id)
-                if row is None:
-                    raise NotFound(f"no scan {scan_id!r}")
-                session.delete(row)
+            if not self._forget(tables.Scan.id == scan_id):
+                raise NotFound(f"no scan {scan_id!r}")
         except IntegrityError as error:
             raise Conflict(f"scan {scan_id!r} belongs to a map or survey; delete that first") from error
-        self._blobs.delete_prefix(keys.scan_folder(scan_id))
+
+    def take_back(self, added: ScanRecord) -> None:
+        """Forget a scan that `add` said was new, unless somebody else sent it again or uses it by now."""
+        with contextlib.suppress(IntegrityError):
+            self._forget(tables.Scan.key == added.key, tables.Scan.resent.is_(None))
+
+    def _forget(self, *which: ColumnElement[bool]) -> bool:
+        """Delete one scan, then the very file that its row named: another of the same bytes may just be coming."""
+        with self._database.write() as session:
+            key = session.scalar(delete(tables.Scan).where(*which).returning(tables.Scan.key))
+        if key is None:
+            return False
+        self._blobs.delete_prefix(keys.folder_of(key))
+        return True
+
+    def _sent_again(self, scan_id: str) -> ScanRecord | None:
+        """The scan of this id, with the note that one more client relies on it; None where there is none."""
+        statement = update(tables.Scan).where(tables.Scan.id == scan_id).values(resent=now())
+        with self._database.write() as session:
+            row = session.scalar(statement.returning(tables.Scan))
+            return None if row is None else _record(row)
 
 
 def rows_in_order(session: Session, scan_ids: Sequence[str]) -> tuple[ScanRecord, ...]:
@@ -117,6 +166,12 @@ def rows_in_order(session: Session, scan_ids: Sequence[str]) -> tuple[ScanRecord
     if missing:
         raise NotFound(f"no scan {', '.join(map(repr, missing))}; upload it with POST /scans")
     return tuple(_record(found[scan_id]) for scan_id in scan_ids)
+
+
+def _in_use(scan_id: str) -> ColumnElement[bool]:
+    return exists().where(tables.MapScan.scan_id == scan_id) | exists().where(
+        tables.SurveyScan.scan_id == scan_id
+    )
 
 
 def _record(row: tables.Scan) -> ScanRecord:

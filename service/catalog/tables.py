@@ -66,6 +66,7 @@ class Scan(Base):
     pose: Mapped[list[list[float]] | None]
     key: Mapped[str]
     created: Mapped[datetime]
+    resent: Mapped[datetime | None]
 
     __table_args__ = (Index(None, "created", "id"),)
 

@@ -17,7 +17,7 @@ Scans = Annotated[list[str], typer.Argument(help="Files, which are uploaded, or 
 Wait = Annotated[bool, typer.Option("--wait", help="Follow the job to its end.")]
 Model = Annotated[str | None, typer.Option(help="`name/version`; `spicd models` lists them.")]
 
-_ACCEPTED = {True: Text("yes", style="green"), False: Text("no", style="red")}
+_ACCEPTED: dict[bool | None, Text] = {True: Text("yes", style="green"), False: Text("no", style="red")}
 
 
 def register(commands: typer.Typer) -> None:

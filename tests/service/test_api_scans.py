@@ -11,6 +11,8 @@ from pathlib import Path
 import pytest
 from samples import IDENTITY, add_map, ply, running
 
+from service.errors import QueueUnavailable
+
 RAW = {"Content-Type": "application/octet-stream"}
 POSE = [[0, -1, 0, 2.5], [1, 0, 0, 0], [0, 0, 1, 0.35], [0, 0, 0, 1]]
 
@@ -176,6 +178,45 @@ def test_a_scan_is_deleted_once_and_not_while_a_map_rests_on_it(client, catalog)
     add_map(catalog)
     used = catalog.maps.get("lobby").scans[0].scan_id
     assert client.delete(f"/scans/{used}").json()["type"] == "urn:spicd:problem:conflict"
+
+
+TURNED = json.dumps(POSE)
+MOVED = json.dumps([[1, 0, 0, 4], *IDENTITY[1:]])
+LATER = "2026-03-02T12:00:00Z"
+
+
+def test_the_same_bytes_with_another_pose_or_time_correct_a_scan_that_nothing_rests_on(client):
+    client.post("/scans", content=ply(), headers=RAW, params={"pose": TURNED, "filename": "hall.ply"})
+    answer = client.post("/scans", content=ply(), headers=RAW, params={"pose": MOVED, "captured_at": LATER})
+    scan = answer.json()
+    assert (answer.status_code, scan["pose"], scan["captured_at"]) == (200, json.loads(MOVED), LATER)
+    assert client.get(f"/scans/{scan['scan_id']}").json() == scan
+    again = client.post("/scans", content=ply(), headers=RAW)
+    assert (again.status_code, again.json()) == (200, scan)  # what is not said stays
+
+
+def test_the_same_bytes_with_another_pose_are_refused_once_a_map_rests_on_the_scan(client):
+    scan = client.post("/scans", content=ply(), headers=RAW, params={"pose": TURNED}).json()
+    client.post("/maps", json={"scan_ids": [scan["scan_id"]]})
+    refused = client.post("/scans", content=ply(), headers=RAW, params={"pose": MOVED})
+    assert (refused.status_code, refused.json()["type"]) == (409, "urn:spicd:problem:conflict")
+    assert "another pose," in refused.json()["detail"]
+    same = client.post("/scans", content=ply(), headers=RAW, params={"pose": TURNED})
+    assert (same.status_code, same.json()) == (200, scan)
+
+
+def test_an_upload_that_was_acknowledged_outlives_a_request_that_brought_the_same_bytes_and_failed(
+    client, catalog, queue
+):
+    sent: list[str] = []
+
+    def refuse(job_id: str, kind: str) -> None:
+        sent.append(client.post("/scans", content=ply(), headers=RAW).json()["scan_id"])
+        raise QueueUnavailable("the job queue does not answer")
+
+    queue.submit = refuse
+    assert client.post("/maps", files={"scans": ("hall.ply", ply())}).status_code == 503
+    assert catalog.blobs.get_bytes(catalog.scans.get(sent[0]).key) == ply()
 
 
 def test_a_start_sweeps_what_a_killed_process_left_and_no_upload_of_today(settings, queue):

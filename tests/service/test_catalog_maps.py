@@ -6,7 +6,7 @@ from datetime import timedelta
 
 import pytest
 from pydantic import ValidationError
-from samples import IDENTITY, MODEL, NOON, add_map, add_scan, add_survey, tile
+from samples import IDENTITY, MODEL, NOON, add_map, add_scan, add_survey, ply, tile
 
 from service.catalog import keys
 from service.catalog.records import Bounds, ScanOutcome, TileRecord
@@ -115,6 +115,40 @@ def test_a_survey_needs_a_map_that_is_ready(catalog, status):
         catalog.jobs.dismiss(job_id)
     with pytest.raises(NotReady, match=status):
         catalog.surveys.create("lobby", scan_ids=[add_scan(catalog).scan_id], model=MODEL)
+
+
+def test_a_scan_deleted_while_the_same_bytes_come_again_leaves_the_new_file(catalog, monkeypatch):
+    first = add_scan(catalog)
+    forget = catalog.blobs.delete_prefix
+    again = []
+
+    def late(prefix: str) -> None:
+        """The row is gone and the file is not yet: now the same upload comes."""
+        if not again:
+            again.append(add_scan(catalog))
+        forget(prefix)
+
+    monkeypatch.setattr(catalog.blobs, "delete_prefix", late)
+    catalog.scans.delete(first.scan_id)
+    assert again[0].scan_id == first.scan_id
+    assert catalog.blobs.get_bytes(again[0].key) == ply("hall")
+    assert not catalog.blobs.exists(first.key)
+
+
+def test_of_two_uploads_of_the_same_bytes_at_once_one_file_is_kept(catalog, monkeypatch):
+    put, first = catalog.blobs.put_file, []
+
+    def late(key, path, *, move):
+        if not first:
+            first.append(None)
+            first[0] = add_scan(catalog)
+            path.write_bytes(ply("hall"))
+        put(key, path, move=move)
+
+    monkeypatch.setattr(catalog.blobs, "put_file", late)
+    assert add_scan(catalog) == first[0]
+    files = [path for path in (catalog.blobs._root / "scans").rglob("*") if path.is_file()]
+    assert files == [catalog.blobs._root / first[0].key]
 
 
 def test_a_deleted_map_takes_its_surveys_jobs_and_blobs_and_leaves_its_scans(catalog):
