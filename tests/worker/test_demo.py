@@ -116,6 +116,13 @@ def test_misses_and_false_alarms_are_told(judged: Any) -> None:
         assert f"tile_{tile:03d}_000_000" in told
 
 
+def test_the_scan_that_sets_the_frame_has_no_fitness_and_needs_none(story: Story) -> None:
+    exact = story.first[0].world_from_sensor.tolist()
+    outcomes = [{"accepted": True, "fitness": None, "map_from_scan": exact}]
+    line = placement_line("map", outcomes, story.first[:1])
+    assert line.startswith("map: 1 of 1 scans placed; off by 0.0 cm")
+
+
 def test_placement_is_measured_against_the_true_poses(story: Story) -> None:
     found = story.first[1].world_from_sensor.copy()
     found[0, 3] += 0.02
@@ -170,6 +177,6 @@ def _started_for(folder: Path) -> list[str]:
             words = process.read_bytes().replace(b"\0", b" ").decode(errors="replace")
         except OSError:  # it ended meanwhile
             continue
-        if str(folder / "data") in words:
+        if str(folder / "demo-data") in words:
             found.append(words)
     return found

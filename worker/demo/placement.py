@@ -20,9 +20,10 @@ def placement_line(visit: str, outcomes: Sequence[dict[str, Any]], scans: Sequen
         return line
     before = _errors([(scan.prior, scan.world_from_sensor) for _, scan in placed])
     after = _errors([(np.array(out["map_from_scan"]), scan.world_from_sensor) for out, scan in placed])
-    fitness = np.median([outcome["fitness"] for outcome, _ in placed])
+    fitted = [outcome["fitness"] for outcome, _ in placed if outcome["fitness"] is not None]
+    fitness = f", median fitness {np.median(fitted):.2f}" if fitted else ""
     return (
-        f"{line}, median fitness {fitness:.2f}; off by {_said(np.median(after, axis=0))}, "
+        f"{line}{fitness}; off by {_said(np.median(after, axis=0))}, "
         f"at worst {_said(after.max(axis=0))}; the robot's own odometry: {_said(np.median(before, axis=0))}"
     )
 

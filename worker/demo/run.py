@@ -58,7 +58,8 @@ def run(out: Path, settings: DemoSettings, *, out_console: Console, err_console:
     A change that the detector does not find is a result, not a failure.
     """
     began = time.monotonic()
-    fresh = [out / name for name in ("data", "scans")]
+    # names that nothing else has: what is there is removed, and `out` may be any folder
+    fresh = [out / name for name in ("demo-data", "demo-scans")]
     for folder in fresh:
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
@@ -130,12 +131,12 @@ def _through_the_service(
         url = child.await_ready()["url"]
     with Client(url) as client:
         with steps.step("upload the first visit") as step:
-            first = _uploaded(client, story.first, out / "scans", "first", step)
+            first = _uploaded(client, story.first, out / "demo-scans", "first", step)
         with steps.step("build the map") as step:
             accepted = client.create_map(first, map_id=MAP_ID, name="The demo's office")
             client.wait(accepted["job_id"], step.follow)
         with steps.step("upload the second visit") as step:
-            second = _uploaded(client, story.second, out / "scans", "second", step)
+            second = _uploaded(client, story.second, out / "demo-scans", "second", step)
         with steps.step("compare it with the map") as step:
             accepted = client.submit_survey(MAP_ID, second, device_id="demo-robot")
             client.wait(accepted["job_id"], step.follow)

@@ -15,7 +15,7 @@ from worker.jobs.scans import save_scans, scan_files, scan_outcomes
 from worker.jobs.step import Context, put, step
 from worker.pipeline import archive
 from worker.pipeline.flow import build_map
-from worker.pipeline.manifest import manifest
+from worker.pipeline.manifest import manifest, padded_patches
 from worker.pipeline.ply import write_ply
 
 
@@ -36,7 +36,12 @@ def register_map(at: Context) -> None:
             f"({len(built.reference.points)} points in all); add scans"
         )
     put(at, keys.map_reference(record.map_id), lambda path: archive.save_reference(path, built.reference))
-    put(at, keys.map_tiles(record.map_id), lambda path: archive.save_tiles(path, built.tiles))
+    patches = padded_patches(built.tiles, size=card.preprocessing.patch_points, seed=card.preprocessing.seed)
+    put(
+        at,
+        keys.map_tiles(record.map_id),
+        lambda path: archive.save_tiles(path, built.tiles, patches=patches),
+    )
     put(
         at,
         keys.map_cloud(record.map_id),

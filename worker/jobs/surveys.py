@@ -60,9 +60,14 @@ def score_survey(at: Context) -> None:
     if blobs.exists(key):
         with blobs.local(key) as path:
             description = archive.load_arrays(path)
-    scores = detector.score(
-        pairs, description=description, progress=lambda _, share: at.report("scoring", share)
-    )
+    described = description is not None
+
+    def report(stage: str, share: float) -> None:
+        """A model that did not describe the map does so now, which is half of the work."""
+        half = 0.0 if stage == "describe" else 0.5
+        at.report("scoring", share if described else half + share / 2)
+
+    scores = detector.score(pairs, description=description, progress=report)
     put(at, keys.survey_scores(survey_id), lambda path: archive.save_scores(path, scores))
 
 

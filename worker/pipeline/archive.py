@@ -5,15 +5,16 @@ Plain `.npz`, arrays only (no pickle), written aside and renamed, so that a read
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from worker.detectors.detector import TileScores
 from worker.pipeline.mapping import CurrentMap, ReferenceMap
 from worker.pipeline.registration import RegisteredScan
-from worker.pipeline.tiling import TileGrid, TilePairs, Tiles
+from worker.pipeline.tiling import TileGrid, TilePairs, Tiles, tile_id
 from worker.pipeline.values import Arrays, Points
 
 
@@ -75,14 +76,21 @@ def save_scan(path: Path, scan: RegisteredScan) -> None:
     save_arrays(path, {"points": scan.points, "map_from_scan": scan.map_from_scan, **origin, **colors})
 
 
-def save_tiles(path: Path, tiles: Tiles) -> None:
-    """Keep the grid and every tile's points."""
-    save_arrays(path, {**_grid_arrays(tiles), **_ragged("reference", tiles.points)})
+def save_tiles(path: Path, tiles: Tiles, *, patches: Sequence[Points]) -> None:
+    """Keep the grid, and for each tile `dense/<tile_id>` (n, 3) and `patch/<tile_id>` (paper, Table A1)."""
+    arrays = _grid_arrays(tiles)
+    for index, dense, patch in zip(tiles.indices, tiles.points, patches, strict=True):
+        arrays[f"dense/{tile_id(index)}"] = dense
+        arrays[f"patch/{tile_id(index)}"] = patch
+    save_arrays(path, arrays)
 
 
 def load_tiles(path: Path) -> Tiles:
-    """Read what `save_tiles` or `save_pairs` wrote."""
-    return _tiles(load_arrays(path))
+    """Read what `save_tiles` wrote, without the patches."""
+    with np.load(path, allow_pickle=False) as archive:
+        indices = archive["indices"]
+        points = tuple(archive[f"dense/{tile_id(index)}"] for index in indices)
+        return Tiles(grid=_grid(archive), indices=indices, points=points)
 
 
 def save_pairs(path: Path, pairs: TilePairs) -> None:
@@ -119,10 +127,13 @@ def _grid_arrays(tiles: Tiles) -> Arrays:
     }
 
 
-def _tiles(arrays: Arrays) -> Tiles:
+def _grid(arrays: Mapping[str, Any]) -> TileGrid:
     i, j, k = (int(count) for count in arrays["shape"])
-    grid = TileGrid(origin=arrays["origin"], size=arrays["size"], shape=(i, j, k))
-    return Tiles(grid=grid, indices=arrays["indices"], points=_unragged("reference", arrays))
+    return TileGrid(origin=arrays["origin"], size=arrays["size"], shape=(i, j, k))
+
+
+def _tiles(arrays: Arrays) -> Tiles:
+    return Tiles(grid=_grid(arrays), indices=arrays["indices"], points=_unragged("reference", arrays))
 
 
 def _ragged(name: str, parts: Sequence[Points]) -> Arrays:

@@ -48,10 +48,19 @@ def searched(
             is_accepted(best, settings)
             and best.seen.mutual > needed_agreement(best, settings) + settings.sure_margin
         ):
-            return best
-    if best.searched and not best.vouched and is_accepted(best, settings):
-        for pose in _quarter_turns(source, best.found.target_from_source):
-            best = better(best, refine(pose))
+            break
+    return best
+
+
+def turned(source: Surface, best: Candidate, refine: Callable[[Matrix4], Candidate]) -> Candidate:
+    """The best of a pose and its quarter turns: a rectangular room fits itself turned about its middle.
+
+    Not asked where a prior vouches for the pose.
+    """
+    if best.vouched:
+        return best
+    for pose in _quarter_turns(source, best.found.target_from_source):
+        best = better(best, refine(pose))
     return best
 
 
@@ -61,7 +70,6 @@ def better(best: Candidate, other: Candidate) -> Candidate:
 
 
 def _quarter_turns(source: Surface, pose: Matrix4) -> Iterator[Matrix4]:
-    """A rectangular room fits itself turned about its middle: those poses are tried before one is believed."""
     there = transformed(source.points, pose)
     center = (there.min(axis=0) + there.max(axis=0)) / 2
     for quarter in (1, 2, 3):
@@ -117,7 +125,9 @@ def _is_near(pose: Matrix4, prior: Matrix4, settings: RegistrationSettings) -> b
 def is_accepted(candidate: Candidate, settings: RegistrationSettings) -> bool:
     """Table 1's RMSE, enough of the scan in the map, and agreement from both sides; never against a prior."""
     found, seen = candidate.found, candidate.seen
-    overlap = settings.min_overlap_vouched if candidate.vouched else settings.min_overlap
+    overlap = settings.min_overlap
+    if candidate.vouched:
+        overlap = min(overlap, settings.min_overlap_vouched)
     return (
         not candidate.contradicts_prior
         and (found.fitness > settings.min_fitness or seen.overlap >= overlap)
@@ -129,4 +139,4 @@ def is_accepted(candidate: Candidate, settings: RegistrationSettings) -> bool:
 def needed_agreement(candidate: Candidate, settings: RegistrationSettings) -> float:
     """More is asked where the sides are known, which raises it, and no prior speaks for the pose."""
     strict = candidate.oriented and not candidate.vouched
-    return settings.min_agreement_unvouched if strict else settings.min_agreement
+    return max(settings.min_agreement, settings.min_agreement_unvouched if strict else 0.0)

@@ -13,9 +13,17 @@ from pathlib import Path
 
 import numpy as np
 
+from worker.errors import MapFailed
 from worker.pipeline.icp import Surface
 from worker.pipeline.poses import inverse
-from worker.pipeline.registration import RegisteredScan, ScanRejected, as_reference, register, surface_of
+from worker.pipeline.registration import (
+    RegisteredScan,
+    ScanRejected,
+    as_reference,
+    register,
+    source_surface,
+    surface_of,
+)
 from worker.pipeline.registration_settings import RegistrationSettings
 from worker.pipeline.scan import Scan, read_scan
 from worker.pipeline.values import Matrix4
@@ -79,16 +87,14 @@ def chain(
 ) -> tuple[tuple[Outcome, ...], Voxels]:
     """Place every scan in the frame of the first, and fuse them on the way.
 
-    The first scan stands at its pose prior, or at identity. A scan that finds no place is tried again
-    as long as the map grows. Returns the outcomes in the order given, and the fused voxels; raises ScanError.
+    The first scan with enough structure stands at its pose prior, or at identity. A scan that finds no place is
+    tried again as long as the map grows. Returns the outcomes in the order given, and the fused voxels.
+    Raises ScanError, and MapFailed where no scan can hold a pose.
     """
-    first = files[0].read(max_points=max_points)
-    start = _start(files[0], first)
-    placed = as_reference(first, np.eye(4) if start is None else start)
-    outcomes = {0: Outcome(name=files[0].name, scan=placed)}  # it fits itself: no numbers
-    fused = placed.voxels(settings.voxel_size)
+    begun, outcomes = _first_that_holds(files, settings, max_points)
+    fused = begun.voxels(settings.voxel_size)
     target = surface_of(fused, settings)
-    waiting, in_vain = deque(range(1, len(files))), 0
+    waiting, in_vain = deque(range(len(outcomes), len(files))), 0
     while in_vain < len(waiting):  # ends when every scan that waits has met this very map
         at = waiting.popleft()
         share = 1 - (len(waiting) + 1) / len(files)
@@ -106,6 +112,25 @@ def chain(
             in_vain += 1
     progress("registering", 1.0)
     return tuple(outcomes[at] for at in range(len(files))), fused
+
+
+def _first_that_holds(
+    files: Sequence[ScanFile], settings: RegistrationSettings, max_points: int
+) -> tuple[RegisteredScan, dict[int, Outcome]]:
+    """The scan that sets the frame, and the outcomes up to it: those before it hold no pose, anywhere."""
+    outcomes: dict[int, Outcome] = {}
+    for at, file in enumerate(files):
+        scan = file.read(max_points=max_points)
+        try:
+            source_surface(scan, settings)
+        except ScanRejected as error:
+            outcomes[at] = Outcome(name=file.name, scan=None, reason=str(error))
+            continue
+        start = _start(file, scan)
+        placed = as_reference(scan, np.eye(4) if start is None else start)
+        outcomes[at] = Outcome(name=file.name, scan=placed)  # it fits itself: no numbers
+        return placed, outcomes
+    raise MapFailed("; ".join(str(outcome.reason) for outcome in outcomes.values()))
 
 
 def _start(file: ScanFile, scan: Scan) -> Matrix4 | None:

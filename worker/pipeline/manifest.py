@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+
+from worker.pipeline.patches import patch
 from worker.pipeline.tiling import Tiles, tile_id
 from worker.pipeline.values import Points
 
-PATCHES = "tiles.npz"  #: where every tile's points are; one archive instead of a file a patch
+PATCHES = "tiles.npz"  #: one archive of arrays instead of two files a tile
 
 
 def manifest(
@@ -40,11 +43,20 @@ def manifest(
                 "tile_center": [round(float(value), 6) for value in center],
                 "n_original_points": len(tile),
                 "n_sampled_points": patch_size,
-                "file": f"{PATCHES}#{tile_id(index)}",
-                "dense_file": f"{PATCHES}#{tile_id(index)}",
+                "file": f"{PATCHES}#patch/{tile_id(index)}",
+                "dense_file": f"{PATCHES}#dense/{tile_id(index)}",
             }
             for index, center, tile in zip(tiles.indices, centers, tiles.points, strict=True)
         ],
         "n_valid_patches": len(tiles.points),
         "n_skipped_tiles": n_cells - len(tiles.points),
     }
+
+
+def padded_patches(tiles: Tiles, *, size: int, seed: int) -> tuple[Points, ...]:
+    """T patches (size, 3) float32, metres, each relative to its tile's centre, as Table A1 stores them."""
+    centers = tiles.grid.centers(tiles.indices)
+    return tuple(
+        patch((points - center).astype(np.float32), size=size, seed=seed).padded()
+        for points, center in zip(tiles.points, centers, strict=True)
+    )

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from worker.errors import ScanError
-from worker.pipeline.records import Field
+from worker.pipeline.records import FARTHEST, Field
 from worker.pipeline.values import Matrix4
 
 _KEYWORDS = (
@@ -132,8 +132,10 @@ def _viewpoint(words: list[str]) -> Matrix4:
         numbers = np.array([float(word) for word in words])
     except ValueError:
         numbers = np.empty(0)
-    if numbers.shape != (7,) or not bool(np.all(np.abs(numbers) < 1e6)):
-        raise ScanError(f"VIEWPOINT {' '.join(words)[:80]!r} is not tx ty tz qw qx qy qz in metres")
+    if numbers.shape != (7,) or not bool(np.all(np.abs(numbers) < FARTHEST)):
+        raise ScanError(
+            f"VIEWPOINT {' '.join(words)[:80]!r} is not tx ty tz qw qx qy qz in metres, within {FARTHEST:g} m"
+        )
     length = float(np.linalg.norm(numbers[3:]))
     if abs(length - 1) > 0.05:
         raise ScanError(

@@ -32,7 +32,8 @@ from worker.pipeline.picture_frame import (
 )
 from worker.pipeline.values import Points
 
-_PIXEL = 0.05  # metres
+_PIXEL = 0.05  # metres, or more where the picture would have too many
+_MOST_PIXELS = 4000  # along a side
 _DARKEST_WALL = 0.5  # grey of the map, so that ink on it is seen at once
 _ROOM_FOR_ID = 0.75  # inches; a smaller tile shows its score alone
 _WIDEST, _HIGHEST, _NARROWEST = 11.0, 9.0, 6.5  # inches of the map's part of the picture
@@ -87,7 +88,8 @@ def _standing(points: Points, floor: float, extent: Extent) -> NDArray[np.float6
     """(rows, columns) voxels from 15 cm to 2 m above the floor in each pixel."""
     body = points[(points[:, 2] > floor + 0.15) & (points[:, 2] < floor + 2.0)]
     left, right, bottom, top = extent
-    bins = [round((top - bottom) / _PIXEL), round((right - left) / _PIXEL)]
+    pixel = max(_PIXEL, (top - bottom) / _MOST_PIXELS, (right - left) / _MOST_PIXELS)
+    bins = [round((top - bottom) / pixel), round((right - left) / pixel)]
     counts, _, _ = np.histogram2d(body[:, 1], body[:, 0], bins=bins, range=[[bottom, top], [left, right]])
     return np.asarray(counts, np.float64)
 

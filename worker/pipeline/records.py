@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 from worker.errors import ScanError
 from worker.pipeline.values import Colors, Matrix4
 
+FARTHEST = 10_000.0  #: metres from the origin; there a float32 steps by 1 mm
+
 HEADER_LIMIT = 64 * 1024  #: bytes; a longer header is refused unread
 STRIDE_LIMIT = 64 * 1024  #: bytes of one point; SHOT, the widest descriptor in PCL, takes 1.4 kB
 

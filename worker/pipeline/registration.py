@@ -10,7 +10,15 @@ import numpy as np
 
 from worker.errors import RegistrationFailed
 from worker.pipeline.agreement import Agreement
-from worker.pipeline.candidate import Candidate, better, is_accepted, needed_agreement, refined, searched
+from worker.pipeline.candidate import (
+    Candidate,
+    better,
+    is_accepted,
+    needed_agreement,
+    refined,
+    searched,
+    turned,
+)
 from worker.pipeline.constraint import constraint
 from worker.pipeline.icp import IcpResult, Surface
 from worker.pipeline.normals import estimate_normals
@@ -70,7 +78,7 @@ def register(
 
     Raises ScanRejected with the best numbers reached, or where the scene cannot hold a pose.
     """
-    source = _source_surface(scan, settings)
+    source = source_surface(scan, settings)
     refine = functools.partial(refined, source, target, start, settings=settings, tick=tick)
     best = refine(None)
     if start is not None and not is_accepted(best, settings):
@@ -79,7 +87,9 @@ def register(
         best = better(best, refined(source, target, start, None, settings=narrow, tick=tick))
     if not is_accepted(best, settings):
         best = searched(source, target, best, start, refine, settings)
-    if not is_accepted(best, settings):
+    if is_accepted(best, settings):
+        best = turned(source, best, refine)
+    else:
         raise _rejected(scan.name, best, _why_not(best, settings))
     _require_held(scan.name, source, target, best, settings)
     return _placed(scan, best)
@@ -98,7 +108,8 @@ def surface_of(voxels: Voxels, settings: RegistrationSettings) -> Surface:
     return Surface.of(points, normals, oriented)
 
 
-def _source_surface(scan: Scan, settings: RegistrationSettings) -> Surface:
+def source_surface(scan: Scan, settings: RegistrationSettings) -> Surface:
+    """The scan at voxel spacing, in its own frame; raises ScanRejected where it cannot be placed anywhere."""
     voxels = Voxels.of(scan.points, size=settings.voxel_size, origin=_trusted_origin(scan))
     points = voxels.points
     if len(points) < settings.min_points:
@@ -177,7 +188,7 @@ def _placed(scan: Scan, best: Candidate) -> RegisteredScan:
 
 
 def as_reference(scan: Scan, pose: Matrix4) -> RegisteredScan:
-    """The scan that a map starts from: placed by definition, so its numbers are those of a perfect match."""
+    """The scan that a map starts from: placed by definition, so it fits itself perfectly."""
     perfect = IcpResult(
         target_from_source=pose,
         converged=True,

@@ -19,12 +19,11 @@ from worker.pipeline.pcd import read_pcd
 from worker.pipeline.pcd_header import looks_like_pcd
 from worker.pipeline.ply import read_ply
 from worker.pipeline.ply_header import looks_like_ply
-from worker.pipeline.records import RawCloud, colors_of
+from worker.pipeline.records import FARTHEST, RawCloud, colors_of
 from worker.pipeline.values import Colors, Matrix4, Points
 
 LONGEST_SITE = 500.0  #: metres along one axis; an indoor scan that is longer is not in metres
 SHORTEST_ROOM = 3.0  #: metres; what another unit would make of the extent has to be a room
-FARTHEST = 10_000.0  #: metres from the origin; there a float32 steps by 1 mm
 _SAMPLE = 100_000  #: points that the extent is measured on
 
 

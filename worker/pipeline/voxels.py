@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from worker.errors import MapFailed
 from worker.pipeline.values import Colors, Points
 
 _BITS = 21  # of a signed cell index; 2^20 cells of 5 cm reach 52 km from the origin
@@ -37,9 +38,13 @@ class Voxels:
     ) -> Voxels:
         """Sort points (N, 3), metres, into cells of `size` metres; what is given beside them is averaged too.
 
-        `origin` (3,) is where they were seen from, in their frame.
+        `origin` (3,) is where they were seen from, in their frame. Raises MapFailed for a point that is farther
+        from the frame's origin than the cells can count.
         """
         cells = np.floor(points / size).astype(np.int64) + (1 << (_BITS - 1))
+        if len(cells) and (cells.min() < 0 or cells.max() >> _BITS):
+            farthest = float(np.abs(points).max()) / 1000
+            raise MapFailed(f"a point lies {farthest:.0f} km from the map's origin; check the pose priors")
         keys = (cells[:, 0] << (2 * _BITS)) | (cells[:, 1] << _BITS) | cells[:, 2]
         columns = [points, _directions(points, origin)] + ([] if colors is None else [colors])
         values = np.hstack(columns).astype(np.float64)

@@ -10,6 +10,7 @@ from rooms import scores_of
 from tilings import row_of
 
 from worker.pipeline import archive
+from worker.pipeline.manifest import manifest, padded_patches
 from worker.pipeline.mapping import CurrentMap, ReferenceMap
 from worker.pipeline.poses import exponential
 from worker.pipeline.registration import RegisteredScan
@@ -64,14 +65,25 @@ def test_pairs_come_back_equal_with_empty_tiles_in_any_place(
 @pytest.mark.parametrize("counts", [(6, 1, 8), (3,), ()])
 def test_tiles_come_back_equal(tmp_path: Path, counts: tuple[int, ...]) -> None:
     tiles = row_of(counts, counts, observed=[True] * len(counts)).reference
-    archive.save_tiles(tmp_path / "t.npz", tiles)
+    patches = padded_patches(tiles, size=10, seed=42)
+    archive.save_tiles(tmp_path / "t.npz", tiles, patches=patches)
     assert_same(tiles, archive.load_tiles(tmp_path / "t.npz"))
 
 
-def test_pairs_can_be_read_as_the_maps_tiles(tmp_path: Path) -> None:
-    pairs = row_of([6, 1], [2, 3], observed=[True, True])
-    archive.save_pairs(tmp_path / "p.npz", pairs)
-    assert_same(pairs.reference, archive.load_tiles(tmp_path / "p.npz"))
+def test_dense_tiles_and_patches_lie_where_the_manifest_says(tmp_path: Path) -> None:
+    tiles = row_of([6, 12], [6, 12], observed=[True, True]).reference
+    patches = padded_patches(tiles, size=10, seed=42)
+    archive.save_tiles(tmp_path / "tiles.npz", tiles, patches=patches)
+    cloud = np.concatenate(tiles.points)
+    listing = manifest(cloud, tiles, patch_size=10, min_points=1, voxel_size=0.05)
+    kept = archive.load_arrays(tmp_path / "tiles.npz")
+    for entry, dense in zip(listing["patches"], tiles.points, strict=True):
+        (file, patch), (dense_file, whole) = (entry[key].split("#") for key in ("file", "dense_file"))
+        assert file == dense_file == "tiles.npz"
+        assert_same(dense, kept[whole])
+        assert kept[patch].shape == (entry["n_sampled_points"], 3)
+        there = kept[patch] + np.array(entry["tile_center"], np.float32)
+        assert np.linalg.norm(there[:, None] - dense[None], axis=2).min(axis=1).max() < 1e-5
 
 
 def test_scores_come_back_equal_with_nan(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from rooms import Room
 
-from worker.errors import Cancelled, ScanError, ScanTooLarge
+from worker.errors import Cancelled, MapFailed, ScanError, ScanTooLarge
 from worker.evaluation.sensor import SimulatedScan
 from worker.pipeline.chaining import ScanFile, chain, place
 from worker.pipeline.pcd import write_pcd
@@ -175,3 +175,25 @@ def test_a_dismissal_stops_the_registration_before_its_next_iteration(room: Room
     with pytest.raises(Cancelled):
         chain(files, settings=SETTINGS, max_points=MANY, progress=dismissed_at_the_third)
     assert calls == 3
+
+
+def _bare_plane(path: Path) -> ScanFile:
+    rng = np.random.default_rng(0)
+    plane = np.column_stack([rng.uniform(-4, 4, (40_000, 2)), rng.normal(-0.4, 0.015, 40_000)])
+    write_pcd(path, plane.astype(np.float32))
+    return ScanFile(name=path.name, path=path)
+
+
+def test_a_bare_plane_makes_no_map(tmp_path: Path) -> None:
+    with pytest.raises(MapFailed, match=r"plane\.pcd: its surfaces leave a motion free"):
+        chain([_bare_plane(tmp_path / "plane.pcd")], settings=SETTINGS, max_points=MANY)
+
+
+def test_the_first_scan_that_holds_a_pose_sets_the_frame(room: Room, tmp_path: Path) -> None:
+    first = written(tmp_path / "first.pcd", room.before[0], pose=room.before[0].world_from_sensor)
+    files = [_bare_plane(tmp_path / "plane.pcd"), first]
+    outcomes, _ = chain(files, settings=SETTINGS, max_points=MANY)
+    assert outcomes[0].scan is None
+    assert "leave a motion free" in str(outcomes[0].reason)
+    assert outcomes[1].scan is not None
+    assert off(outcomes[1].scan.map_from_scan, room.before[0].world_from_sensor) == 0

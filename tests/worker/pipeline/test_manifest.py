@@ -54,8 +54,8 @@ def test_tile_2_1_1_is_listed_with_its_place_and_points(listing: dict[str, Any])
         "tile_center": [13.75, -0.75, 2.0],
         "n_original_points": 512,
         "n_sampled_points": 4096,
-        "file": f"{PATCHES}#tile_002_001_001",
-        "dense_file": f"{PATCHES}#tile_002_001_001",
+        "file": f"{PATCHES}#patch/tile_002_001_001",
+        "dense_file": f"{PATCHES}#dense/tile_002_001_001",
     }
 
 

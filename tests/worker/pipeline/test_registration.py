@@ -162,3 +162,37 @@ def test_real_scans_of_different_places_are_rejected(shared_data: Path, current:
     voxels = Voxels.of(read_scan(shared_data / reference).points, size=SETTINGS.voxel_size)
     with pytest.raises(ScanRejected):
         register(read_scan(shared_data / current), surface_of(voxels, SETTINGS), settings=SETTINGS)
+
+
+def test_asking_for_more_agreement_is_heeded_with_and_without_a_prior(room: Room) -> None:
+    strict = SETTINGS.model_copy(update={"min_agreement": 1.0, "search_resolutions": (0.3,)})
+    for start in (None, room.after[0].world_from_sensor):
+        with pytest.raises(ScanRejected, match="at least 1"):
+            register(room.scan(), room.target, start=start, settings=strict)
+
+
+def test_a_room_without_furniture_is_not_believed_half_turned_when_a_better_turn_is_there() -> None:
+    """A box of 6 x 4 m with a closet in one corner: half a turn puts walls on walls."""
+    rng = np.random.default_rng(4)
+    target = surface_of(Voxels.of(_box_room(rng), size=0.05, origin=np.zeros(3)), SETTINGS)
+    half = exponential(np.array([0.0, 0.0, np.pi, 0.0, 0.0, 0.0]))
+    turned = _box_room(rng) @ half[:3, :3].T
+    found = register(as_scan(turned.astype(np.float32)), target, settings=SETTINGS)
+    centimetres, degrees = _off(found, half)
+    assert centimetres < 3
+    assert degrees < 0.5
+
+
+def _box_room(rng: np.random.Generator) -> np.ndarray:
+    """(N, 3) noisy points on floor, ceiling, walls and a closet, seen from the middle."""
+    size, parts = np.array([6.0, 4.0, 2.5]), []
+    for axis in range(3):
+        for side in (-0.5, 0.5):
+            flat = rng.uniform(-0.5, 0.5, (9000, 3))
+            flat[:, axis] = side
+            parts.append(flat * size)
+    closet = rng.uniform(0, 1, (4000, 3)) * (0.6, 1.0, 1.8) + (2.35, 0.95, -1.25)
+    closet[:2000, 0] = 2.35
+    closet[2000:, 1] = 0.95
+    cloud = np.concatenate([*parts, closet])
+    return cloud + rng.normal(0, 0.01, cloud.shape)

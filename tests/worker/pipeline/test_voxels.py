@@ -3,6 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from worker.errors import MapFailed
 from worker.pipeline.voxels import Voxels
 
 
@@ -49,3 +50,9 @@ def test_a_cell_seen_from_both_sides_has_no_direction() -> None:
     right = Voxels.of(point, size=0.1, origin=np.array([2.0, 0.0, 0.0]))
     assert left.views == pytest.approx(np.array([[-1.0, 0.0, 0.0]]))
     assert left.merged(right).views == pytest.approx(np.zeros((1, 3)))
+
+
+@pytest.mark.parametrize("far", [60_000.0, -60_000.0])
+def test_a_point_beyond_what_the_cells_can_count_is_refused(far: float) -> None:
+    with pytest.raises(MapFailed, match="60 km from the map's origin"):
+        Voxels.of(np.array([[0.0, far, 0.0]]), size=0.05)
