@@ -10,6 +10,7 @@ import importlib.util
 import json
 import logging
 import os
+import shutil
 import signal
 import socket
 import threading
@@ -71,6 +72,7 @@ def up(
         redis = None
         if settings.redis_url is None:
             redis = stack.enter_context(EmbeddedRedis(settings.data_dir / "redis"))
+            sweep_scratch(settings.scratch_dir())  # the folder is ours alone now
         settings = _resolve(settings, redis, listening)
         _migrate(settings)
         pool = WorkerPool(
@@ -90,6 +92,12 @@ def up(
             if not api.is_alive():
                 raise LaunchFailed("the API ended by itself; the log says why")
             time.sleep(_LOOK_S)
+
+
+def sweep_scratch(folder: Path) -> None:
+    """Remove what steps left that were killed; only while no worker runs on this folder."""
+    for left in folder.iterdir() if folder.is_dir() else ():
+        shutil.rmtree(left, ignore_errors=True)
 
 
 def environment_of(settings: Settings) -> dict[str, str]:

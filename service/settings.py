@@ -9,10 +9,16 @@ from pydantic import Field
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 
+def _model_store() -> Path:
+    """The folder beside this package in a checkout, wherever the process was started."""
+    beside = Path(__file__).resolve().parents[1] / "model_store"
+    return beside if beside.is_dir() else Path("model_store")
+
+
 class Settings(BaseSettings):
     """Read once where a process starts and passed on; nothing else reads the environment."""
 
-    model_config = SettingsConfigDict(env_prefix="SPICD_", extra="ignore")
+    model_config = SettingsConfigDict(env_prefix="SPICD_", env_ignore_empty=True, extra="ignore")
 
     host: str = Field("127.0.0.1", description="address that the API listens on")
     port: int = Field(8000, ge=0, le=65535, description="port of the API; 0 takes a free one")
@@ -25,7 +31,10 @@ class Settings(BaseSettings):
         None, description="`file:///...` or `s3://bucket/prefix`; unset: data folder"
     )
     device: Literal["auto", "cpu", "cuda"] = Field("auto", description="where the network runs")
-    model_store: Path = Field(Path("model_store"), description="folder of the models and their cards")
+    model_store: Path = Field(
+        default_factory=_model_store,
+        description="folder of the models and their cards; unset: the checkout's, without one `./model_store`",
+    )
     model: str = Field("spicd-net/1", description="model used where a request names none")
     geometry_workers: int = Field(1, ge=0, description="worker processes of the geometry queue")
     inference_workers: int = Field(1, ge=0, description="worker processes of the inference queue")
@@ -36,8 +45,17 @@ class Settings(BaseSettings):
 
     def resolved_database_url(self) -> str:
         """The database that is used, embedded or not."""
-        return self.database_url or f"sqlite:///{(self.data_dir / 'spicd.sqlite').absolute()}"
+        if self.database_url is not None:
+            return self.database_url
+        path = str((self.data_dir / "spicd.sqlite").absolute())
+        return "sqlite:///" + path.replace("%", "%25").replace(
+            "?", "%3F"
+        )  # the two that a URL reads otherwise
 
     def resolved_blob_url(self) -> str:
         """The blob store that is used, embedded or not."""
         return self.blob_url or (self.data_dir / "blobs").absolute().as_uri()
+
+    def scratch_dir(self) -> Path:
+        """Where steps write aside: on the disk of embedded blobs, so that keeping a file is a rename."""
+        return self.data_dir.absolute() / "scratch"

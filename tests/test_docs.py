@@ -7,6 +7,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from pydantic_core import PydanticUndefined
 from rq.exceptions import AbandonedJobError
 from rq.timeouts import JobTimeoutException
 
@@ -26,7 +27,7 @@ def settings_table() -> str:
     """What README.md says of the settings, row by row."""
     rows = ["| variable | default | what it is |", "| --- | --- | --- |"]
     for name, field in Settings.model_fields.items():
-        default = "" if field.default is None else f"`{field.default}`"
+        default = "" if field.default in (None, PydanticUndefined) else f"`{field.default}`"
         rows.append(f"| `SPICD_{name.upper()}` | {default} | {field.description} |")
     return "\n".join(rows)
 

@@ -131,6 +131,25 @@ def test_a_second_one_on_the_same_folder_is_refused_in_one_line(launched: Launch
         up(settings, on_ready=lambda running: None)
 
 
+def test_a_start_sweeps_the_scratch_of_killed_steps_and_not_under_a_running_service(
+    launched: Launched, tmp_path: Path
+) -> None:
+    step = tmp_path / "data" / "scratch" / "spicd-step-1"
+    step.mkdir(parents=True)
+    (step / "cloud.ply").touch()
+    settings = Settings(data_dir=tmp_path / "data", port=0, geometry_workers=0, inference_workers=0)
+    with pytest.raises(LaunchFailed):  # the folder is in use
+        up(settings, on_ready=lambda running: None)
+    assert step.exists()
+    launched.process.terminate()
+    launched.process.wait(20)
+    (tmp_path / "ready.json").unlink()
+    again = Launched(tmp_path, workers=0)
+    again.process.kill()
+    again.process.wait()
+    assert not step.exists()
+
+
 def test_a_dead_redis_is_started_again_with_what_it_held(launched: Launched) -> None:
     client = Redis.from_url(launched.ready["redis_url"])
     client.set("kept", "yes")
