@@ -17,6 +17,7 @@ from service.api.incoming import sweep
 from service.api.metrics import Metrics, MetricsMiddleware
 from service.api.schema import describe
 from service.api.services import Queue, Services
+from service.api.submission import resubmit
 from service.catalog.catalog import open_catalog
 from service.queue import JobQueue
 from service.settings import Settings
@@ -65,6 +66,7 @@ def _lifespan(settings: Settings, queue: Queue | None) -> Any:
         app.state.services = Services(
             settings=settings, catalog=catalog, queue=used, cards=Cards(settings.model_store)
         )
+        await run_in_threadpool(resubmit, app.state.services)
         try:
             yield
         finally:

@@ -62,6 +62,19 @@ def submit(services: Services, job: JobRecord, *, forget: Callable[[], None]) ->
         raise
 
 
+def resubmit(services: Services) -> None:
+    """Hand over what was recorded and perhaps never submitted, for a process died between the two or Redis lost it.
+
+    A job that is in the queue is left as it is. One that runs is not touched: whether its step is still at work, its
+    worker knows.
+    """
+    try:
+        for job in services.catalog.jobs.accepted():
+            services.queue.submit(job.job_id, job.kind)
+    except QueueUnavailable as error:
+        log.warning("jobs that wait could not be submitted again: %s", error)
+
+
 def dismiss(services: Services, job_id: str) -> JobRecord:
     """Dismiss a job for good, then tell the workers. Raises NotFound and Conflict.
 

@@ -56,6 +56,13 @@ class Jobs:
         with self._database.read() as session:
             return tuple(job_record(row) for row in session.scalars(query))
 
+    def accepted(self) -> tuple[JobRecord, ...]:
+        """The jobs that no step has begun, in the order they were asked for."""
+        query = select(tables.Job).where(tables.Job.status == "accepted")
+        with self._database.read() as session:
+            rows = session.scalars(query.order_by(tables.Job.created, tables.Job.id))
+            return tuple(job_record(row) for row in rows)
+
     def counts(self) -> dict[str, int]:
         """How many jobs are in each state; states without a job are left out."""
         query = select(tables.Job.status, func.count()).group_by(tables.Job.status)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from samples import add_map, add_survey
+from samples import RememberingQueue, add_map, add_survey, catalog_of, running
 
 from service.catalog.records import Problem
 
@@ -92,3 +92,21 @@ def test_jobs_are_listed_by_state_and_map(client, catalog):
         ({"map_id": "hall", "status": "failed"}, []),
     ):
         assert [job["jobID"] for job in client.get("/jobs", params=asked).json()["jobs"]] == ids
+
+
+def test_a_start_submits_again_what_waits_and_nothing_else(settings):
+    with running(settings, RememberingQueue()) as client:
+        catalog = catalog_of(client)
+        first, begun, third = (add_map(catalog, name, ready=False) for name in ("a", "b", "c"))
+        catalog.jobs.start(begun)
+        add_map(catalog, "done")
+    queue = RememberingQueue()
+    with running(settings, queue):
+        assert queue.submitted == [(first, "map"), (third, "map")]
+
+
+def test_a_start_without_a_queue_serves_all_the_same(settings):
+    with running(settings, RememberingQueue()) as client:
+        add_map(catalog_of(client), ready=False)
+    with running(settings, RememberingQueue(down=True)) as client:
+        assert client.get("/jobs").json()["jobs"][0]["status"] == "accepted"
