@@ -61,8 +61,8 @@ class WorkerPool:
     def check(self) -> None:
         """Bury the dead and start those that are due again; call a few times a second."""
         for worker in self.workers:
-            if worker.process is not None and worker.process.poll() is not None:
-                self._bury(worker)
+            if worker.process is not None and (status := worker.process.poll()) is not None:
+                self._bury(worker, status)
             if worker.process is None and time.monotonic() >= worker.due:
                 self._start(worker)
 
@@ -96,8 +96,7 @@ class WorkerPool:
         )
         worker.started = time.monotonic()
 
-    def _bury(self, worker: WorkerProcess) -> None:
-        assert worker.process is not None
+    def _bury(self, worker: WorkerProcess, status: int) -> None:
         lived = time.monotonic() - worker.started
         worker.deaths = 0 if lived > _HEALTHY_S else worker.deaths + 1
         wait = min(2.0**worker.deaths - 1, _LONGEST_WAIT_S)
@@ -105,7 +104,7 @@ class WorkerPool:
             "the %s worker %d ended with %s after %.0f s; starting another in %.0f s",
             worker.queue,
             worker.pid,
-            worker.process.returncode,
+            status,
             lived,
             wait,
         )

@@ -76,6 +76,14 @@ def test_every_requirement_is_pinned_to_a_version_that_it_admits() -> None:
     assert {name for name, each in wanted.items() if not each.specifier.contains(pinned[name])} == set()
 
 
+def test_the_files_that_a_package_brings_beside_its_modules_are_there() -> None:
+    brought = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["package-data"]
+    assert set(brought) == {"service", "worker"}
+    for package, patterns in brought.items():
+        for pattern in patterns:
+            assert list((ROOT / package.replace(".", "/")).glob(pattern)), f"{package}: {pattern}"
+
+
 def test_pins_are_plain_versions_of_the_public_releases() -> None:
     lines = (ROOT / "docker/constraints.txt").read_text().splitlines()
     odd = [line for line in lines if not re.fullmatch(r"#.*|[\w.-]+==\d[\w.]*", line)]

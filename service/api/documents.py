@@ -65,7 +65,7 @@ class MapDocument(Document):
     settings: dict[str, Any]
     scans: tuple[ScanOutcome, ...]
     bounds: Bounds | None = Field(description="metres, map frame")
-    counts: dict[str, int] = Field(examples=[{"points": 181342, "tiles": 172, "skipped_tiles": 192}])
+    counts: dict[str, int] = Field(examples=[{"points": 181342, "tiles": 172, "scans": 25, "accepted": 24}])
     job_id: str
     problem: ProblemDocument | None
     created: datetime
@@ -101,7 +101,7 @@ class JobDocument(Document):
     processID: Literal["map", "survey"]  # noqa: N815 - the standard's name
     type: Literal["process"] = "process"
     status: JobStatus
-    message: str = Field(description="the stage", examples=["registration"])
+    message: str = Field(description="the stage", examples=["registering"])
     progress: int = Field(ge=0, le=100, examples=[40])
     created: datetime
     started: datetime | None

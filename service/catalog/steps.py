@@ -17,7 +17,7 @@ JobKind = Literal["map", "survey"]
 class Step:
     """One function call of a job."""
 
-    name: str  #: unique within the job; the rq id is "{job_id}.{name}"
+    name: str  #: unique within the job; the rq id is "{job_id}-{name}"
     function: str  #: dotted name, called with the job's id
     queue: Queue  #: geometry forks a process for each step, inference keeps the network warm
 
