@@ -101,8 +101,9 @@ def delete_map(services: Provided, map_id: MapId) -> None:
 )
 def get_manifest(services: Provided, map_id: MapId) -> Response:
     """Tile size, bounds, and every tile that is kept."""
-    services.catalog.maps.ready(map_id)
-    return blob_response(services.catalog.blobs, keys.map_manifest(map_id), media_type="application/json")
+    found = services.catalog.maps.ready(map_id)
+    key = keys.map_manifest(found.job_id)
+    return blob_response(services.catalog.blobs, key, media_type="application/json")
 
 
 @router.get(
@@ -116,9 +117,9 @@ def get_manifest(services: Provided, map_id: MapId) -> Response:
 )
 def get_map_cloud(services: Provided, map_id: MapId) -> Response:
     """The fused reference map, in metres."""
-    services.catalog.maps.ready(map_id)
+    found = services.catalog.maps.ready(map_id)
     return blob_response(
-        services.catalog.blobs, keys.map_cloud(map_id), media_type=bodies.RAW, filename=f"{map_id}.ply"
+        services.catalog.blobs, keys.map_cloud(found.job_id), media_type=bodies.RAW, filename=f"{map_id}.ply"
     )
 
 

@@ -31,39 +31,43 @@ def probe(token: str) -> str:
     return f"health/{token}"
 
 
-def map_folder(map_id: str) -> str:
-    """The prefix of everything kept for a map."""
-    return f"maps/{map_id}/"
+def map_folder(job_id: str) -> str:
+    """The prefix of everything kept for a map.
+
+    `job_id` is that of the job that builds it, and not the map's own id, which a client may give again once the map is
+    deleted: a step of the old job that comes late must not write among the files of the new map.
+    """
+    return f"maps/{job_id}/"
 
 
-def map_cloud(map_id: str) -> str:
+def map_cloud(job_id: str) -> str:
     """The fused reference map, PLY."""
-    return map_folder(map_id) + "cloud.ply"
+    return map_folder(job_id) + "cloud.ply"
 
 
-def map_reference(map_id: str) -> str:
+def map_reference(job_id: str) -> str:
     """What surveys are registered to: points and normals of the reference map."""
-    return map_folder(map_id) + "reference.npz"
+    return map_folder(job_id) + "reference.npz"
 
 
-def map_tiles(map_id: str) -> str:
+def map_tiles(job_id: str) -> str:
     """The dense points of the map's tiles."""
-    return map_folder(map_id) + "tiles.npz"
+    return map_folder(job_id) + "tiles.npz"
 
 
-def map_description(map_id: str, model: str) -> str:
+def map_description(job_id: str, model: str) -> str:
     """What one model computed of the reference alone; `model` is `name/version`."""
-    return f"{map_folder(map_id)}description-{safe_name(model.replace('/', '-'))}.npz"
+    return f"{map_folder(job_id)}description-{safe_name(model.replace('/', '-'))}.npz"
 
 
-def map_manifest(map_id: str) -> str:
+def map_manifest(job_id: str) -> str:
     """The tile manifest (paper, Table A1), JSON."""
-    return map_folder(map_id) + "manifest.json"
+    return map_folder(job_id) + "manifest.json"
 
 
-def map_scan(map_id: str, scan_id: str) -> str:
+def map_scan(job_id: str, scan_id: str) -> str:
     """The points, pose and sensor origin of one accepted scan of the map."""
-    return f"{map_folder(map_id)}scans/{scan_id}.npz"
+    return f"{map_folder(job_id)}scans/{scan_id}.npz"
 
 
 def survey_folder(survey_id: str) -> str:

@@ -92,10 +92,15 @@ class Maps:
         with self._database.read() as session:
             return page_of([_record(row, problem) for row, problem in session.execute(query)], limit)
 
-    def save_outcomes(self, map_id: str, outcomes: Iterable[ScanOutcome]) -> None:
-        """Record what became of the scans, also when the map then fails. Raises NotFound."""
+    def save_outcomes(
+        self, map_id: str, outcomes: Iterable[ScanOutcome], *, job_id: str | None = None
+    ) -> None:
+        """Record what became of the scans, also when the map then fails.
+
+        Raises NotFound, also where another job than `job_id` builds the map of this id by now.
+        """
         with self._database.write() as session:
-            row = _row(session, map_id)
+            row = _row(session, map_id, job_id)
             write_outcomes(row.scans, outcomes)
             row.updated = now()
 
@@ -106,10 +111,14 @@ class Maps:
         outcomes: Iterable[ScanOutcome],
         bounds: Bounds,
         counts: Mapping[str, int],
+        job_id: str | None = None,
     ) -> None:
-        """Record the built map, replacing an earlier run's result; `jobs.succeed` makes it ready. Raises NotFound."""
+        """Record the built map, replacing an earlier run's result; `jobs.succeed` makes it ready.
+
+        Raises NotFound, also where another job than `job_id` builds the map of this id by now.
+        """
         with self._database.write() as session:
-            row = _row(session, map_id)
+            row = _row(session, map_id, job_id)
             write_outcomes(row.scans, outcomes)
             row.bounds = bounds.model_dump(mode="json")
             row.counts = dict(counts)
@@ -120,15 +129,16 @@ class Maps:
         with self._database.write() as session:
             row = _row(session, map_id)
             surveys = session.scalars(select(tables.Survey.id).where(tables.Survey.map_id == map_id)).all()
+            built_by = row.job_id
             session.delete(row)
-        self._blobs.delete_prefix(keys.map_folder(map_id))
+        self._blobs.delete_prefix(keys.map_folder(built_by))
         for survey_id in surveys:
             self._blobs.delete_prefix(keys.survey_folder(survey_id))
 
 
-def _row(session: Session, map_id: str) -> tables.Map:
+def _row(session: Session, map_id: str, job_id: str | None = None) -> tables.Map:
     row = session.get(tables.Map, map_id)
-    if row is None:
+    if row is None or job_id not in (None, row.job_id):
         raise NotFound(f"no map {map_id!r}; GET /maps lists those there are")
     return row
 

@@ -251,14 +251,14 @@ def test_a_map_is_ready_with_its_counts_scans_and_files(house: House) -> None:
     for outcome, scan in zip(found.scans, house.material.before, strict=True):
         assert outcome.accepted
         assert difference(np.array(outcome.map_from_scan), scan.world_from_sensor)[0] < 0.015
-        assert house.catalog.blobs.exists(keys.map_scan(MAP, outcome.scan_id))
-    with house.catalog.blobs.local(keys.map_cloud(MAP)) as path:
+        assert house.catalog.blobs.exists(keys.map_scan(house.catalog.maps.get(MAP).job_id, outcome.scan_id))
+    with house.catalog.blobs.local(keys.map_cloud(house.catalog.maps.get(MAP).job_id)) as path:
         assert len(read_scan(path).points) == found.counts["points"]
-    listing = json.loads(house.catalog.blobs.get_bytes(keys.map_manifest(MAP)))
+    listing = json.loads(house.catalog.blobs.get_bytes(keys.map_manifest(house.catalog.maps.get(MAP).job_id)))
     assert listing["n_valid_patches"] == found.counts["tiles"]
     assert found.bounds is not None
     assert found.bounds.max == pytest.approx(listing["map_bounds"]["max"])
-    assert house.catalog.blobs.exists(keys.map_description(MAP, MODEL))
+    assert house.catalog.blobs.exists(keys.map_description(house.catalog.maps.get(MAP).job_id, MODEL))
 
 
 def test_a_survey_is_ready_with_a_state_for_every_tile_of_the_map(house: House) -> None:
@@ -299,7 +299,7 @@ def test_a_threshold_of_0_finds_every_observed_tile_changed(house: House) -> Non
 def test_a_model_that_cuts_alike_scores_a_map_that_was_described_for_another(house: House) -> None:
     ours, theirs = (house.tiles(house.survey(job).survey_id) for job in house.done)
     assert house.survey(house.done[1]).model == SAME_CUT
-    assert not house.catalog.blobs.exists(keys.map_description(MAP, SAME_CUT))
+    assert not house.catalog.blobs.exists(keys.map_description(house.catalog.maps.get(MAP).job_id, SAME_CUT))
     assert len(ours) == len(theirs)
     for one, two in zip(ours, theirs, strict=True):  # the same weights under another name
         assert one["score"] == pytest.approx(two["score"], abs=1e-4)
@@ -349,11 +349,11 @@ def test_each_step_of_a_map_may_run_twice(house: House) -> None:
     files = house.files()
     run(job, "describe")
     assert house.files() == files
-    made = {name.removeprefix("maps/again/"): found for name, found in files.items() if "maps/again/" in name}
-    first = {
-        name.removeprefix(f"maps/{MAP}/"): found for name, found in files.items() if f"maps/{MAP}/" in name
-    }
-    assert made == first  # the same scans give the same map, to the byte
+    made, first = (
+        {name.removeprefix(folder): found for name, found in files.items() if name.startswith(folder)}
+        for folder in (keys.map_folder(house.catalog.maps.get(name).job_id) for name in ("again", MAP))
+    )
+    assert made == first != {}  # the same scans give the same map, to the byte
 
 
 def test_a_finished_job_is_left_alone(house: House) -> None:

@@ -101,9 +101,9 @@ def test_a_taken_id_keeps_no_new_file_and_leaves_the_known_ones(client, catalog)
 
 
 def test_a_ready_map_shows_what_it_is_and_its_files(client, catalog):
-    add_map(catalog)
-    catalog.blobs.put_bytes(keys.map_manifest("lobby"), b'{"n_valid_patches": 4}')
-    catalog.blobs.put_bytes(keys.map_cloud("lobby"), b"ply\n0123456789")
+    job_id = add_map(catalog)
+    catalog.blobs.put_bytes(keys.map_manifest(job_id), b'{"n_valid_patches": 4}')
+    catalog.blobs.put_bytes(keys.map_cloud(job_id), b"ply\n0123456789")
     found = client.get("/maps/lobby").json()
     assert (found["status"], found["counts"]) == ("ready", {"tiles": 4})
     assert found["bounds"] == {"min": [0, 0, 0], "max": [3, 3, 1]}

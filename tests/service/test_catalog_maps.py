@@ -152,10 +152,10 @@ def test_of_two_uploads_of_the_same_bytes_at_once_one_file_is_kept(catalog, monk
 
 
 def test_a_deleted_map_takes_its_surveys_jobs_and_blobs_and_leaves_its_scans(catalog):
-    add_map(catalog)
+    built_by = add_map(catalog)
     add_map(catalog, "hall")
     survey_id, job_id = add_survey(catalog, [tile(0, 0)])
-    catalog.blobs.put_bytes(keys.map_cloud("lobby"), b"ply")
+    catalog.blobs.put_bytes(keys.map_cloud(built_by), b"ply")
     catalog.blobs.put_bytes(keys.survey_cloud(survey_id), b"ply")
     catalog.maps.delete("lobby")
     for ask, key in (
@@ -166,10 +166,27 @@ def test_a_deleted_map_takes_its_surveys_jobs_and_blobs_and_leaves_its_scans(cat
         with pytest.raises(NotFound):
             ask(key)
     assert catalog.changes.of_survey(survey_id) == ()
-    assert not catalog.blobs.exists(keys.map_cloud("lobby"))
+    assert not catalog.blobs.exists(keys.map_cloud(built_by))
     assert not catalog.blobs.exists(keys.survey_cloud(survey_id))
     assert len(catalog.scans.page().items) == 3
     assert [found.map_id for found in catalog.maps.page().items] == ["hall"]
+
+
+def test_a_late_step_of_a_deleted_map_touches_nothing_of_the_map_that_took_its_id(catalog):
+    old = add_map(catalog, ready=False)
+    catalog.maps.delete("lobby")
+    new = add_map(catalog)
+    before = catalog.maps.get("lobby")
+    assert keys.map_folder(old) != keys.map_folder(new)
+    left_out = [ScanOutcome(scan_id=before.scans[0].scan_id, accepted=False, reason="late")]
+    with pytest.raises(NotFound):
+        catalog.maps.save_outcomes("lobby", left_out, job_id=old)
+    with pytest.raises(NotFound):
+        catalog.maps.save_result(
+            "lobby", outcomes=left_out, bounds=Bounds(min=(0, 0, 0), max=(9, 9, 9)), counts={}, job_id=old
+        )
+    assert not catalog.jobs.succeed(old)
+    assert catalog.maps.get("lobby") == before
 
 
 def test_the_same_bytes_from_the_same_device_are_one_scan(catalog):

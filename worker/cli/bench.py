@@ -10,6 +10,7 @@ from rich.console import Group
 from rich.table import Table
 
 from worker.cli import terminal
+from worker.detectors.card import MODEL_STORE
 
 
 def register(commands: typer.Typer) -> None:
@@ -24,7 +25,7 @@ def bench(
     model: Annotated[str, typer.Option(envvar="SPICD_MODEL", help="name/version")] = "spicd-net/1",
     model_store: Annotated[
         Path, typer.Option("--model-store", envvar="SPICD_MODEL_STORE", help="Folder of the models.")
-    ] = Path("model_store"),
+    ] = MODEL_STORE,
 ) -> None:
     """Seconds in each stage of a map and of a survey on a simulated corridor, and what the network costs."""
     # Not at the head of the file: torch and Open3D take seconds, which `--help` need not wait for.

@@ -10,6 +10,7 @@ from rich.console import Group
 from rich.table import Table
 
 from worker.cli import terminal
+from worker.detectors.card import MODEL_STORE
 
 MOST_ROWS = 20  #: changed tiles in the table; the file has all
 
@@ -31,7 +32,7 @@ def detect(
     model: Annotated[str, typer.Option(envvar="SPICD_MODEL", help="name/version")] = "spicd-net/1",
     model_store: Annotated[
         Path, typer.Option("--model-store", envvar="SPICD_MODEL_STORE", help="Folder of the models.")
-    ] = Path("model_store"),
+    ] = MODEL_STORE,
     threshold: Annotated[
         float | None, typer.Option(min=0, max=1, help="Probability of change; left out: the model's own.")
     ] = None,

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field
+
+#: The models that come with the code, wherever a command is typed.
+MODEL_STORE = Path(__file__).resolve().parents[2] / "model_store"
 
 
 class Preprocessing(BaseModel):

@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from worker.detectors.card import MODEL_STORE
 from worker.detectors.spicd_net.detector import SpicdNet
 from worker.detectors.store import open_detector
 from worker.evaluation.scenes import corridor
@@ -51,7 +52,7 @@ class BenchSettings:
     prior_error: tuple[float, float] = (0.1, 2.0)  #: sigma of the odometry, metres and degrees
     tiles: int = PAPER_TILES  #: that the network is timed on
     repeats: int = 3  #: of each way of running the network, in turn
-    model_store: Path = Path("model_store")
+    model_store: Path = MODEL_STORE
     model: str = "spicd-net/1"
 
 

@@ -29,25 +29,25 @@ def register_map(at: Context) -> None:
         built = build_map(files, settings=pipeline_settings(at, record, card), progress=at.report)
     at.report("saving", 0.0)
     outcomes = scan_outcomes(record.scans, built.outcomes)
-    at.catalog.maps.save_outcomes(record.map_id, outcomes)
+    at.catalog.maps.save_outcomes(record.map_id, outcomes, job_id=at.job.job_id)
     if not built.tiles.points:
         raise MapFailed(
             f"no tile holds {card.preprocessing.min_points} points of the fused map "
             f"({len(built.reference.points)} points in all); add scans"
         )
-    put(at, keys.map_reference(record.map_id), lambda path: archive.save_reference(path, built.reference))
+    put(at, keys.map_reference(at.job.job_id), lambda path: archive.save_reference(path, built.reference))
     patches = padded_patches(built.tiles, size=card.preprocessing.patch_points, seed=card.preprocessing.seed)
     put(
         at,
-        keys.map_tiles(record.map_id),
+        keys.map_tiles(at.job.job_id),
         lambda path: archive.save_tiles(path, built.tiles, patches=patches),
     )
     put(
         at,
-        keys.map_cloud(record.map_id),
+        keys.map_cloud(at.job.job_id),
         lambda path: write_ply(path, built.reference.points, colors=built.reference.colors),
     )
-    save_scans(at, record.scans, built.outcomes, functools.partial(keys.map_scan, record.map_id))
+    save_scans(at, record.scans, built.outcomes, functools.partial(keys.map_scan, at.job.job_id))
     listing = manifest(
         built.reference.points,
         built.tiles,
@@ -55,9 +55,10 @@ def register_map(at: Context) -> None:
         min_points=card.preprocessing.min_points,
         voxel_size=card.preprocessing.voxel_size,
     )
-    at.catalog.blobs.put_bytes(keys.map_manifest(record.map_id), json.dumps(listing).encode())
+    at.catalog.blobs.put_bytes(keys.map_manifest(at.job.job_id), json.dumps(listing).encode())
     at.catalog.maps.save_result(
         record.map_id,
+        job_id=at.job.job_id,
         outcomes=outcomes,
         bounds=Bounds.model_validate(listing["map_bounds"]),
         counts={
@@ -74,9 +75,9 @@ def describe_map(at: Context) -> None:
     """What the model can know of the reference alone; then the map is ready."""
     record = at.catalog.maps.get(at.job.map_id)
     detector = kept_detector(at.settings, record.model)
-    with at.catalog.blobs.local(keys.map_tiles(record.map_id)) as path:
+    with at.catalog.blobs.local(keys.map_tiles(at.job.job_id)) as path:
         tiles = archive.load_tiles(path)
     description = detector.describe(tiles, progress=lambda _, share: at.report("describing", share))
-    key = keys.map_description(record.map_id, record.model)
+    key = keys.map_description(at.job.job_id, record.model)
     put(at, key, lambda path: archive.save_arrays(path, description))
     at.catalog.jobs.succeed(at.job.job_id)

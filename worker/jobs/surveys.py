@@ -29,9 +29,9 @@ def register_survey(at: Context) -> None:
     with ExitStack() as stack:
         blobs = at.catalog.blobs
         reference = archive.load_reference(
-            stack.enter_context(blobs.local(keys.map_reference(record.map_id)))
+            stack.enter_context(blobs.local(keys.map_reference(record.job_id)))
         )
-        tiles = archive.load_tiles(stack.enter_context(blobs.local(keys.map_tiles(record.map_id))))
+        tiles = archive.load_tiles(stack.enter_context(blobs.local(keys.map_tiles(record.job_id))))
         files = scan_files(at, survey.scans, stack)
         settings = pipeline_settings(at, record, card)
         try:
@@ -56,7 +56,7 @@ def score_survey(at: Context) -> None:
     with blobs.local(keys.survey_pairs(survey_id)) as path:
         pairs = archive.load_pairs(path)
     description = None
-    key = keys.map_description(survey.map_id, survey.model)
+    key = keys.map_description(at.catalog.maps.get(survey.map_id).job_id, survey.model)
     if blobs.exists(key):
         with blobs.local(key) as path:
             description = archive.load_arrays(path)
@@ -83,7 +83,8 @@ def export_survey(at: Context) -> None:
         pairs = archive.load_pairs(local(keys.survey_pairs(survey_id)))
         scores = archive.load_scores(local(keys.survey_scores(survey_id)))
         current = archive.load_current(local(keys.survey_current(survey_id)))
-        reference = archive.load_reference(local(keys.map_reference(survey.map_id)))
+        built_by = at.catalog.maps.get(survey.map_id).job_id
+        reference = archive.load_reference(local(keys.map_reference(built_by)))
     card = open_card(at.settings.model_store, survey.model)
     threshold = card.threshold if survey.threshold is None else survey.threshold
     changes = decide(pairs, scores, threshold=threshold)
