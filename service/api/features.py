@@ -130,7 +130,7 @@ def feature(change: ChangeRecord) -> TileFeature:
         properties=TileProperties(
             tile_id=tile.tile_id,
             tile_index=tile.tile_index,
-            center=((x0 + x1) / 2, (y0 + y1) / 2, (z0 + z1) / 2),
+            center=(round((x0 + x1) / 2, 6), round((y0 + y1) / 2, 6), round((z0 + z1) / 2, 6)),
             state=tile.state,
             score=tile.score,
             probabilities=tile.probabilities,

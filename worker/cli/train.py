@@ -42,6 +42,12 @@ def train(
     density: Annotated[
         tuple[float, float] | None, typer.Option(help="Least and largest share of points that changes take.")
     ] = None,
+    start_from: Annotated[
+        Path | None, typer.Option("--start-from", help="Checkpoint whose network is trained on.")
+    ] = None,
+    learning_rate: Annotated[
+        float | None, typer.Option("--learning-rate", min=0, help="To begin with.")
+    ] = None,
     device: Annotated[Literal["auto", "cpu", "cuda"], typer.Option(envvar="SPICD_DEVICE")] = "auto",
     threads: Annotated[int | None, typer.Option(min=1, help="Of the CPU.")] = None,
 ) -> None:
@@ -66,6 +72,8 @@ def train(
             train_pairs=train_pairs,
             validation_pairs=validation_pairs,
             batch=batch,
+            learning_rate=learning_rate,
+            start_from=None if start_from is None else str(start_from),
         ),
     )
     tiles = tiles or folder / "tiles.npz"

@@ -59,7 +59,7 @@ def _feature(tile: TileResult, shared: dict[str, Any]) -> dict[str, Any]:
         "properties": {
             "tile_id": tile.tile_id,
             "tile_index": list(tile.tile_index),
-            "center": [(x0 + x1) / 2, (y0 + y1) / 2, (z0 + z1) / 2],
+            "center": [round((x0 + x1) / 2, 6), round((y0 + y1) / 2, 6), round((z0 + z1) / 2, 6)],
             "state": tile.state,
             "score": tile.score,
             "probabilities": None if tile.probabilities is None else list(tile.probabilities),

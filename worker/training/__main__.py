@@ -31,6 +31,8 @@ def main() -> None:
     parser.add_argument(
         "--density", type=float, nargs=2, default=default.pairs.density, metavar=("LOW", "HIGH")
     )
+    parser.add_argument("--start-from", help="checkpoint whose network is trained on")
+    parser.add_argument("--learning-rate", type=float, default=default.learning_rate, help="to begin with")
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     parser.add_argument("--threads", type=int, help="of the CPU")
     given = parser.parse_args()
@@ -43,6 +45,8 @@ def main() -> None:
         train_pairs=given.train_pairs,
         validation_pairs=given.validation_pairs,
         batch=given.batch,
+        start_from=given.start_from,
+        learning_rate=given.learning_rate,
         device=given.device,
         coarse_search=given.device == "cpu",
         pairs=PairSettings(revisit_share=given.revisit_share, density=(given.density[0], given.density[1])),

@@ -42,6 +42,7 @@ class TrainSettings:
     weight_decay: float = 1e-4
     held_out: float = 0.1  #: share of the tiles
     seed: int = 42
+    start_from: str | None = None  #: checkpoint whose network is trained on, with a fresh optimiser
     device: str = "cpu"
     coarse_search: bool = (
         True  #: bfloat16 where max-pooling looks for its winners; a third less time on the CPU
@@ -111,7 +112,11 @@ class Run:
             fused=True,
         )
         self._makers = PairMaker(training, settings.pairs), PairMaker(validation, settings.pairs)
-        self._settle()
+        if settings.start_from is None:
+            self._settle()
+        else:
+            start = torch.load(settings.start_from, map_location=self._device, weights_only=True)
+            self._network.load_state_dict(start["network"])
         self._epochs = 0
         self._seconds = 0.0
         self._best = (-1.0, -1.0)

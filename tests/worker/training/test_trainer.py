@@ -75,6 +75,21 @@ def test_other_settings_do_not_take_up_a_checkpoint(dataset, tmp_path):
         train(replace(quick, seed=1), dataset, tmp_path)
 
 
+def test_a_training_may_start_from_another_ones_network(trained, dataset, tmp_path):
+    still = replace(
+        TINY,
+        epochs=1,
+        train_pairs=8,
+        validation_pairs=8,
+        learning_rate=0.0,
+        final_learning_rate=0.0,
+        start_from=str(trained),
+    )
+    before = torch.load(trained, weights_only=True)["network"]
+    after = torch.load(train(still, dataset, tmp_path), weights_only=True)["network"]
+    assert torch.equal(after["head.classifier.0.weight"], before["head.classifier.0.weight"])
+
+
 def test_a_run_without_progress_in_accuracy_ends_early(dataset, tmp_path):
     frozen = replace(
         TINY,
