@@ -8,15 +8,17 @@ from contextlib import ExitStack
 
 from service.catalog import keys
 from service.catalog.records import Bounds
+from worker.detectors.card import Preprocessing
 from worker.detectors.store import open_card
 from worker.errors import MapFailed
 from worker.jobs.models import kept_detector, pipeline_settings
 from worker.jobs.scans import save_scans, scan_files, scan_outcomes
 from worker.jobs.step import Context, put, step
 from worker.pipeline import archive
-from worker.pipeline.flow import build_map
+from worker.pipeline.flow import BuiltMap, build_map
 from worker.pipeline.manifest import manifest, padded_patches
 from worker.pipeline.ply import write_ply
+from worker.pipeline.values import Points
 
 
 @step
@@ -35,32 +37,13 @@ def register_map(at: Context) -> None:
             f"no tile holds {card.preprocessing.min_points} points of the fused map "
             f"({len(built.reference.points)} points in all); add scans"
         )
-    put(at, keys.map_reference(at.job.job_id), lambda path: archive.save_reference(path, built.reference))
-    patches = padded_patches(built.tiles, size=card.preprocessing.patch_points, seed=card.preprocessing.seed)
-    put(
-        at,
-        keys.map_tiles(at.job.job_id),
-        lambda path: archive.save_tiles(path, built.tiles, patches=patches),
-    )
-    put(
-        at,
-        keys.map_cloud(at.job.job_id),
-        lambda path: write_ply(path, built.reference.points, colors=built.reference.colors),
-    )
     save_scans(at, record.scans, built.outcomes, functools.partial(keys.map_scan, at.job.job_id))
-    listing = manifest(
-        built.reference.points,
-        built.tiles,
-        patch_size=card.preprocessing.patch_points,
-        min_points=card.preprocessing.min_points,
-        voxel_size=card.preprocessing.voxel_size,
-    )
-    at.catalog.blobs.put_bytes(keys.map_manifest(at.job.job_id), json.dumps(listing).encode())
+    _put_map(at, built, card.preprocessing)
     at.catalog.maps.save_result(
         record.map_id,
         job_id=at.job.job_id,
         outcomes=outcomes,
-        bounds=Bounds.model_validate(listing["map_bounds"]),
+        bounds=_bounds(built.reference.points),
         counts={
             "points": len(built.reference.points),
             "tiles": len(built.tiles.points),
@@ -81,3 +64,24 @@ def describe_map(at: Context) -> None:
     key = keys.map_description(at.job.job_id, record.model)
     put(at, key, lambda path: archive.save_arrays(path, description))
     at.catalog.jobs.succeed(at.job.job_id)
+
+
+def _put_map(at: Context, built: BuiltMap, needs: Preprocessing) -> None:
+    """The map's files: cloud, reference, tiles with their patches, manifest."""
+    job_id, reference, tiles = at.job.job_id, built.reference, built.tiles
+    patches = padded_patches(tiles, size=needs.patch_points, seed=needs.seed)
+    put(at, keys.map_reference(job_id), lambda path: archive.save_reference(path, reference))
+    put(at, keys.map_tiles(job_id), lambda path: archive.save_tiles(path, tiles, patches=patches))
+    put(at, keys.map_cloud(job_id), lambda path: write_ply(path, reference.points, colors=reference.colors))
+    listing = manifest(
+        reference.points,
+        tiles,
+        patch_size=needs.patch_points,
+        min_points=needs.min_points,
+        voxel_size=needs.voxel_size,
+    )
+    at.catalog.blobs.put_bytes(keys.map_manifest(job_id), json.dumps(listing).encode())
+
+
+def _bounds(points: Points) -> Bounds:
+    return Bounds(min=tuple(points.min(axis=0).tolist()), max=tuple(points.max(axis=0).tolist()))

@@ -20,17 +20,17 @@ log = logging.getLogger("worker.jobs")
 
 #: The part of the whole job that each stage takes, about as `make bench` measures it.
 MAP_STAGES = {
-    "registering": (0.0, 0.7),
-    "tiling": (0.7, 0.75),
-    "saving": (0.75, 0.8),
-    "describing": (0.8, 1.0),
+    "registering": (0.0, 0.85),
+    "tiling": (0.85, 0.88),
+    "saving": (0.88, 0.9),
+    "describing": (0.9, 1.0),
 }
 SURVEY_STAGES = {
-    "registering": (0.0, 0.3),
-    "tiling": (0.3, 0.33),
-    "saving": (0.33, 0.36),
-    "scoring": (0.36, 0.85),
-    "exporting": (0.85, 1.0),
+    "registering": (0.0, 0.5),
+    "tiling": (0.5, 0.52),
+    "saving": (0.52, 0.55),
+    "scoring": (0.55, 0.8),
+    "exporting": (0.8, 1.0),
 }
 
 
