@@ -15,7 +15,6 @@ from worker.training.pairs import PairSettings, altered
 #: Share of changed tiles that the threshold is chosen for; the paper's experiments change about 24 of 172.
 PREVALENCE = 0.15
 SWEEP = np.round(np.arange(0.02, 0.99, 0.01), 2)
-SLACK = 0.05  # of the highest F1
 UNCHANGED = "unchanged"
 
 
@@ -65,15 +64,10 @@ def survey_pairs(tiles: TileSet, settings: PairSettings, *, seed: int) -> Survey
 
 
 def best_threshold(scores: NDArray[np.float32], pairs: SurveyPairs) -> Operating:
-    """The threshold with the fewest false alarms of those whose F1 is within `SLACK` of the highest.
-
-    F1 alone is flat near its top (paper, Figure 5), and every false alarm costs somebody a walk.
-    """
+    """The threshold with the highest F1; the middle one of equals."""
     found = [operating(float(threshold), scores, pairs) for threshold in SWEEP]
     best = max(point.f1 for point in found)
-    as_good = [point for point in found if point.f1 >= (1 - SLACK) * best]
-    fewest = min(point.false_positive_rate for point in as_good)
-    equals = [point for point in as_good if point.false_positive_rate == fewest]
+    equals = [point for point in found if point.f1 >= best - 1e-9]
     return equals[len(equals) // 2]
 
 
