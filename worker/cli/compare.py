@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 from worker.detectors.detector import Detector
-from worker.errors import MapFailed
 from worker.pipeline.chaining import Outcome, ScanFile
 from worker.pipeline.changes import ChangeSet
 from worker.pipeline.export import tile_results, write_coloured_cloud
@@ -50,11 +49,6 @@ def compare(
     )
     on_map, on_survey = _titled("map", progress), _titled("survey", progress)
     built = build_map(earlier, settings=settings, progress=on_map)
-    if not built.tiles.points:
-        raise MapFailed(
-            f"no tile holds {settings.tiling.min_points} points of the reference "
-            f"({len(built.reference.points)} points in all); add scans with --reference"
-        )
     located = locate_survey(later, built.reference, built.tiles, settings=settings, progress=on_survey)
     changes = detect(located.pairs, detector, threshold=threshold, progress=on_survey)
     return Comparison(built=built, located=located, changes=changes)

@@ -10,12 +10,11 @@ from service.catalog import keys
 from service.catalog.records import Bounds
 from worker.detectors.card import Preprocessing
 from worker.detectors.store import open_card
-from worker.errors import MapFailed
 from worker.jobs.models import kept_detector, pipeline_settings
 from worker.jobs.scans import save_scans, scan_files, scan_outcomes
 from worker.jobs.step import Context, put, step
 from worker.pipeline import archive
-from worker.pipeline.flow import BuiltMap, build_map
+from worker.pipeline.flow import BuiltMap, NothingToTile, build_map
 from worker.pipeline.manifest import manifest, padded_patches
 from worker.pipeline.ply import write_ply
 from worker.pipeline.values import Points
@@ -28,15 +27,14 @@ def register_map(at: Context) -> None:
     card = open_card(at.settings.model_store, record.model)
     with ExitStack() as stack:
         files = scan_files(at, record.scans, stack)
-        built = build_map(files, settings=pipeline_settings(at, record, card), progress=at.report)
+        try:
+            built = build_map(files, settings=pipeline_settings(at, record, card), progress=at.report)
+        except NothingToTile as error:
+            outcomes = scan_outcomes(record.scans, error.outcomes)
+            at.catalog.maps.save_outcomes(record.map_id, outcomes, job_id=at.job.job_id)
+            raise
     at.report("saving", 0.0)
     outcomes = scan_outcomes(record.scans, built.outcomes)
-    at.catalog.maps.save_outcomes(record.map_id, outcomes, job_id=at.job.job_id)
-    if not built.tiles.points:
-        raise MapFailed(
-            f"no tile holds {card.preprocessing.min_points} points of the fused map "
-            f"({len(built.reference.points)} points in all); add scans"
-        )
     save_scans(at, record.scans, built.outcomes, functools.partial(keys.map_scan, at.job.job_id))
     _put_map(at, built, card.preprocessing)
     at.catalog.maps.save_result(

@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from worker.detectors.card import Preprocessing
 from worker.detectors.detector import Detector
-from worker.errors import RegistrationFailed
+from worker.errors import MapFailed, RegistrationFailed
 from worker.pipeline.chaining import Outcome, ScanFile, chain, place
 from worker.pipeline.changes import ChangeSet, decide
 from worker.pipeline.mapping import CurrentMap, ReferenceMap, current_map, reference_map
@@ -67,12 +67,22 @@ class NoScanAccepted(RegistrationFailed):
         super().__init__(f"no scan could be registered to the map: {reasons}")
 
 
+class NothingToTile(MapFailed):
+    """The fused map is too thin for a single tile; `outcomes` says what became of each scan."""
+
+    def __init__(self, outcomes: Sequence[Outcome], *, points: int, min_points: int) -> None:
+        self.outcomes = tuple(outcomes)
+        super().__init__(
+            f"no tile holds {min_points} points of the fused map ({points} points in all); add scans"
+        )
+
+
 def build_map(
     files: Sequence[ScanFile], *, settings: PipelineSettings, progress: Progress = silent
 ) -> BuiltMap:
     """Stage 1: place the scans in one frame, fuse them, cut the map into tiles.
 
-    Raises ScanError for a file that cannot be read, MapFailed where nothing can be tiled.
+    Raises ScanError for a file that cannot be read, MapFailed where no scan holds a pose, and NothingToTile.
     """
     outcomes, fused = chain(
         files, settings=settings.registration, max_points=settings.max_scan_points, progress=progress
@@ -81,6 +91,8 @@ def build_map(
     reference = reference_map(fused, settings=settings.registration)
     grid = grid_over(reference.points, tile_size=settings.tiling.tile_size, voxel_size=fused.size)
     tiles = cut(reference.points, grid, min_points=settings.tiling.min_points)
+    if not tiles.points:
+        raise NothingToTile(outcomes, points=len(reference.points), min_points=settings.tiling.min_points)
     progress("tiling", 1.0)
     return BuiltMap(reference=reference, tiles=tiles, outcomes=outcomes)
 
