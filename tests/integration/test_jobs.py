@@ -29,6 +29,7 @@ from worker.errors import DetectorUnavailable, MapFailed, ScanError
 from worker.evaluation.scenes import random_room
 from worker.evaluation.sensor import SimulatedScan
 from worker.evaluation.visits import visit
+from worker.jobs.surveys import scoring
 from worker.pipeline.flow import NoScanAccepted
 from worker.pipeline.pcd import write_pcd
 from worker.pipeline.poses import difference
@@ -482,3 +483,30 @@ def test_a_step_before_its_turn_is_harmless(house: House, visited: JobRecord) ->
     run(visited)
     in_turn, out_of_turn = (house.tiles(house.survey(job).survey_id) for job in (house.done[0], visited))
     assert out_of_turn == in_turn
+
+
+@pytest.mark.parametrize(("described", "expected"), [(True, [0.0, 1.0]), (False, [0.0, 0.5, 0.5, 1.0])])
+def test_scoring_never_goes_back_when_the_map_has_to_be_described_first(
+    described: bool, expected: list[float]
+) -> None:
+    told: list[float] = []
+    progress = scoring(lambda _, share: told.append(share), described=described)
+    for stage in ("score",) if described else ("describe", "score"):
+        progress(stage, 0.0)
+        progress(stage, 1.0)
+    assert told == expected
+
+
+def test_what_a_step_is_in_the_middle_of_lies_in_the_scratch_folder(
+    house: House, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folders: list[Path] = []
+
+    def noting(**given: Any) -> tempfile.TemporaryDirectory[str]:
+        folders.append(Path(given["dir"]))
+        return tempfile.TemporaryDirectory(**given)
+
+    monkeypatch.setattr("worker.jobs.step.TemporaryDirectory", noting)
+    run(house.map_of(house.add("one.pcd", house.material.before[1]), map_id="hall"))
+    assert set(folders) == {Settings().scratch_dir()}
+    assert list(Settings().scratch_dir().iterdir()) == []

@@ -17,6 +17,7 @@ from worker.pipeline.changes import decide
 from worker.pipeline.export import TileResult, tile_results, write_coloured_cloud
 from worker.pipeline.flow import NoScanAccepted, locate_survey
 from worker.pipeline.picture import draw_picture
+from worker.progress import Progress
 
 
 @step
@@ -60,14 +61,8 @@ def score_survey(at: Context) -> None:
     if blobs.exists(key):
         with blobs.local(key) as path:
             description = archive.load_arrays(path)
-    described = description is not None
-
-    def report(stage: str, share: float) -> None:
-        """A model that did not describe the map does so now, which is half of the work."""
-        half = 0.0 if stage == "describe" else 0.5
-        at.report("scoring", share if described else half + share / 2)
-
-    scores = detector.score(pairs, description=description, progress=report)
+    progress = scoring(at.report, described=description is not None)
+    scores = detector.score(pairs, description=description, progress=progress)
     put(at, keys.survey_scores(survey_id), lambda path: archive.save_scores(path, scores))
 
 
@@ -100,6 +95,16 @@ def export_survey(at: Context) -> None:
     tiles = [_tile_record(result) for result in tile_results(changes)]
     at.catalog.surveys.save_result(survey_id, tiles=tiles, threshold=threshold)
     at.catalog.jobs.succeed(at.job.job_id)
+
+
+def scoring(report: Progress, *, described: bool) -> Progress:
+    """A model that did not describe the map does so now, which is half of the work."""
+
+    def progress(stage: str, share: float) -> None:
+        half = 0.0 if stage == "describe" else 0.5
+        report("scoring", share if described else half + share / 2)
+
+    return progress
 
 
 def _survey_id(at: Context) -> str:

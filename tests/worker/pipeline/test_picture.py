@@ -11,7 +11,7 @@ from matplotlib.image import imread
 from worker.pipeline.changes import ChangeSet, TileState
 from worker.pipeline.export import STATE_COLORS
 from worker.pipeline.mapping import CurrentMap
-from worker.pipeline.picture import draw_picture
+from worker.pipeline.picture import _standing, draw_picture
 from worker.pipeline.tiling import TileGrid, TilePairs, Tiles
 
 
@@ -80,3 +80,9 @@ def test_one_tile_and_a_long_building_both_make_a_sheet_of_sensible_size(tmp_pat
         rows, columns, _ = picture.shape
         assert 200 < rows < 1800
         assert 800 < columns < 1800
+
+
+def test_a_very_long_place_is_drawn_in_coarser_pixels() -> None:
+    points = np.array([[0.0, 0.0, 0.0], [900.0, 1.0, 1.0]], np.float32)
+    assert max(_standing(points, 0.0, (0.0, 1000.0, 0.0, 10.0)).shape) <= 4000
+    assert _standing(points, 0.0, (0.0, 10.0, 0.0, 5.0)).shape == (100, 200)

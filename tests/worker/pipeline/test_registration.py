@@ -117,6 +117,22 @@ def test_a_wall_seen_from_its_other_side_does_not_pull_the_scan_over() -> None:
     assert _off(found, scans[4].world_from_sensor)[0] < 2.0
 
 
+def test_a_good_prior_is_not_dragged_away_where_the_map_shares_little_with_the_scan() -> None:
+    """Seen through a door: with the wide gates alone this scan finds no place."""
+    from worker.evaluation.scenes import small_office
+
+    scans = visit(small_office(1), 14, seed=1, prior_error=(0.1, 2.0))
+    fused: Voxels | None = None
+    for each in (*scans[:8], *scans[10:]):
+        voxels = Voxels.of(each.world_points, size=0.05, origin=each.world_from_sensor[:3, 3])
+        fused = voxels if fused is None else fused.merged(voxels)
+    assert fused is not None
+    settings = SETTINGS.model_copy(update={"search_resolutions": ()})
+    target = surface_of(fused, settings)
+    found = register(as_scan(scans[8].points), target, start=scans[8].prior, settings=settings)
+    assert _off(found, scans[8].world_from_sensor)[0] < 2.0
+
+
 @pytest.mark.parametrize(("size", "expected"), [(1, 1e-4), (2, 0.001)])
 def test_constraint_of_one_and_two_planes_is_next_to_nothing(size: int, expected: float) -> None:
     rng = np.random.default_rng(0)
