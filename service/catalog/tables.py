@@ -187,6 +187,7 @@ class Job(Base):
     message: Mapped[str]
     progress: Mapped[int]
     problem: Mapped[dict[str, Any] | None]
+    attempts: Mapped[int] = mapped_column(server_default="0")
     created: Mapped[datetime]
     started: Mapped[datetime | None]
     finished: Mapped[datetime | None]
