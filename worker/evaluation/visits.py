@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Protocol
 
 import numpy as np
 
@@ -12,10 +13,18 @@ from worker.evaluation.sensor import SensorModel, SimulatedScan, scan
 from worker.evaluation.truth import TileTruth, changed_tiles
 from worker.pipeline.values import Floats, Matrix4, Points
 
-__all__ = ["TileTruth", "changed_tiles", "drifted", "merged", "stops", "visit"]
+__all__ = ["Drift", "TileTruth", "changed_tiles", "drifted", "drifted_within", "merged", "stops", "visit"]
 
 SENSOR_HEIGHT = 0.35  #: metres above the floor
 CLEARANCE = 0.25  #: metres between the sensor and anything else
+
+
+class Drift(Protocol):
+    """How a belief about a pose comes to be off: the pose, how far (metres, degrees), the random numbers."""
+
+    def __call__(
+        self, world_from_sensor: Matrix4, error: tuple[float, float], rng: np.random.Generator
+    ) -> Matrix4: ...
 
 
 def stops(scene: Scene, count: int, *, seed: int) -> tuple[Matrix4, ...]:
@@ -43,6 +52,27 @@ def stops(scene: Scene, count: int, *, seed: int) -> tuple[Matrix4, ...]:
     return tuple(poses)
 
 
+def drifted(world_from_sensor: Matrix4, error: tuple[float, float], rng: np.random.Generator) -> Matrix4:
+    """The pose shifted and turned about its own place by errors of the given sigma (metres, degrees)."""
+    metres, degrees = error
+    shift = rng.normal(0.0, 1.0, 3) * metres * np.array([1.0, 1.0, 0.1])
+    return _off_by(world_from_sensor, shift, yaw=float(rng.normal(0.0, 1.0)) * degrees)
+
+
+def drifted_within(
+    world_from_sensor: Matrix4, error: tuple[float, float], rng: np.random.Generator
+) -> Matrix4:
+    """As `drifted` by errors of at most (metres, degrees): every length and angle up to them is equally likely.
+
+    The length is that of the shift over the floor, in any direction; the height is off by at most a tenth.
+    """
+    metres, degrees = error
+    length, towards = rng.uniform(0.0, metres), rng.uniform(0.0, 2 * np.pi)
+    rise = rng.uniform(-0.1, 0.1) * metres
+    shift = np.array([length * np.cos(towards), length * np.sin(towards), rise])
+    return _off_by(world_from_sensor, shift, yaw=float(rng.uniform(-degrees, degrees)))
+
+
 def visit(
     scene: Scene,
     poses: int | tuple[Matrix4, ...],
@@ -50,13 +80,14 @@ def visit(
     seed: int,
     sensor: SensorModel | None = None,
     prior_error: tuple[float, float] = (0.0, 0.0),
+    drift: Drift = drifted,
     duration_s: float = 5.0,
 ) -> tuple[SimulatedScan, ...]:
     """One scan a stop; `poses` are the stops (world_from_sensor) or how many to make along the route.
 
-    `prior_error` is the sigma in metres (each of x and y, a tenth of it in z) and in degrees of yaw by which
-    each scan's prior is off, independently of the others. Each scan's noise depends on the seed and its place
-    in the visit only.
+    Each scan's prior is off, independently of the others, by `prior_error` (metres, degrees of yaw): with
+    `drifted` that is sigma, with `drifted_within` the most there can be. Each scan's noise depends on the seed
+    and its place in the visit only.
     """
     sensor = sensor or SensorModel()
     where = stops(scene, poses, seed=seed) if isinstance(poses, int) else poses
@@ -64,24 +95,21 @@ def visit(
     for number, world_from_sensor in enumerate(where):
         rng = np.random.default_rng([seed, 2, number])
         seen = scan(scene, world_from_sensor, duration_s=duration_s, sensor=sensor, rng=rng)
-        scans.append(replace(seen, prior=drifted(world_from_sensor, prior_error, rng)))
+        scans.append(replace(seen, prior=drift(world_from_sensor, prior_error, rng)))
     return tuple(scans)
-
-
-def drifted(world_from_sensor: Matrix4, error: tuple[float, float], rng: np.random.Generator) -> Matrix4:
-    """The pose shifted and turned about its own place by errors of the given sigma (metres, degrees)."""
-    metres, degrees = error
-    shift = rng.normal(0.0, 1.0, 3) * metres * np.array([1.0, 1.0, 0.1])
-    turn = rigid(yaw=float(rng.normal(0.0, 1.0)) * degrees)
-    prior = world_from_sensor.copy()
-    prior[:3, :3] = turn[:3, :3] @ prior[:3, :3]
-    prior[:3, 3] += shift
-    return prior
 
 
 def merged(scans: tuple[SimulatedScan, ...]) -> Points:
     """(N, 3) float32, world frame: all points by the true poses."""
     return np.concatenate([seen.world_points for seen in scans])
+
+
+def _off_by(pose: Matrix4, shift: Floats, *, yaw: float) -> Matrix4:
+    turn = rigid(yaw=yaw)
+    prior = pose.copy()
+    prior[:3, :3] = turn[:3, :3] @ prior[:3, :3]
+    prior[:3, 3] += shift
+    return prior
 
 
 def _free_place(scene: Scene, wanted: Floats, rng: np.random.Generator) -> Floats:

@@ -2,10 +2,20 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
-from worker.evaluation.scenes import Scene, corridor, random_edits, random_room, rigid, small_office
+from worker.evaluation.scenes import (
+    Scene,
+    corridor,
+    corridor_with_loop,
+    random_edits,
+    random_room,
+    rigid,
+    small_office,
+)
 from worker.evaluation.scenes.mesh import box, cylinder, sphere
 from worker.evaluation.sensor import PERFECT, scan
 
@@ -15,7 +25,7 @@ def overlapping(scene: Scene) -> list[str]:
     return [o.name for o in scene.movable if not scene.is_free(o.mesh.bounds, ignoring=o.name)]
 
 
-@pytest.mark.parametrize("make", [small_office, corridor, random_room])
+@pytest.mark.parametrize("make", [small_office, corridor, corridor_with_loop, random_room])
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_pieces_stand_apart_inside_the_building(make, seed):
     scene = make(seed)
@@ -41,7 +51,7 @@ def test_the_office_measures_ten_by_eight_by_two_point_six_inside():
     assert scene["ceiling-1"].mesh.bounds[0, 2] == pytest.approx(2.6)
 
 
-@pytest.mark.parametrize("make", [small_office, corridor, random_room])
+@pytest.mark.parametrize("make", [small_office, corridor, corridor_with_loop, random_room])
 def test_no_ray_leaves_a_building(make):
     scene = make(2)
     x, y = np.mean([scene.rooms[-1].low, scene.rooms[-1].high], axis=0)
@@ -50,6 +60,28 @@ def test_no_ray_leaves_a_building(make):
     assert within_range <= len(seen.points) <= 21_600
     low, high = scene.bounds
     assert np.all(seen.world_points > low) and np.all(seen.world_points < high)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_robot_can_walk_the_route_of_the_corridor_with_a_loop(seed):
+    scene = corridor_with_loop(seed)
+    route = np.array(scene.route)
+    walked = np.concatenate([np.linspace(a, b, 60) for a, b in pairwise(route)])
+    for height in (0.35, 0.7, 1.2):
+        room = scene.caster.distances(np.c_[walked, np.full(len(walked), height)])
+        assert room.min() > 0.3
+
+
+def test_the_route_of_the_corridor_with_a_loop_leads_about_the_block_and_back():
+    route = np.array(corridor_with_loop(1).route)
+    legs = np.linalg.norm(np.diff(route, axis=0), axis=1)
+    assert legs.sum() / 42 == pytest.approx(2.35, abs=0.01)  # between two of 42 stops
+    assert np.array_equal(route[0], route[-1])
+    loop = route[2:7]  # from the end of the second leg to there again
+    assert np.array_equal(loop[0], loop[-1])
+    from_block = loop[:-1] - (17.8 - 2.5, 20.2 + 2.0)  # its middle
+    turned = np.diff(np.unwrap(np.arctan2(from_block[[0, 1, 2, 3, 0], 1], from_block[[0, 1, 2, 3, 0], 0])))
+    assert abs(np.degrees(turned.sum())) == pytest.approx(360.0)
 
 
 def test_solids_have_the_area_of_their_shape():

@@ -5,16 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from worker.evaluation.scenes import corridor, small_office
+from worker.evaluation.scenes import corridor, corridor_with_loop, rigid, small_office
 from worker.evaluation.sensor import PERFECT
-from worker.evaluation.visits import CLEARANCE, drifted, merged, stops, visit
+from worker.evaluation.visits import CLEARANCE, drifted, drifted_within, merged, stops, visit
 
 
-@pytest.mark.parametrize("make", [small_office, corridor])
+@pytest.mark.parametrize(("make", "count"), [(small_office, 25), (corridor, 25), (corridor_with_loop, 42)])
 @pytest.mark.parametrize("seed", [0, 7])
-def test_stops_are_in_rooms_and_clear_of_everything(make, seed):
+def test_stops_are_in_rooms_and_clear_of_everything(make, count, seed):
     scene = make(1)
-    places = np.array([pose[:3, 3] for pose in stops(scene, 25, seed=seed)])
+    places = np.array([pose[:3, 3] for pose in stops(scene, count, seed=seed)])
     assert scene.caster.distances(places).min() > CLEARANCE - 0.05  # the robot's height varies by 1 cm
     for x, y, _ in places:
         assert any(
@@ -50,6 +50,28 @@ def test_priors_are_off_by_the_sigma_that_was_set():
     yaw = np.degrees(np.arctan2(priors[:, 1, 0], priors[:, 0, 0]))
     assert priors[:, :2, 3].std() == pytest.approx(0.2, rel=0.1)
     assert yaw.std() == pytest.approx(3.0, rel=0.1)
+
+
+def test_bounded_drift_reaches_its_bounds_and_stays_within():
+    rng = np.random.default_rng(0)
+    true = rigid(3.0, -2.0, 0.35, yaw=80.0, pitch=0.5)
+    priors = np.array([drifted_within(true, (0.25, 4.0), rng) for _ in range(400)])
+    over_floor = np.linalg.norm(priors[:, :2, 3] - true[:2, 3], axis=1)
+    assert 0.24 < over_floor.max() <= 0.25
+    assert over_floor.mean() == pytest.approx(0.125, rel=0.1)
+    assert 0.024 < np.abs(priors[:, 2, 3] - 0.35).max() <= 0.025
+    turns = priors[:, :3, :3] @ true[:3, :3].T
+    yaw = np.degrees(np.arctan2(turns[:, 1, 0], turns[:, 0, 0]))
+    assert 3.9 < yaw.max() <= 4.0
+    assert -3.9 > yaw.min() >= -4.0
+    assert turns[:, 2, 2] == pytest.approx(1.0)  # about the vertical alone
+
+
+def test_a_visit_drifts_as_it_is_told(bare_room):
+    first = visit(bare_room, 3, seed=3, duration_s=0.05, prior_error=(0.2, 3.0), drift=drifted_within)
+    for seen in first:
+        off = np.linalg.norm((seen.prior - seen.world_from_sensor)[:2, 3])
+        assert 0 < off <= 0.2
 
 
 def test_merged_scans_without_noise_lie_on_the_scene():

@@ -1,6 +1,7 @@
 """Buildings made of parametric parts, and edits of them."""
 
-from worker.evaluation.scenes.buildings import corridor, random_room, small_office
+from worker.evaluation.scenes.buildings import random_room, small_office
+from worker.evaluation.scenes.corridors import corridor, corridor_with_loop
 from worker.evaluation.scenes.edits import random_edits
 from worker.evaluation.scenes.mesh import Mesh, rigid
 from worker.evaluation.scenes.scene import Change, ChangeKind, Room, Scene, SceneObject
@@ -13,6 +14,7 @@ __all__ = [
     "Scene",
     "SceneObject",
     "corridor",
+    "corridor_with_loop",
     "random_edits",
     "random_room",
     "rigid",

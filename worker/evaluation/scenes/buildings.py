@@ -1,4 +1,4 @@
-"""Whole scenes: an office, a corridor, single rooms. The same seed gives the same scene."""
+"""Whole scenes: an office and single rooms. The same seed gives the same scene."""
 
 from __future__ import annotations
 
@@ -52,41 +52,6 @@ def small_office(seed: int) -> Scene:
     return draft.finish(rooms=(*rooms, corridor), route=_round(rooms, doors, (south + north) / 2))
 
 
-def corridor(
-    seed: int, *, length: float = 20.0, leg: float = 18.0, width: float = 2.2, height: float = 2.6
-) -> Scene:
-    """An L of two corridors, `length` along x and `leg` along y (outer measures), door niches in every wall.
-
-    `leg` 0 gives one straight corridor. The defaults hold about as many tiles as the paper's corridor (172).
-    """
-    rng = np.random.default_rng(seed)
-    draft = Draft(f"corridor-{seed}", rng)
-    rooms = [Room(low=(0.0, 0.0), high=(length, width), height=height)]
-    route: list[Place] = [(0.9, width / 2), (length - width / 2, width / 2)]
-    inside = length - width if leg else length
-    walls = [("south", (0.0, 0.0), (length, 0.0), 1), ("north", (0.0, width), (inside, width), -1)]
-    walls.append(("west", (0.0, 0.0), (0.0, width), 1))
-    walls.append(("east", (length, 0.0), (length, leg or width), -1))
-    if leg:
-        rooms.append(Room(low=(inside, width), high=(length, leg), height=height))
-        route.append((length - width / 2, leg - 0.9))
-        walls.append(("inner", (inside, width), (inside, leg), 1))
-        walls.append(("end", (inside, leg), (length, leg), -1))
-        draft.keep_clear((inside, width - 0.7), (length, width + 0.9))
-    fittings.shell(draft, tuple(rooms))
-    for name, start, end, inward in walls:
-        doors = _doors(rng, abs(end[0] - start[0]) + abs(end[1] - start[1]))
-        fittings.niche_wall(draft, f"wall-{name}", start, end, inward=inward, height=height, doors=doors)
-    for number, room in enumerate(rooms, start=1):
-        fittings.hang_lamps(draft, room, f"lamps-{number}")
-        for at, (radius, z) in enumerate(((0.06, height - 0.3), (0.04, height - 0.5)), start=1):
-            pipe = fittings.pipe_along(room, radius=radius, inset=0.12, z=z)
-            draft.building(f"pipe-{number}-{at}", pipe)
-        _line_corridor(draft, room)
-    # There and back again: a sensor that looks ahead sees both sides of everything.
-    return draft.finish(rooms=tuple(rooms), route=(*route, *route[-2::-1]))
-
-
 def random_room(seed: int) -> Scene:
     """One room of 4-8 x 3.2-6.5 x 2.4-3.2 m with 6 to 14 pieces of furniture."""
     rng = np.random.default_rng(seed)
@@ -94,7 +59,7 @@ def random_room(seed: int) -> Scene:
     (x, y, height) = rng.uniform((4.0, 3.2, 2.4), (8.0, 6.5, 3.2)).tolist()
     room = Room(low=(0.0, 0.0), high=(x, y), height=height)
     fittings.shell(draft, (room,))
-    _outer_walls(draft, x, y, height, doors=_doors(rng, x))
+    _outer_walls(draft, x, y, height, doors=fittings.openings(rng, x))
     _fit_out(draft, room, 1, pieces=int(rng.integers(6, 15)))
     corners = [(0.3 * x, 0.3 * y), (0.7 * x, 0.3 * y), (0.7 * x, 0.7 * y), (0.3 * x, 0.7 * y)]
     return draft.finish(rooms=(room,), route=(*corners, corners[0]))
@@ -119,14 +84,6 @@ def _inner_wall(y: float, doors: list[float], height: float) -> Mesh:
     return wall((0.0, y), (10.0, y), thickness=INNER, height=height, doors=openings)
 
 
-def _doors(rng: np.random.Generator, length: float) -> tuple[tuple[float, float], ...]:
-    """Openings along a wall, about one in 4 m, none in the last metre of either end."""
-    count = int(length // 4)
-    spans = [(number * length / count, (number + 1) * length / count) for number in range(count)]
-    firsts = [float(rng.uniform(low + 1.0, high - 1.0 - DOOR)) for low, high in spans]
-    return tuple((first, first + DOOR) for first in firsts)
-
-
 def _fit_out(draft: Draft, room: Room, number: int, *, pieces: int = 8) -> None:
     """Lamps, a radiator, a pillar, pictures, then furniture, more of it along the walls than in the middle."""
     rng = draft.rng
@@ -144,21 +101,6 @@ def _fit_out(draft: Draft, room: Room, number: int, *, pieces: int = 8) -> None:
             kind = free[count // 2 % len(free)]
             draft.freely(room, kind, furniture.FREE_PIECES[kind]())
     draft.against_wall(room, "picture", fittings.picture(), z=1.3)
-
-
-def _line_corridor(draft: Draft, room: Room) -> None:
-    """What stands along a corridor, leaving the middle free."""
-    span = max(room.high[0] - room.low[0], room.high[1] - room.low[1])
-    for _ in range(int(span / 7)):
-        draft.against_wall(room, "pillar", fittings.pillar(height=room.height - 0.7), fixed=True)
-        draft.against_wall(room, "cabinet", furniture.cabinet(0.8, 0.4, float(draft.rng.uniform(0.9, 1.9))))
-        draft.against_wall(room, "bench", furniture.bench())
-        draft.against_wall(room, "plant", furniture.plant())
-        draft.against_wall(room, "crate", furniture.crate())
-        draft.against_wall(room, "bin", furniture.bin_())
-        draft.against_wall(room, "extinguisher", furniture.extinguisher(), z=0.9)
-        draft.against_wall(room, "radiator", fittings.radiator(), z=0.12, fixed=True)
-        draft.against_wall(room, "picture", fittings.picture(), z=1.4)
 
 
 def _round(rooms: tuple[Room, ...], doors: list[float], aisle: float) -> tuple[Place, ...]:

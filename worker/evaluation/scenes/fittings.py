@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from worker.evaluation.scenes.draft import Draft, wall
 from worker.evaluation.scenes.mesh import Mesh, block, box, cylinder, rigid, union
 from worker.evaluation.scenes.scene import Room
@@ -81,6 +83,14 @@ def niche_wall(
         else:
             placed = union(leaf, handle).at(middle[0] + first, middle[1] - inward * 0.05)
         draft.building(f"{name}-door-{number}", placed)
+
+
+def openings(rng: np.random.Generator, length: float) -> tuple[tuple[float, float], ...]:
+    """Where doors are along a wall, about one in 4 m, none in the last metre of either end; metres, (from, to)."""
+    count = int(length // 4)
+    spans = [(number * length / count, (number + 1) * length / count) for number in range(count)]
+    firsts = [float(rng.uniform(low + 1.0, high - 1.0 - DOOR)) for low, high in spans]
+    return tuple((first, first + DOOR) for first in firsts)
 
 
 def hang_lamps(draft: Draft, room: Room, name: str, *, every: float = 3.0) -> None:
