@@ -11,6 +11,7 @@ from service.catalog.jobs import Jobs
 from service.catalog.maps import Maps
 from service.catalog.scans import Scans
 from service.catalog.surveys import Surveys
+from service.catalog.versions import Versions
 from service.settings import Settings
 
 
@@ -22,6 +23,7 @@ class Catalog:
     blobs: Blobs
     scans: Scans
     maps: Maps
+    versions: Versions
     surveys: Surveys
     changes: Changes
     jobs: Jobs
@@ -45,6 +47,7 @@ def open_catalog(settings: Settings, *, migrate: bool = True) -> Catalog:
         blobs=blobs,
         scans=Scans(database, blobs),
         maps=Maps(database, blobs),
+        versions=Versions(database, blobs),
         surveys=Surveys(database, blobs),
         changes=Changes(database),
         jobs=Jobs(database),

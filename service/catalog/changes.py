@@ -130,6 +130,7 @@ def _record(tile: tables.SurveyTile, survey: tables.Survey) -> ChangeRecord:
     return ChangeRecord(
         tile=tile_record(tile),
         map_id=survey.map_id,
+        map_version=survey.map_version,
         survey_id=survey.id,
         model=survey.model,
         threshold=survey.threshold,

@@ -93,11 +93,11 @@ class Jobs:
         return status is None or status == "dismissed"
 
     def succeed(self, job_id: str) -> bool:
-        """The job is done and its map or survey ready; False when it had ended or gone before."""
+        """The job is done and its map's version or survey ready; False when it had ended or gone before."""
         return self._end(job_id, "successful", message="done", progress=100)
 
     def fail(self, job_id: str, problem: Problem) -> bool:
-        """The job and its map or survey failed; False when it had ended or gone before."""
+        """The job and its map's version or survey failed; False when it had ended or gone before."""
         return self._end(job_id, "failed", message=problem.detail, problem=problem.model_dump())
 
     def dismiss(self, job_id: str) -> JobRecord:
@@ -121,8 +121,8 @@ class Jobs:
             ):
                 return False
             job = _row(session, job_id)
-            subject: tables.Map | tables.Survey | None = (
-                session.get(tables.Map, job.map_id)
+            subject: tables.MapVersion | tables.Survey | None = (
+                session.get(tables.MapVersion, job_id)
                 if job.survey_id is None
                 else session.get(tables.Survey, job.survey_id)
             )

@@ -32,7 +32,7 @@ def probe(token: str) -> str:
 
 
 def map_folder(job_id: str) -> str:
-    """The prefix of everything kept for a map.
+    """The prefix of everything kept for a version of a map.
 
     `job_id` is that of the job that builds it, and not the map's own id, which a client may give again once the map is
     deleted: a step of the old job that comes late must not write among the files of the new map.
@@ -68,6 +68,16 @@ def map_manifest(job_id: str) -> str:
 def map_scan(job_id: str, scan_id: str) -> str:
     """The points, pose and sensor origin of one accepted scan of the map."""
     return f"{map_folder(job_id)}scans/{scan_id}.npz"
+
+
+def map_work(job_id: str) -> str:
+    """The prefix of what the building of a map remembers of itself while it lasts."""
+    return map_folder(job_id) + "work/"
+
+
+def map_pairs(job_id: str, token: str) -> str:
+    """Pairs of scans that were registered, JSON; every write has a token of its own."""
+    return f"{map_work(job_id)}pairs-{token}.json"
 
 
 def survey_folder(survey_id: str) -> str:

@@ -3,25 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from service.catalog import tables
 from service.catalog.records import ScanOutcome
 from service.errors import BadRequest
 
-Row = TypeVar("Row", tables.MapScan, tables.SurveyScan)
+Row = TypeVar("Row", tables.VersionScan, tables.SurveyScan)
+
+_FACTS = tuple(name for name in ScanOutcome.model_fields if name != "scan_id")  #: columns of the same names
 
 
-def outcome(row: tables.MapScan | tables.SurveyScan) -> ScanOutcome:
+def outcome(row: tables.VersionScan | tables.SurveyScan) -> ScanOutcome:
     """The record of a row."""
-    return ScanOutcome(
-        scan_id=row.scan_id,
-        accepted=row.accepted,
-        fitness=row.fitness,
-        rmse=row.rmse,
-        map_from_scan=row.map_from_scan,
-        reason=row.reason,
-    )
+    return ScanOutcome(scan_id=row.scan_id, **{name: getattr(row, name) for name in _FACTS})
+
+
+def facts(found: ScanOutcome) -> dict[str, Any]:
+    """The columns of an outcome, less its scan."""
+    return found.model_dump(mode="json", exclude={"scan_id"})
 
 
 def write_outcomes(rows: Iterable[Row], outcomes: Iterable[ScanOutcome]) -> None:
@@ -30,11 +30,8 @@ def write_outcomes(rows: Iterable[Row], outcomes: Iterable[ScanOutcome]) -> None
     for found in outcomes:
         if found.scan_id not in by_scan:
             raise ValueError(f"scan {found.scan_id!r} does not belong to this map or survey")
-        row = by_scan[found.scan_id]
-        row.accepted, row.fitness, row.rmse = found.accepted, found.fitness, found.rmse
-        row.reason = found.reason
-        matrix = found.map_from_scan
-        row.map_from_scan = None if matrix is None else [list(line) for line in matrix]
+        for name, value in facts(found).items():
+            setattr(by_scan[found.scan_id], name, value)
 
 
 def checked_scan_ids(scan_ids: Sequence[str]) -> tuple[str, ...]:

@@ -69,6 +69,11 @@ class ScanOutcome(Record):
     fitness: float | None = None  #: inlier fraction, 0..1
     rmse: float | None = None  #: metres, over the inliers
     map_from_scan: Matrix | None = None
+    translation_sigma: float | None = None  #: metres, one sigma, in the direction that is held worst
+    rotation_sigma: float | None = None  #: radians, likewise
+    path: tuple[str, ...] | None = (
+        None  #: scan ids from the map's reference scan to this one; None in surveys
+    )
     reason: str | None = None  #: why it was left out
 
 
@@ -77,6 +82,15 @@ class Bounds(Record):
 
     min: Vector3
     max: Vector3
+
+
+class Anchor(Record):
+    """Where a map lies on the Earth: its origin in WGS 84, and how it is turned. Its z axis points up there."""
+
+    longitude: float = Field(ge=-180, le=180)  #: degrees, of the map frame's origin
+    latitude: float = Field(ge=-90, le=90)  #: degrees
+    height: float = Field(ge=-1000, le=10_000)  #: metres above the ellipsoid
+    heading: float = Field(ge=0, lt=360)  #: degrees, clockwise from true north to the map's x axis
 
 
 class TileRecord(Record):
@@ -100,17 +114,42 @@ class TileRecord(Record):
 
 
 class MapRecord(Record):
-    """A reference map; `bounds` and `counts` are empty until it is built."""
+    """A reference map as it is in use: the newest of its versions that is ready, and the newest where none is."""
 
     map_id: str
     name: str | None
+    version: int  #: the one that is shown here, as are the status and all that is about its building
     status: MapStatus
     model: str  #: `name/version`, whose card gives voxel and tile size
     settings: dict[str, Any]
+    anchor: Anchor | None
     scans: tuple[ScanOutcome, ...]  #: in the order of the request
+    bounds: Bounds | None  #: None until it is built
+    counts: dict[str, int]  #: empty until it is built
+    registration: (
+        dict[str, Any] | None
+    )  #: totals of the registration (paper, Table 2); None until it is built
+    job_id: str
+    problem: Problem | None
+    created: Utc
+    updated: Utc
+
+
+class VersionRecord(Record):
+    """One state of a map; a survey stays with the version that it was compared with."""
+
+    map_id: str
+    version: int  #: 1, 2, ...
+    status: MapStatus
+    base_version: int | None  #: the version that it goes on from; None in the first
+    survey_id: str | None  #: the accepted survey that it takes over; None where it is made of scans
+    model: str  #: the map's
+    settings: dict[str, Any]  #: the map's
+    scans: tuple[ScanOutcome, ...]  #: those of the base that were accepted, then the new ones
     bounds: Bounds | None
     counts: dict[str, int]
-    job_id: str
+    registration: dict[str, Any] | None
+    job_id: str  #: of the job that builds it, and so of its files (`keys.map_folder`)
     problem: Problem | None
     created: Utc
     updated: Utc
@@ -121,6 +160,9 @@ class SurveyRecord(Record):
 
     survey_id: str
     map_id: str
+    map_version: (
+        int  #: the version that was in use when the survey was asked for, and that it is compared with
+    )
     status: SurveyStatus
     model: str  #: `name/version`
     threshold: float | None  #: asked for, then the one that was used
@@ -156,6 +198,7 @@ class ChangeRecord(Record):
 
     tile: TileRecord
     map_id: str
+    map_version: int
     survey_id: str
     model: str
     threshold: float | None

@@ -169,7 +169,7 @@ def rows_in_order(session: Session, scan_ids: Sequence[str]) -> tuple[ScanRecord
 
 
 def _in_use(scan_id: str) -> ColumnElement[bool]:
-    return exists().where(tables.MapScan.scan_id == scan_id) | exists().where(
+    return exists().where(tables.VersionScan.scan_id == scan_id) | exists().where(
         tables.SurveyScan.scan_id == scan_id
     )
 

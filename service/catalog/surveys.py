@@ -20,7 +20,8 @@ from service.catalog.page import Page, Position, newest_first, page_of
 from service.catalog.records import JobRecord, Problem, ScanOutcome, SurveyRecord, TileRecord, TileState
 from service.catalog.scans import rows_in_order
 from service.catalog.tiles import tile_row
-from service.errors import NotFound, NotReady
+from service.catalog.version_rows import current_row, map_row
+from service.errors import Conflict, NotFound, NotReady
 
 
 class Surveys:
@@ -45,12 +46,14 @@ class Surveys:
         survey_id = new_id("survey")
         job = new_job("survey", map_id, survey_id)
         with self._database.write() as session:
-            _ready_map(session, map_id)
+            map_row(session, map_id, lock=True)  # nobody deletes the version meanwhile
+            version = current_row(session, map_id)
             scans = rows_in_order(session, scan_ids)
             taken = [scan.captured_at for scan in scans if scan.captured_at is not None]
             row = tables.Survey(
                 id=survey_id,
                 map_id=map_id,
+                map_version=version.number,
                 status="running",
                 model=model,
                 threshold=threshold,
@@ -134,22 +137,28 @@ class Surveys:
             row.updated = now()
 
     def delete(self, survey_id: str) -> None:
-        """Forget a survey with its job and files; the scans stay. Raises NotFound."""
+        """Forget a survey with its job and files; the scans stay. Raises NotFound, and Conflict while a version is built of it."""
         with self._database.write() as session:
-            session.delete(_row(session, survey_id))
+            row = _row(session, survey_id, lock=True)
+            _check_unused(session, row)
+            session.delete(row)
         self._blobs.delete_prefix(keys.survey_folder(survey_id))
 
 
-def _ready_map(session: Session, map_id: str) -> None:
-    found = session.get(tables.Map, map_id)
-    if found is None:
-        raise NotFound(f"no map {map_id!r}; GET /maps lists those there are")
-    if found.status != "ready":
-        raise NotReady(f"map {map_id!r} is {found.status}; a survey needs a map that is ready")
+def _check_unused(session: Session, row: tables.Survey) -> None:
+    """Raises Conflict while a version of the map is being built of the survey."""
+    version = tables.MapVersion
+    query = select(version).where(version.map_id == row.map_id, version.survey_id == row.id)
+    built = session.scalar(query.where(version.status == "building"))
+    if built is not None:
+        raise Conflict(
+            f"version {built.number} of map {row.map_id!r} is being built of survey {row.id!r}; wait for job "
+            f"{built.job_id}, or dismiss it"
+        )
 
 
-def _row(session: Session, survey_id: str) -> tables.Survey:
-    row = session.get(tables.Survey, survey_id)
+def _row(session: Session, survey_id: str, *, lock: bool = False) -> tables.Survey:
+    row = session.get(tables.Survey, survey_id, with_for_update=lock)
     if row is None:
         raise NotFound(f"no survey {survey_id!r}; GET /maps/<id>/surveys lists those there are")
     return row
@@ -159,6 +168,7 @@ def _record(row: tables.Survey, problem: dict[str, Any] | None) -> SurveyRecord:
     return SurveyRecord(
         survey_id=row.id,
         map_id=row.map_id,
+        map_version=row.map_version,
         status=row.status,
         model=row.model,
         threshold=row.threshold,

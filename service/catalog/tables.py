@@ -5,7 +5,17 @@ from __future__ import annotations
 from datetime import UTC, datetime
 from typing import Any
 
-from sqlalchemy import JSON, BigInteger, DateTime, ForeignKey, Index, MetaData, String, TypeDecorator
+from sqlalchemy import (
+    JSON,
+    BigInteger,
+    DateTime,
+    ForeignKey,
+    Index,
+    MetaData,
+    String,
+    TypeDecorator,
+    UniqueConstraint,
+)
 from sqlalchemy.engine import Dialect
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column, relationship
 
@@ -46,7 +56,9 @@ class Base(DeclarativeBase):
         datetime: UtcDateTime(),
         dict[str, Any]: JSON(none_as_null=True),
         dict[str, int]: JSON(none_as_null=True),
+        dict[str, float]: JSON(none_as_null=True),
         list[list[float]]: JSON(none_as_null=True),
+        list[str]: JSON(none_as_null=True),
         str: String(),
     }
 
@@ -72,22 +84,27 @@ class Scan(Base):
 
 
 class Outcome:
-    """The columns that `map_scans` and `survey_scans` share."""
+    """The columns that `version_scans` and `survey_scans` share."""
 
     ordinal: Mapped[int]
     accepted: Mapped[bool | None]
     fitness: Mapped[float | None]
     rmse: Mapped[float | None]
     map_from_scan: Mapped[list[list[float]] | None]
+    translation_sigma: Mapped[float | None]
+    rotation_sigma: Mapped[float | None]
+    path: Mapped[list[str] | None]
     reason: Mapped[str | None]
 
 
-class MapScan(Outcome, Base):
-    """A scan of a map."""
+class VersionScan(Outcome, Base):
+    """A scan of a version of a map."""
 
-    __tablename__ = "map_scans"
+    __tablename__ = "version_scans"
 
-    map_id: Mapped[str] = mapped_column(ForeignKey("maps.id", ondelete="CASCADE"), primary_key=True)
+    job_id: Mapped[str] = mapped_column(
+        ForeignKey("map_versions.job_id", ondelete="CASCADE"), primary_key=True
+    )
     scan_id: Mapped[str] = mapped_column(ForeignKey("scans.id"), primary_key=True, index=True)
 
 
@@ -100,25 +117,42 @@ class SurveyScan(Outcome, Base):
     scan_id: Mapped[str] = mapped_column(ForeignKey("scans.id"), primary_key=True, index=True)
 
 
+class MapVersion(Base):
+    """One state of a map, known by the job that builds it."""
+
+    __tablename__ = "map_versions"
+
+    job_id: Mapped[str] = mapped_column(primary_key=True)
+    map_id: Mapped[str] = mapped_column(ForeignKey("maps.id", ondelete="CASCADE"))
+    number: Mapped[int]
+    status: Mapped[str]
+    base_version: Mapped[int | None]
+    survey_id: Mapped[str | None]  # no foreign key: what a version was made from may be deleted since
+    bounds: Mapped[dict[str, Any] | None]
+    counts: Mapped[dict[str, int]]
+    registration: Mapped[dict[str, Any] | None]
+    created: Mapped[datetime]
+    updated: Mapped[datetime]
+
+    scans: Mapped[list[VersionScan]] = relationship(
+        order_by=VersionScan.ordinal, cascade="all, delete-orphan", passive_deletes=True
+    )
+
+    __table_args__ = (UniqueConstraint("map_id", "number"), Index(None, "map_id", "created", "job_id"))
+
+
 class Map(Base):
-    """A reference map."""
+    """A reference map: what holds for all of its versions."""
 
     __tablename__ = "maps"
 
     id: Mapped[str] = mapped_column(primary_key=True)
     name: Mapped[str | None]
-    status: Mapped[str]
     model: Mapped[str]
     settings: Mapped[dict[str, Any]]
-    bounds: Mapped[dict[str, Any] | None]
-    counts: Mapped[dict[str, int]]
-    job_id: Mapped[str]
+    anchor: Mapped[dict[str, float] | None]
     created: Mapped[datetime]
     updated: Mapped[datetime]
-
-    scans: Mapped[list[MapScan]] = relationship(
-        order_by=MapScan.ordinal, cascade="all, delete-orphan", passive_deletes=True
-    )
 
     __table_args__ = (Index(None, "created", "id"),)
 
@@ -130,6 +164,7 @@ class Survey(Base):
 
     id: Mapped[str] = mapped_column(primary_key=True)
     map_id: Mapped[str] = mapped_column(ForeignKey("maps.id", ondelete="CASCADE"))
+    map_version: Mapped[int] = mapped_column(server_default="1")  # that of the rows before migration 0004
     status: Mapped[str]
     model: Mapped[str]
     threshold: Mapped[float | None]

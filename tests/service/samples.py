@@ -27,6 +27,7 @@ from service.settings import Settings
 MODEL = "spicd-net/1"
 IDENTITY = ((1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1))
 NOON = datetime(2026, 3, 1, 12, tzinfo=UTC)
+BOUNDS = Bounds(min=(0, 0, 0), max=(3, 3, 1))
 
 
 @dataclass
@@ -113,8 +114,27 @@ def add_map(catalog: Catalog, map_id: str = "lobby", *, ready: bool = True) -> s
         accepted = ScanOutcome(
             scan_id=scan.scan_id, accepted=True, fitness=0.98, rmse=0.02, map_from_scan=IDENTITY
         )
-        catalog.maps.save_result(
-            map_id, outcomes=[accepted], bounds=Bounds(min=(0, 0, 0), max=(3, 3, 1)), counts={"tiles": 4}
+        catalog.versions.save_result(
+            job.job_id, outcomes=[accepted], bounds=BOUNDS, counts={"tiles": 4}, registration={"scans": 1}
+        )
+        catalog.jobs.succeed(job.job_id)
+    return job.job_id
+
+
+def add_version(
+    catalog: Catalog, map_id: str = "lobby", *, survey_id: str | None = None, ready: bool = True
+) -> str:
+    """A further version of a map, of one new scan or of a survey, built or not; its job's id."""
+    number = len(catalog.versions.page(map_id).items) + 1
+    scan_ids = [] if survey_id else [add_scan(catalog, f"further-{map_id}-{number}").scan_id]
+    version, job = catalog.versions.create(map_id, scan_ids=scan_ids, survey_id=survey_id)
+    if ready:
+        outcomes = [
+            scan if scan.accepted else scan.model_copy(update={"accepted": True, "map_from_scan": IDENTITY})
+            for scan in version.scans
+        ]
+        catalog.versions.save_result(
+            job.job_id, outcomes=outcomes, bounds=BOUNDS, counts={"tiles": 4 + version.version}
         )
         catalog.jobs.succeed(job.job_id)
     return job.job_id

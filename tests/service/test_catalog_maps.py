@@ -27,11 +27,11 @@ def test_a_map_lists_its_scans_in_the_order_asked_for(catalog):
 
 
 def test_a_result_saved_twice_is_the_second_result(catalog):
-    add_map(catalog, ready=False)
+    job_id = add_map(catalog, ready=False)
     scan_id = catalog.maps.get("lobby").scans[0].scan_id
     for fitness in (0.7, 0.9):
-        catalog.maps.save_result(
-            "lobby",
+        catalog.versions.save_result(
+            job_id,
             outcomes=[accepted(scan_id, fitness)],
             bounds=Bounds(min=(0, 0, 0), max=(fitness, 1, 1)),
             counts={"tiles": round(10 * fitness)},
@@ -43,17 +43,17 @@ def test_a_result_saved_twice_is_the_second_result(catalog):
 
 
 def test_outcomes_of_a_failed_map_are_kept(catalog):
-    add_map(catalog, ready=False)
+    job_id = add_map(catalog, ready=False)
     scan_id = catalog.maps.get("lobby").scans[0].scan_id
     left_out = ScanOutcome(scan_id=scan_id, accepted=False, fitness=0.1, rmse=0.04, reason="fitness 0.10")
-    catalog.maps.save_outcomes("lobby", [left_out])
+    catalog.versions.save_outcomes(job_id, [left_out])
     assert catalog.maps.get("lobby").scans == (left_out,)
 
 
 def test_an_outcome_of_a_foreign_scan_is_a_mistake(catalog):
-    add_map(catalog, ready=False)
+    job_id = add_map(catalog, ready=False)
     with pytest.raises(ValueError, match="elsewhere"):
-        catalog.maps.save_outcomes("lobby", [accepted("elsewhere", 1)])
+        catalog.versions.save_outcomes(job_id, [accepted("elsewhere", 1)])
 
 
 def test_an_id_is_taken_once_and_the_second_leaves_no_job(catalog):
@@ -108,12 +108,12 @@ def test_a_survey_is_as_late_as_its_latest_scan(catalog):
     assert catalog.surveys.get(survey.survey_id).captured_at == NOON + timedelta(hours=5)
 
 
-@pytest.mark.parametrize("status", ["building", "failed"])
-def test_a_survey_needs_a_map_that_is_ready(catalog, status):
+@pytest.mark.parametrize("ended", [False, True])
+def test_a_survey_needs_a_map_that_is_ready(catalog, ended):
     job_id = add_map(catalog, ready=False)
-    if status == "failed":
+    if ended:
         catalog.jobs.dismiss(job_id)
-    with pytest.raises(NotReady, match=status):
+    with pytest.raises(NotReady, match=job_id):
         catalog.surveys.create("lobby", scan_ids=[add_scan(catalog).scan_id], model=MODEL)
 
 
@@ -180,10 +180,10 @@ def test_a_late_step_of_a_deleted_map_touches_nothing_of_the_map_that_took_its_i
     assert keys.map_folder(old) != keys.map_folder(new)
     left_out = [ScanOutcome(scan_id=before.scans[0].scan_id, accepted=False, reason="late")]
     with pytest.raises(NotFound):
-        catalog.maps.save_outcomes("lobby", left_out, job_id=old)
+        catalog.versions.save_outcomes(old, left_out)
     with pytest.raises(NotFound):
-        catalog.maps.save_result(
-            "lobby", outcomes=left_out, bounds=Bounds(min=(0, 0, 0), max=(9, 9, 9)), counts={}, job_id=old
+        catalog.versions.save_result(
+            old, outcomes=left_out, bounds=Bounds(min=(0, 0, 0), max=(9, 9, 9)), counts={}
         )
     assert not catalog.jobs.succeed(old)
     assert catalog.maps.get("lobby") == before

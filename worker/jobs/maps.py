@@ -23,7 +23,7 @@ from worker.pipeline.values import Points
 @step
 def register_map(at: Context) -> None:
     """Scans to a fused, tiled map."""
-    record = at.catalog.maps.get(at.job.map_id)
+    record = at.catalog.versions.of_job(at.job.job_id)
     card = open_card(at.settings.model_store, record.model)
     with ExitStack() as stack:
         files = scan_files(at, record.scans, stack)
@@ -31,15 +31,14 @@ def register_map(at: Context) -> None:
             built = build_map(files, settings=pipeline_settings(at, record, card), progress=at.report)
         except NothingToTile as error:
             outcomes = scan_outcomes(record.scans, error.outcomes)
-            at.catalog.maps.save_outcomes(record.map_id, outcomes, job_id=at.job.job_id)
+            at.catalog.versions.save_outcomes(at.job.job_id, outcomes)
             raise
     at.report("saving", 0.0)
     outcomes = scan_outcomes(record.scans, built.outcomes)
     save_scans(at, record.scans, built.outcomes, functools.partial(keys.map_scan, at.job.job_id))
     _put_map(at, built, card.preprocessing)
-    at.catalog.maps.save_result(
-        record.map_id,
-        job_id=at.job.job_id,
+    at.catalog.versions.save_result(
+        at.job.job_id,
         outcomes=outcomes,
         bounds=_bounds(built.reference.points),
         counts={
@@ -54,7 +53,7 @@ def register_map(at: Context) -> None:
 @step
 def describe_map(at: Context) -> None:
     """What the model can know of the reference alone; then the map is ready."""
-    record = at.catalog.maps.get(at.job.map_id)
+    record = at.catalog.versions.of_job(at.job.job_id)
     detector = kept_detector(at.settings, record.model)
     with at.catalog.blobs.local(keys.map_tiles(at.job.job_id)) as path:
         tiles = archive.load_tiles(path)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 from pathlib import Path
 
-from service.catalog.records import MapRecord
+from service.catalog.records import VersionRecord
 from service.settings import Settings
 from worker.detectors.card import Card
 from worker.detectors.detector import Detector
@@ -42,7 +42,7 @@ def card_that_fits(settings: Settings, model: str, map_model: str) -> Card:
     return card
 
 
-def pipeline_settings(at: Context, record: MapRecord, card: Card) -> PipelineSettings:
+def pipeline_settings(at: Context, record: VersionRecord, card: Card) -> PipelineSettings:
     asked = PipelineSettings.model_validate(
         {**record.settings, "max_scan_points": at.settings.max_scan_points}
     )

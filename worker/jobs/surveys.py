@@ -25,7 +25,7 @@ def register_survey(at: Context) -> None:
     """Scans to tiles paired with the map's; a survey with no accepted scan fails here."""
     survey_id = _survey_id(at)
     survey = at.catalog.surveys.get(survey_id)
-    record = at.catalog.maps.ready(survey.map_id)
+    record = at.catalog.versions.get(survey.map_id, survey.map_version)
     card = card_that_fits(at.settings, survey.model, record.model)
     with ExitStack() as stack:
         blobs = at.catalog.blobs
@@ -57,7 +57,8 @@ def score_survey(at: Context) -> None:
     with blobs.local(keys.survey_pairs(survey_id)) as path:
         pairs = archive.load_pairs(path)
     description = None
-    key = keys.map_description(at.catalog.maps.get(survey.map_id).job_id, survey.model)
+    built_by = at.catalog.versions.get(survey.map_id, survey.map_version).job_id
+    key = keys.map_description(built_by, survey.model)
     if blobs.exists(key):
         with blobs.local(key) as path:
             description = archive.load_arrays(path)
@@ -78,7 +79,7 @@ def export_survey(at: Context) -> None:
         pairs = archive.load_pairs(local(keys.survey_pairs(survey_id)))
         scores = archive.load_scores(local(keys.survey_scores(survey_id)))
         current = archive.load_current(local(keys.survey_current(survey_id)))
-        built_by = at.catalog.maps.get(survey.map_id).job_id
+        built_by = at.catalog.versions.get(survey.map_id, survey.map_version).job_id
         reference = archive.load_reference(local(keys.map_reference(built_by)))
     card = open_card(at.settings.model_store, survey.model)
     threshold = card.threshold if survey.threshold is None else survey.threshold
