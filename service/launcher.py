@@ -27,6 +27,7 @@ from fastapi import FastAPI
 from service.catalog.database import Database
 from service.children import WorkerPool
 from service.embedded_redis import EmbeddedRedis, LaunchFailed
+from service.queue import JobQueue
 from service.settings import Settings
 
 log = logging.getLogger("spicd")
@@ -73,6 +74,7 @@ def up(
         if settings.redis_url is None:
             redis = stack.enter_context(EmbeddedRedis(settings.data_dir / "redis"))
             sweep_scratch(settings.scratch_dir())  # the folder is ours alone now
+            _release_claims(redis)
         settings = _resolve(settings, redis, listening)
         _migrate(settings)
         pool = WorkerPool(
@@ -98,6 +100,13 @@ def sweep_scratch(folder: Path) -> None:
     """Remove what steps left that were killed; only while no worker runs on this folder."""
     for left in folder.iterdir() if folder.is_dir() else ():
         shutil.rmtree(left, ignore_errors=True)
+
+
+def _release_claims(redis: EmbeddedRedis) -> None:
+    """No worker of an earlier start is alive: they end with their launcher, and it with the server's lock."""
+    queue = JobQueue(redis.url)
+    queue.release_claims()
+    queue.close()
 
 
 def environment_of(settings: Settings) -> dict[str, str]:

@@ -18,6 +18,7 @@ from rq import Queue
 from rq.command import send_stop_job_command
 from rq.exceptions import InvalidJobOperation, NoSuchJobError
 from rq.job import Job, JobStatus
+from rq.registry import DeferredJobRegistry
 from rq.serializers import JSONSerializer
 
 from service.catalog.steps import STEPS, JobKind, Step
@@ -33,7 +34,7 @@ def step_id(job_id: str, step: Step) -> str:
 
 
 class JobQueue:
-    """Submits and dismisses jobs; safe to share between threads, connects at the first call.
+    """Submits, looks for and dismisses jobs; safe to share between threads, connects at the first call.
 
     `steps` is another table of steps in tests. Every method raises `QueueUnavailable` when Redis does not answer.
     """
@@ -58,20 +59,47 @@ class JobQueue:
             raise _unavailable(error) from error
 
     def submit(self, job_id: str, kind: JobKind) -> None:
-        """Enqueue the steps of a job, all or none; a job that is there already is left as it is."""
-        jobs = self._chain(job_id, kind)
+        """Enqueue the steps of a job, all or none; a job that the queue holds is left as it is.
+
+        One that it lost goes on with the first step that had not finished, as far as the queue remembers.
+        """
         try:
             with self._redis.pipeline() as pipe:
-                pipe.watch(jobs[0].key)  # type: ignore[no-untyped-call]
-                if pipe.exists(jobs[0].key):
+                # every change of a step's state is one of these keys, so who comes between is noticed
+                pipe.watch(*(Job.key_for(step_id(job_id, step)) for step in self._steps[kind]))  # type: ignore[no-untyped-call]
+                if self._holds(job_id, kind):
                     return
+                jobs = self._chain(job_id, self._left(job_id, kind))
                 pipe.multi()
+                for job in jobs:
+                    self._forget(job, pipe)
                 for waiting in jobs[1:]:
                     self._defer(waiting, pipe)
                 self._queue(jobs[0].origin).enqueue_job(jobs[0], pipeline=pipe)
                 pipe.execute()
-        except WatchError:  # the same job was submitted between the look and the write
+        except WatchError:  # the same job was submitted, or moved on, between the look and the write
             return
+        except RedisError as error:
+            raise _unavailable(error) from error
+
+    def holds(self, job_id: str, kind: JobKind) -> bool:
+        """Whether a step of the job waits for a worker, or a worker has its claim on one.
+
+        A claim outlives its worker by about a minute; then another worker finds it and asks what to do.
+        """
+        try:
+            return self._holds(job_id, kind)
+        except RedisError as error:
+            raise _unavailable(error) from error
+
+    def release_claims(self) -> None:
+        """Take all claims away: for a caller who knows that no worker is alive, and need not wait until they end."""
+        try:
+            for name in sorted({step.queue for steps in self._steps.values() for step in steps}):
+                queue = self._queue(name)
+                self._redis.delete(
+                    queue.started_job_registry.key, queue.intermediate_queue_key, queue.registry_cleaning_key
+                )
         except RedisError as error:
             raise _unavailable(error) from error
 
@@ -100,10 +128,31 @@ class JobQueue:
         """Give the connections back."""
         self._redis.close()
 
-    def _chain(self, job_id: str, kind: JobKind) -> list[Job]:
+    def _holds(self, job_id: str, kind: JobKind) -> bool:
+        """Looks in the order in which a step moves on, so that none slips by between two looks."""
+        for step in self._steps[kind]:
+            queue, name = self._queue(step.queue), step_id(job_id, step)
+            for waiting in (queue.key, queue.intermediate_queue_key):
+                if self._redis.lpos(waiting, name) is not None:
+                    return True
+            if name in queue.started_job_registry:
+                return True
+        return False
+
+    def _left(self, job_id: str, kind: JobKind) -> Sequence[Step]:
+        """The steps from the first that has not finished; all of them where none is known, or none is left."""
+        steps = self._steps[kind]
+        ids = [step_id(job_id, step) for step in steps]
+        found = Job.fetch_many(ids, connection=self._redis, serializer=JSONSerializer)
+        for number, job in enumerate(found):
+            if job is None or job.get_status(refresh=False) != JobStatus.FINISHED:
+                return steps[number:]
+        return steps
+
+    def _chain(self, job_id: str, steps: Sequence[Step]) -> list[Job]:
         """The steps as rq jobs, each waiting for the one before."""
         jobs: list[Job] = []
-        for step in self._steps[kind]:
+        for step in steps:
             jobs.append(
                 Job.create(
                     step.function,
@@ -119,6 +168,14 @@ class JobQueue:
                 )
             )
         return jobs
+
+    @staticmethod
+    def _forget(job: Job, pipe: Any) -> None:
+        """What an earlier submission left of a step."""
+        pipe.delete(job.key, job.dependents_key, job.dependencies_key, job.execution_registry.key)
+        for registry in (job.finished_job_registry, job.failed_job_registry):
+            pipe.zrem(registry.key, job.id)
+        DeferredJobRegistry(job.origin, connection=job.connection).remove(job.id, pipeline=pipe)
 
     def _queue(self, name: str) -> Queue:
         return Queue(name, connection=self._redis, serializer=JSONSerializer)

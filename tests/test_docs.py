@@ -8,10 +8,10 @@ from types import SimpleNamespace
 
 import pytest
 from pydantic_core import PydanticUndefined
-from rq.exceptions import AbandonedJobError
 from rq.timeouts import JobTimeoutException
 
 from service.api.problems import PROBLEMS
+from service.catalog.attempts import WORKER_DIED
 from service.errors import ServiceError
 from service.settings import Settings
 from worker import rq_workers
@@ -75,13 +75,7 @@ def codes(kind: type[Exception]) -> set[str]:
 
 
 def codes_of_ends() -> set[str]:
-    """What a worker records of a step that could not speak for itself."""
-    ends = (
-        FunctionRefused(),
-        JobTimeoutException(),
-        AbandonedJobError(),
-        rq_workers.WorkerStopped(),
-        KeyError(),
-    )
+    """What is recorded of a step that could not speak for itself."""
+    ends = (FunctionRefused(), JobTimeoutException(), KeyError())
     step = SimpleNamespace(id="job-1-register", timeout=1)
-    return {rq_workers._problem(end, step)[0] for end in ends}  # type: ignore[arg-type]
+    return {WORKER_DIED, *(rq_workers._problem(end, step)[0] for end in ends)}  # type: ignore[arg-type]

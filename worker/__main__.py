@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import importlib
 import logging
 import sys
 
 from redis import Redis
 
+from service.catalog.attempts import Attempts
 from service.catalog.database import Database
 from service.catalog.jobs import Jobs
 from service.catalog.records import Problem
@@ -16,7 +18,7 @@ from service.catalog.steps import ALLOWED_FUNCTIONS
 from service.lifetime import end_with_parent
 from service.logs import set_up_logging
 from service.settings import Settings
-from worker.rq_workers import GeometryWorker, InferenceWorker, OnDeath
+from worker.rq_workers import GeometryWorker, InferenceWorker
 from worker.threads import wait_passively
 
 log = logging.getLogger("worker")
@@ -47,26 +49,38 @@ def main(arguments: list[str] | None = None) -> int:
         options.queue,
         Redis.from_url(settings.redis_url),
         allowed=ALLOWED_FUNCTIONS,
-        on_death=_recorder(settings),
+        records=CatalogRecords(settings.resolved_database_url()),
         grace_s=options.grace,
     ).work()
     return 0
 
 
-def _recorder(settings: Settings) -> OnDeath:
-    """Writes a death to the catalog, first writer wins: what the step itself recorded stands.
+class CatalogRecords:
+    """Writes to the catalog how a step ended, first writer wins: what the step itself recorded stands.
 
     The database alone is opened, and closed again: the blob store starts threads, and this process forks.
     """
 
-    def record(job_id: str, code: str, sentence: str) -> None:
-        database = Database(settings.resolved_database_url())
-        try:
-            Jobs(database).fail(job_id, Problem(code=code, detail=sentence))
-        finally:
-            database.close()
+    def __init__(self, database_url: str) -> None:
+        self._url = database_url
 
-    return record
+    def failed(self, job_id: str, code: str, sentence: str) -> bool:
+        """The job failed with this problem."""
+        with self._database() as database:
+            return Jobs(database).fail(job_id, Problem(code=code, detail=sentence))
+
+    def lost(self, job_id: str, how: str) -> bool:
+        """Count an attempt; whether to start the step again."""
+        with self._database() as database:
+            return Attempts(database).lose(job_id, how)
+
+    def stopped(self, job_id: str) -> bool:
+        """The step waits for another worker; whether the job still wants it."""
+        with self._database() as database:
+            return Attempts(database).put_back(job_id)
+
+    def _database(self) -> contextlib.closing[Database]:
+        return contextlib.closing(Database(self._url))
 
 
 def _parse(arguments: list[str] | None) -> argparse.Namespace:

@@ -8,9 +8,13 @@ callbacks, bound instances, webhooks.
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
+from rq import Queue
+from rq.exceptions import NoSuchJobError
 from rq.job import Job
+from rq.serializers import JSONSerializer
 
 
 class FunctionRefused(Exception):
@@ -58,6 +62,28 @@ class StepJob(Job):  # type: ignore[misc]  # rq is untyped here
             return str(self.args[0])
         except Exception:  # the payload comes from outside and may be anything
             return None
+
+    def start_again(self) -> None:
+        """Have rq put the step back into its queue where it would mark it as failed; the steps behind it go on waiting.
+
+        That is rq's own retry, granted when it is due and not before: how often, the catalog knows. What the
+        attempt leaves behind goes: rq would take a place between queue and worker for a step that got stuck, and does
+        not delete a job whose execution has expired.
+        """
+        self.retries_left = 1
+        between = Queue(self.origin, connection=self.connection).intermediate_queue_key
+        self.connection.lrem(between, 0, self.id)
+        self.connection.delete(self.execution_registry.key)
+
+    def drop_dependents(self) -> None:
+        """Delete the steps that wait for this one, and those that wait for them."""
+        waiting = self.dependent_ids
+        self.connection.delete(self.dependents_key)  # before the descent: a forged circle ends too
+        for name in waiting:
+            with suppress(NoSuchJobError):
+                dependent = type(self).fetch(name, connection=self.connection, serializer=JSONSerializer)
+                dependent.drop_dependents()
+                dependent.delete()
 
 
 def step_job(allowed: frozenset[str]) -> type[StepJob]:

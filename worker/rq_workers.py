@@ -3,7 +3,9 @@
 `GeometryWorker` forks a process for each step, so that a crash in C++ or a lack of memory ends one step and not the
 worker. `InferenceWorker` keeps the network in its own memory and never forks (CUDA does not survive one).
 
-Both tell `on_death` when a step ended without having said why; what the step itself recorded stands.
+Both tell the catalog when a step ended without having said why; what the step itself recorded stands. A step whose
+process or worker died is started again where the catalog says so, and one that was stopped with its worker waits for
+the next. A step that took too long or raised is not: with the same scans it would do so again.
 """
 
 from __future__ import annotations
@@ -15,12 +17,13 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from typing import Any
+from typing import Any, Protocol
 
 from redis import Redis
 from redis.exceptions import RedisError
 from rq import Queue, SimpleWorker, Worker
-from rq.exceptions import AbandonedJobError, NoSuchJobError
+from rq.exceptions import AbandonedJobError
+from rq.job import JobStatus
 from rq.serializers import JSONSerializer
 from rq.timeouts import JobTimeoutException
 from rq.worker.base import BaseWorker
@@ -36,7 +39,18 @@ log = logging.getLogger("worker")
 WORKER_TTL_S = 20
 HEARTBEAT_S = 5
 
-OnDeath = Callable[[str, str, str], None]  #: job id, problem code, one sentence
+
+class Records(Protocol):
+    """What a worker tells the catalog, and asks it."""
+
+    def failed(self, job_id: str, code: str, sentence: str) -> object:
+        """A step ended for good, with this problem."""
+
+    def lost(self, job_id: str, how: str) -> bool:
+        """An attempt ended without a word; whether to start the step again."""
+
+    def stopped(self, job_id: str) -> bool:
+        """A step was stopped with its worker; whether it shall go on with another."""
 
 
 class WorkerStopped(BaseException):
@@ -47,7 +61,7 @@ class _StepWorker(BaseWorker):  # type: ignore[misc]  # rq is untyped here
     """What both kinds have in common: the allow-list, the end of a step, and the end of the worker."""
 
     def __init__(
-        self, queue: str, connection: Redis, *, allowed: frozenset[str], on_death: OnDeath, grace_s: float
+        self, queue: str, connection: Redis, *, allowed: frozenset[str], records: Records, grace_s: float
     ) -> None:
         super().__init__(
             [queue],
@@ -59,9 +73,8 @@ class _StepWorker(BaseWorker):  # type: ignore[misc]  # rq is untyped here
             maintenance_interval=HEARTBEAT_S,
             exception_handlers=[self._record],
         )
-        self._on_death = on_death
+        self._records = records
         self._grace_s = grace_s
-        self._grace_over = False
 
     def execute_job(self, job: StepJob, queue: Queue) -> None:
         begun = time.monotonic()
@@ -71,13 +84,16 @@ class _StepWorker(BaseWorker):  # type: ignore[misc]  # rq is untyped here
 
     def handle_exception(self, job: StepJob, *exc_info: Any) -> None:
         """Log a user's error in one line and ours with its traceback, then record it."""
-        expected = isinstance(exc_info[1], PipelineError | FunctionRefused)
+        expected = isinstance(exc_info[1], PipelineError | FunctionRefused | WorkerStopped)
         log.error("%s failed: %s", job.id, exc_info[1], exc_info=None if expected else exc_info)
         self._record(job, *exc_info)
 
     def handle_job_failure(self, job: StepJob, queue: Queue, *args: Any, **kwargs: Any) -> None:
-        """Forget the steps behind a failed one: rq does not run them, and would keep them for ever."""
-        _drop_dependents(job)
+        """Forget the steps behind one that failed for good: rq does not run them, and would keep them for ever."""
+        if self.execution is None and job.get_status(refresh=False) == JobStatus.QUEUED:
+            self._lost(job, _gone(job))  # rq found it between queue and worker: that one died before it began
+        if not job.should_retry:
+            job.drop_dependents()
         super().handle_job_failure(job, queue, *args, **kwargs)
 
     def handle_warm_shutdown_request(self) -> None:
@@ -93,17 +109,37 @@ class _StepWorker(BaseWorker):  # type: ignore[misc]  # rq is untyped here
     def _record(self, job: StepJob, kind: type[BaseException], error: BaseException, *_: Any) -> None:
         """Handler of rq for a step that raised, and for one whose worker went away."""
         if kind is AbandonedJobError:
-            _drop_dependents(job)
-        self._tell(job, *_problem(error, job))
+            self._lost(job, _gone(job))
+            if not job.should_retry:
+                job.drop_dependents()
+        elif kind is WorkerStopped:
+            self._put_back(job)
+        else:
+            self._tell(job, self._records.failed, *_problem(error, job))
 
-    def _tell(self, job: StepJob, code: str, sentence: str) -> None:
-        """Record the failure; a catalog that does not answer must not take the worker down."""
+    def _lost(self, job: StepJob, how: str) -> None:
+        """An attempt ended without a word."""
+        log.warning("%s: %s", job.id, how)
+        if self._tell(job, self._records.lost, how):
+            job.start_again()
+
+    def _put_back(self, job: StepJob) -> None:
+        """The step ends with this worker, through no fault of its own."""
+        if self._tell(job, self._records.stopped):
+            job.start_again()
+
+    def _tell(self, job: StepJob, record: Callable[..., object], *words: str) -> bool:
+        """The catalog's answer; one that does not answer must not take the worker down.
+
+        What it did not hear, it learns when the service next starts and finds the job running without a step.
+        """
         if job.catalog_id is None:
-            return
+            return False
         try:
-            self._on_death(job.catalog_id, code, sentence)
+            return bool(record(job.catalog_id, *words))
         except Exception:
-            log.exception("%s: the catalog did not take the failure", job.id)
+            log.exception("%s: the catalog did not take how it ended", job.id)
+            return False
 
 
 class GeometryWorker(_StepWorker, Worker):  # type: ignore[misc]
@@ -133,19 +169,14 @@ class GeometryWorker(_StepWorker, Worker):  # type: ignore[misc]
         usage: Any,  # noqa: ARG002
     ) -> None:
         """A step's process ended without a word: a crash, no memory, or this worker's end."""
-        if self._grace_over:
-            self._tell(job, *_problem(WorkerStopped(), job))
+        if self._stop_requested:
+            self._put_back(job)
         elif status is None:
-            self._tell(job, *_problem(JobTimeoutException(), job))
+            self._tell(job, self._records.failed, *_problem(JobTimeoutException(), job))
         else:
-            self._tell(
-                job,
-                "worker_died",
-                f"the process of step {job.id} ended {_ending(status)}; submit the job again",
-            )
+            self._lost(job, f"the process of step {job.id} ended {_ending(status)}")
 
     def _end_grace(self) -> None:
-        self._grace_over = True
         self.kill_horse()
 
 
@@ -195,15 +226,15 @@ def _problem(error: BaseException, job: StepJob) -> tuple[str, str]:
             return "function_refused", str(error)
         case JobTimeoutException():
             return "timed_out", f"step {job.id} took longer than {job.timeout} s; send fewer or smaller scans"
-        case AbandonedJobError():
-            return "worker_died", f"the worker of step {job.id} went away; submit the job again"
-        case WorkerStopped():
-            return "worker_stopped", f"the service was stopped while step {job.id} ran; submit the job again"
         case _:
             return (
                 "internal",
                 f"step {job.id} stopped on an unexpected {type(error).__name__}; see the worker's log",
             )
+
+
+def _gone(job: StepJob) -> str:
+    return f"the worker of step {job.id} went away"
 
 
 def _ending(status: int) -> str:
@@ -213,14 +244,3 @@ def _ending(status: int) -> str:
     number = os.WTERMSIG(status)
     why = " (often: out of memory)" if number == signal.SIGKILL else ""
     return f"by signal {signal.Signals(number).name}{why}"
-
-
-def _drop_dependents(job: StepJob) -> None:
-    """Delete the steps that wait for this one, and those that wait for them."""
-    waiting = job.dependent_ids
-    job.connection.delete(job.dependents_key)  # before the descent: a forged circle ends too
-    for name in waiting:
-        with suppress(NoSuchJobError):
-            dependent = type(job).fetch(name, connection=job.connection, serializer=JSONSerializer)
-            _drop_dependents(dependent)
-            dependent.delete()

@@ -17,7 +17,10 @@ class Queue(Protocol):
     """What the API asks of the job queue (`service.queue.JobQueue`)."""
 
     def submit(self, job_id: str, kind: JobKind) -> None:
-        """Hand a job to the workers. Raises QueueUnavailable."""
+        """Hand a job to the workers, unless they have it. Raises QueueUnavailable."""
+
+    def holds(self, job_id: str, kind: JobKind) -> bool:
+        """Whether the job waits for a worker or has one. Raises QueueUnavailable."""
 
     def dismiss(self, job_id: str, kind: JobKind) -> None:
         """Stop a job that waits or runs. Raises QueueUnavailable."""

@@ -9,6 +9,7 @@ from datetime import datetime
 
 from service.api.incoming import Upload
 from service.api.services import Services
+from service.catalog.attempts import Attempts
 from service.catalog.catalog import Catalog
 from service.catalog.records import JobRecord, ScanRecord
 from service.errors import QueueUnavailable, ServiceError
@@ -63,16 +64,20 @@ def submit(services: Services, job: JobRecord, *, forget: Callable[[], None]) ->
 
 
 def resubmit(services: Services) -> None:
-    """Hand over what was recorded and perhaps never submitted, for a process died between the two or Redis lost it.
+    """Hand over again what the catalog knows as unfinished and the queue does not hold; call when the service starts.
 
-    A job that is in the queue is left as it is. One that runs is not touched: whether its step is still at work, its
-    worker knows.
+    A job that waits was perhaps never submitted: a process died between the two, or Redis lost it. One that runs has
+    lost its worker, and with it an attempt: what takes the whole machine down with it must not do so for ever.
     """
+    attempts = Attempts(services.catalog.database)
     try:
-        for job in services.catalog.jobs.accepted():
-            services.queue.submit(job.job_id, job.kind)
+        for job in services.catalog.jobs.unfinished():
+            if services.queue.holds(job.job_id, job.kind):
+                continue
+            if job.status == "accepted" or attempts.lose(job.job_id, "the service ended while it ran"):
+                services.queue.submit(job.job_id, job.kind)
     except QueueUnavailable as error:
-        log.warning("jobs that wait could not be submitted again: %s", error)
+        log.warning("unfinished jobs could not be submitted again: %s", error)
 
 
 def dismiss(services: Services, job_id: str) -> JobRecord:

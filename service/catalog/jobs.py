@@ -56,9 +56,9 @@ class Jobs:
         with self._database.read() as session:
             return tuple(job_record(row) for row in session.scalars(query))
 
-    def accepted(self) -> tuple[JobRecord, ...]:
-        """The jobs that no step has begun, in the order they were asked for."""
-        query = select(tables.Job).where(tables.Job.status == "accepted")
+    def unfinished(self) -> tuple[JobRecord, ...]:
+        """The jobs that wait or run, in the order they were asked for."""
+        query = select(tables.Job).where(_OPEN)
         with self._database.read() as session:
             rows = session.scalars(query.order_by(tables.Job.created, tables.Job.id))
             return tuple(job_record(row) for row in rows)

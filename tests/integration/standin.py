@@ -1,6 +1,7 @@
 """A worker with steps of its own, for tests: `python standin.py geometry|inference REDIS_URL FOLDER [GRACE]`.
 
-What the steps did and how they ended stands in FOLDER/record, one line an event.
+What the steps did and how they ended stands in FOLDER/record, one line an event. Where STANDIN_CATALOG names a database,
+the steps begin and end their job there, and the worker tells it what it tells the catalog.
 """
 
 from __future__ import annotations
@@ -13,12 +14,16 @@ from pathlib import Path
 
 from redis import Redis
 
+from service.catalog.database import Database
+from service.catalog.jobs import Jobs
 from service.lifetime import end_with_parent
 from service.logs import set_up_logging
+from worker.__main__ import CatalogRecords
 from worker.errors import RegistrationFailed
 from worker.rq_workers import GeometryWorker, InferenceWorker
 
-FUNCTIONS = ("first", "second", "third", "refuse", "crash", "sleep", "busy")
+FUNCTIONS = ("first", "second", "third", "refuse", "crash", "sleep", "busy", "hold", "finish")
+MAX_LOST = 3
 
 
 def record(*words: str) -> None:
@@ -63,9 +68,41 @@ def busy(job_id: str) -> None:
         time.sleep(0.1)
 
 
+def hold(job_id: str) -> None:
+    """Work until the test says `go`."""
+    if catalog := os.environ.get("STANDIN_CATALOG"):
+        Jobs(Database(catalog)).start(job_id)
+    record("hold", job_id, str(os.getpid()))
+    while not Path(os.environ["STANDIN_RECORD"]).with_name("go").exists():
+        time.sleep(0.02)
+    record("held", job_id)
+
+
+def finish(job_id: str) -> None:
+    """The last step of a job in the catalog."""
+    record("finish", job_id)
+    Jobs(Database(os.environ["STANDIN_CATALOG"])).succeed(job_id)
+
+
 def leak(*_: object) -> None:
     """What nobody may call."""
     record("leak")
+
+
+class Book:
+    """Stands in for the catalog: every job is there and open, and is given up at the third loss."""
+
+    def failed(self, job_id: str, code: str, sentence: str) -> None:
+        record("died", job_id, code, sentence)
+
+    def lost(self, job_id: str, how: str) -> bool:
+        record("lost", job_id, how)
+        lines = Path(os.environ["STANDIN_RECORD"]).read_text().splitlines()
+        return sum(line.startswith(f"lost {job_id} ") for line in lines) < MAX_LOST
+
+    def stopped(self, job_id: str) -> bool:
+        record("stopped", job_id)
+        return True
 
 
 def main() -> None:
@@ -79,7 +116,7 @@ def main() -> None:
         queue,
         Redis.from_url(redis_url),
         allowed=frozenset(f"standin.{name}" for name in FUNCTIONS),
-        on_death=lambda job_id, code, sentence: record("died", job_id, code, sentence),
+        records=CatalogRecords(catalog) if (catalog := os.environ.get("STANDIN_CATALOG")) else Book(),
         grace_s=float(grace),
     ).work()
     record("ended", queue)

@@ -150,6 +150,24 @@ def test_a_start_sweeps_the_scratch_of_killed_steps_and_not_under_a_running_serv
     assert not step.exists()
 
 
+def test_a_start_takes_away_the_claims_of_workers_that_were_killed_with_the_service(
+    launched: Launched, tmp_path: Path
+) -> None:
+    client = Redis.from_url(launched.ready["redis_url"])
+    client.zadd("rq:wip:geometry", {"m1-register:1": time.time() + 60})
+    client.close()
+    launched.process.terminate()
+    launched.process.wait(20)
+    (tmp_path / "ready.json").unlink()
+    again = Launched(tmp_path, workers=0)
+    client = Redis.from_url(again.ready["redis_url"])
+    claims = client.zcard("rq:wip:geometry")
+    client.close()
+    again.process.kill()
+    again.process.wait()
+    assert claims == 0
+
+
 def test_a_dead_redis_is_started_again_with_what_it_held(launched: Launched) -> None:
     client = Redis.from_url(launched.ready["redis_url"])
     client.set("kept", "yes")

@@ -6,79 +6,17 @@ import os
 import signal
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterator
-from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
-from redis import Redis
 from rq import Queue
 from rq.serializers import JSONSerializer
 
-from service.catalog import tables
 from service.catalog.catalog import open_catalog
-from service.catalog.jobs import new_job
-from service.catalog.steps import Step
-from service.embedded_redis import EmbeddedRedis
 from service.launcher import environment_of
-from service.queue import JobQueue
 from service.settings import Settings
+from tests.integration.bench import ROOT, Bench, add_map, running, until
 from worker.rq_workers import GeometryWorker
-
-STANDIN = Path(__file__).parent / "standin.py"
-ROOT = Path(__file__).parents[2]
-
-
-def until(condition: Callable[[], object], seconds: float = 20) -> None:
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, "waited too long"
-        time.sleep(0.02)
-
-
-def running(pid: int) -> bool:
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
-    except FileNotFoundError:
-        return False
-
-
-class Bench:
-    """A queue, its workers, and the record of what the steps did."""
-
-    def __init__(self, folder: Path, redis_url: str) -> None:
-        self.folder, self.redis_url, self.redis = folder, redis_url, Redis.from_url(redis_url)
-        self.workers: list[subprocess.Popen[bytes]] = []
-
-    def worker(self, queue: str, grace: float = 5) -> subprocess.Popen[bytes]:
-        command = [sys.executable, str(STANDIN), queue, self.redis_url, str(self.folder), str(grace)]
-        environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-        self.workers.append(subprocess.Popen(command, env=environment, cwd=ROOT, start_new_session=True))
-        return self.workers[-1]
-
-    def submit(self, job_id: str, *steps: tuple[str, str], timeout_s: int = 60) -> JobQueue:
-        table = tuple(Step(name=name, function=f"standin.{name}", queue=queue) for name, queue in steps)
-        queue = JobQueue(self.redis_url, timeout_s=timeout_s, steps={"map": table})
-        queue.submit(job_id, "map")
-        return queue
-
-    def record(self) -> list[str]:
-        path = self.folder / "record"
-        return path.read_text().splitlines() if path.exists() else []
-
-    def wait_for(self, start: str) -> list[str]:
-        until(lambda: any(line.startswith(start) for line in self.record()))
-        return next(line for line in self.record() if line.startswith(start)).split()
-
-
-@pytest.fixture
-def bench(tmp_path: Path) -> Iterator[Bench]:
-    with EmbeddedRedis(tmp_path / "redis") as server:
-        bench = Bench(tmp_path, server.url)
-        yield bench
-        for worker in bench.workers:
-            worker.kill()
-            worker.wait()
 
 
 def test_steps_run_in_order_across_the_two_queues(bench: Bench) -> None:
@@ -98,16 +36,6 @@ def test_a_step_that_raises_ends_its_job_and_leaves_nothing_waiting(bench: Bench
     bench.wait_for("first m2")
     assert not any(line.startswith(("second", "third")) for line in bench.record())
     assert bench.redis.zcard("rq:deferred:geometry") == bench.redis.zcard("rq:deferred:inference") == 0
-
-
-def test_a_crash_ends_the_job_and_not_the_worker(bench: Bench) -> None:
-    worker = bench.worker("geometry")
-    bench.submit("m1", ("crash", "geometry"), ("second", "geometry"))
-    assert "SIGABRT" in " ".join(bench.wait_for("died m1 worker_died"))
-    bench.submit("m2", ("first", "geometry"))
-    bench.wait_for("first m2")
-    assert worker.poll() is None
-    assert not any(line.startswith("second m1") for line in bench.record())
 
 
 def test_a_dismissed_step_is_killed_and_the_worker_goes_on(bench: Bench) -> None:
@@ -146,41 +74,13 @@ def test_a_callback_that_a_job_names_is_not_called(bench: Bench) -> None:
     assert bench.record() == ["first m1", "first m2"]
 
 
-def test_a_killed_worker_takes_its_step_along_and_the_next_one_reports_it(bench: Bench) -> None:
-    first = bench.worker("geometry")
-    bench.submit("m1", ("sleep", "geometry"), ("second", "geometry"))
-    pid = int(bench.wait_for("sleep m1")[2])
-    until(lambda: bench.redis.zcard("rq:wip:geometry") == 1)
-    first.kill()
-    until(lambda: not running(pid))
-    claim = bench.redis.zrange("rq:wip:geometry", 0, -1)[0]
-    assert bench.redis.zscore("rq:wip:geometry", claim) < time.time() + 70  # found in about a minute
-    bench.redis.zadd("rq:wip:geometry", {claim: 1})  # as if that minute were over
-    bench.worker("geometry")
-    bench.wait_for("died m1 worker_died")
-    until(lambda: not bench.redis.exists("rq:job:m1-second"))
-
-
-@pytest.mark.parametrize(("kind", "step"), [("geometry", "sleep"), ("inference", "busy")])
-def test_a_worker_told_to_stop_ends_its_step_after_the_grace(bench: Bench, kind: str, step: str) -> None:
-    worker = bench.worker(kind, grace=0.3)
-    bench.submit("m1", (step, kind))
-    pid = int(bench.wait_for(f"{step} m1")[2])
-    worker.send_signal(signal.SIGTERM)
-    assert worker.wait(15) == 0
-    assert not running(pid)
-    assert "worker_stopped" in " ".join(bench.wait_for("died m1"))
-
-
 def test_a_stop_that_comes_when_the_step_is_over_kills_nobody(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     killed: list[int] = []
     monkeypatch.setattr(os, "killpg", lambda group, number: killed.append(group))
     monkeypatch.setattr(os, "kill", lambda pid, number: killed.append(pid))
-    worker = GeometryWorker(
-        "geometry", bench.redis, allowed=frozenset(), on_death=lambda *told: None, grace_s=1
-    )
+    worker = GeometryWorker("geometry", bench.redis, allowed=frozenset(), records=Mock(), grace_s=1)
     worker.kill_horse()
     assert killed == []
 
@@ -200,23 +100,7 @@ def test_the_real_worker_writes_what_it_refused_into_the_catalog(bench: Bench) -
         data_dir=bench.folder / "data", redis_url=bench.redis_url, blob_url=None, database_url=None
     )
     catalog = open_catalog(settings)
-    with catalog.database.write() as session:
-        job = new_job("map", "lobby")
-        job_id, instant = job.id, job.created
-        session.add(
-            tables.Map(
-                id="lobby",
-                status="building",
-                model="spicd-net/1",
-                settings={},
-                counts={},
-                job_id=job_id,
-                created=instant,
-                updated=instant,
-            )
-        )
-        session.flush()
-        session.add(job)
+    job_id = add_map(catalog)
     Queue("geometry", connection=bench.redis, serializer=JSONSerializer).enqueue("os.system", job_id)
     command = [sys.executable, "-m", "worker", "geometry"]
     bench.workers.append(subprocess.Popen(command, cwd=ROOT, env=environment_of(settings)))

@@ -36,11 +36,16 @@ class RememberingQueue:
 
     submitted: list[tuple[str, str]] = field(default_factory=list)
     dismissed: list[tuple[str, str]] = field(default_factory=list)
+    held: set[str] = field(default_factory=set)  #: jobs that were submitted before
     down: bool = False
 
     def submit(self, job_id: str, kind: str) -> None:
         self.ping()
         self.submitted.append((job_id, kind))
+
+    def holds(self, job_id: str, kind: str) -> bool:
+        self.ping()
+        return job_id in self.held
 
     def dismiss(self, job_id: str, kind: str) -> None:
         self.ping()

@@ -94,15 +94,32 @@ def test_jobs_are_listed_by_state_and_map(client, catalog):
         assert [job["jobID"] for job in client.get("/jobs", params=asked).json()["jobs"]] == ids
 
 
-def test_a_start_submits_again_what_waits_and_nothing_else(settings):
+def test_a_start_submits_again_what_is_unfinished_and_not_in_the_queue(settings):
     with running(settings, RememberingQueue()) as client:
         catalog = catalog_of(client)
-        first, begun, third = (add_map(catalog, name, ready=False) for name in ("a", "b", "c"))
-        catalog.jobs.start(begun)
+        first, begun, held, last = (add_map(catalog, name, ready=False) for name in ("a", "b", "c", "d"))
+        for job_id in (begun, held):
+            catalog.jobs.start(job_id)
         add_map(catalog, "done")
+    queue = RememberingQueue(held={held})
+    with running(settings, queue) as client:
+        assert queue.submitted == [(first, "map"), (begun, "map"), (last, "map")]
+        messages = {job["jobID"]: job["message"] for job in client.get("/jobs").json()["jobs"]}
+        assert messages[begun] == "started again (2 of 3): the service ended while it ran"
+        assert messages[first] == "waiting"
+
+
+def test_a_job_that_runs_at_the_third_end_of_the_service_is_given_up(settings):
+    with running(settings, RememberingQueue()) as client:
+        job_id = add_map(catalog_of(client), ready=False)
+        catalog_of(client).jobs.start(job_id)
     queue = RememberingQueue()
-    with running(settings, queue):
-        assert queue.submitted == [(first, "map"), (third, "map")]
+    for _ in range(3):
+        with running(settings, queue) as client:
+            job = client.get(f"/jobs/{job_id}").json()
+    assert queue.submitted == [(job_id, "map")] * 2
+    assert (job["status"], job["problem"]["type"]) == ("failed", "urn:spicd:problem:worker_died")
+    assert "3 attempts" in job["problem"]["detail"]
 
 
 def test_a_start_without_a_queue_serves_all_the_same(settings):

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import socket
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -58,6 +60,76 @@ def test_submitting_twice_queues_once(queue: JobQueue, redis: Redis) -> None:
     assert redis.zcard("rq:deferred:inference") == 1
 
 
+def begin(redis: Redis, name: str, queue: str = "geometry") -> None:
+    """What a worker leaves in Redis that has taken a step."""
+    redis.lrem(f"rq:queue:{queue}", 1, name)
+    redis.zadd(f"rq:wip:{queue}", {f"{name}:1": time.time() + 60})
+    redis.hset(f"rq:job:{name}", "status", "started")
+
+
+def test_a_job_is_held_while_a_step_waits_or_a_worker_has_it(queue: JobQueue, redis: Redis) -> None:
+    assert not queue.holds("m1", "map")
+    queue.submit("m1", "map")
+    assert queue.holds("m1", "map")
+    redis.lmove("rq:queue:geometry", "rq:queue:geometry:intermediate")  # a worker is about to begin
+    assert queue.holds("m1", "map")
+    redis.delete("rq:queue:geometry:intermediate")
+    begin(redis, "m1-register")
+    assert queue.holds("m1", "map")
+    redis.delete("rq:wip:geometry")
+    assert not queue.holds("m1", "map")
+    assert not queue.holds("m", "map")
+
+
+def test_a_step_that_a_worker_has_is_not_queued_again(queue: JobQueue, redis: Redis) -> None:
+    queue.submit("m1", "map")
+    begin(redis, "m1-register")
+    queue.submit("m1", "map")
+    assert redis.exists("rq:queue:geometry") == 0
+    assert redis.hget("rq:job:m1-register", "status") == "started"
+
+
+def test_a_step_whose_claims_are_released_is_queued_again_with_those_behind_it(
+    queue: JobQueue, redis: Redis
+) -> None:
+    queue.submit("s1", "survey")
+    begin(redis, "s1-register")
+    redis.set("rq:clean_registries:geometry", 1)  # of a worker that was killed while it cleaned up
+    queue.release_claims()
+    assert redis.exists("rq:clean_registries:geometry") == 0
+    queue.submit("s1", "survey")
+    assert redis.lrange("rq:queue:geometry", 0, -1) == ["s1-register"]
+    assert redis.hget("rq:job:s1-register", "status") == "queued"
+    assert redis.smembers("rq:job:s1-score:dependents") == {"s1-export"}
+    assert redis.zrange("rq:deferred:inference", 0, -1) == ["s1-score"]
+
+
+def test_a_job_goes_on_with_the_step_that_had_not_finished(queue: JobQueue, redis: Redis) -> None:
+    queue.submit("s1", "survey")
+    begin(redis, "s1-register")
+    redis.hset("rq:job:s1-register", "status", "finished")
+    redis.zrem("rq:deferred:inference", "s1-score")
+    begin(redis, "s1-score", "inference")
+    queue.release_claims()
+    queue.submit("s1", "survey")
+    assert redis.exists("rq:queue:geometry") == 0
+    assert redis.lrange("rq:queue:inference", 0, -1) == ["s1-score"]
+    assert redis.zrange("rq:deferred:geometry", 0, -1) == ["s1-export"]
+
+
+def test_a_step_that_failed_unheard_leaves_no_trace_when_it_is_queued_again(
+    queue: JobQueue, redis: Redis
+) -> None:
+    queue.submit("m1", "map")
+    redis.delete("rq:queue:geometry")
+    redis.hset("rq:job:m1-register", mapping={"status": "failed", "exc_info": "x", "retries_left": 5})
+    redis.zadd("rq:failed:geometry", {"m1-register": time.time() + 60})
+    queue.submit("m1", "map")
+    assert redis.zcard("rq:failed:geometry") == 0
+    assert redis.hget("rq:job:m1-register", "retries_left") is None
+    assert redis.lrange("rq:queue:geometry", 0, -1) == ["m1-register"]
+
+
 def test_dismiss_leaves_nothing_of_a_waiting_job_and_all_of_another(queue: JobQueue, redis: Redis) -> None:
     queue.submit("s1", "survey")
     queue.submit("s2", "survey")
@@ -76,7 +148,9 @@ def test_a_refused_connection_is_reported_and_the_password_is_not(tmp_path: Path
     with socket.socket() as closed:
         closed.bind(("127.0.0.1", 0))
         queue = JobQueue(f"redis://:secret@127.0.0.1:{closed.getsockname()[1]}")
-        for call in (queue.ping, lambda: queue.submit("m1", "map"), lambda: queue.dismiss("m1", "map")):
+        about = (queue.submit, queue.holds, queue.dismiss)
+        calls = [functools.partial(call, "m1", "map") for call in about]
+        for call in (queue.ping, queue.release_claims, *calls):
             with pytest.raises(QueueUnavailable, match="nothing was recorded") as found:
                 call()
             assert "secret" not in str(found.value)
