@@ -109,9 +109,11 @@ class Client:
         name: str | None = None,
         model: str | None = None,
         settings: Document | None = None,
+        anchor: Document | None = None,
     ) -> Document:
         """Build a reference map; returns `map_id` and `job_id`."""
-        body = {"id": map_id, "name": name, "model": model, "settings": settings, "scan_ids": list(scan_ids)}
+        about = {"id": map_id, "name": name, "model": model, "settings": settings, "anchor": anchor}
+        body = {**about, "scan_ids": list(scan_ids)}
         return self._json("POST", "/maps", json=_given(body))
 
     def maps(self) -> list[Document]:
@@ -119,12 +121,38 @@ class Client:
         return self._all("/maps", "maps")
 
     def map(self, map_id: str) -> Document:
-        """One map with its scans."""
+        """One map as its version in use, with its scans."""
         return self._json("GET", f"/maps/{_quoted(map_id)}")
 
     def delete_map(self, map_id: str) -> None:
-        """Remove a map with its surveys."""
+        """Remove a map with its versions and surveys."""
         self._send("DELETE", f"/maps/{_quoted(map_id)}")
+
+    def set_anchor(self, map_id: str, anchor: Document | None) -> None:
+        """Say where a map lies on the Earth: `longitude latitude height heading`; None: nobody knows."""
+        path = f"/maps/{_quoted(map_id)}/anchor"
+        self._send("DELETE", path) if anchor is None else self._send("PUT", path, json=anchor)
+
+    # versions
+
+    def create_version(
+        self, map_id: str, scan_ids: Sequence[str] = (), *, survey_id: str | None = None
+    ) -> Document:
+        """Go on from a map's version in use, with further scans or a survey; returns `version` and `job_id`."""
+        body = {"scan_ids": list(scan_ids) or None, "survey_id": survey_id}
+        return self._json("POST", f"/maps/{_quoted(map_id)}/versions", json=_given(body))
+
+    def versions(self, map_id: str) -> list[Document]:
+        """Every version of a map, newest first."""
+        return self._all(f"/maps/{_quoted(map_id)}/versions", "versions")
+
+    def version(self, map_id: str, version: int) -> Document:
+        """One version of a map with its scans."""
+        return self._json("GET", f"/maps/{_quoted(map_id)}/versions/{version}")
+
+    def delete_version(self, map_id: str, version: int) -> None:
+        """Remove a version that is not in use."""
+        self._send("DELETE", f"/maps/{_quoted(map_id)}/versions/{version}")
 
     # surveys
 

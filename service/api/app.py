@@ -10,7 +10,7 @@ from typing import Any
 from fastapi import FastAPI
 from fastapi.concurrency import run_in_threadpool
 
-from service.api import changes, health, jobs, maps, models, problems, scans, surveys
+from service.api import anchors, changes, health, jobs, maps, models, problems, scans, surveys, versions
 from service.api.bodies import INCOMING
 from service.api.cards import Cards
 from service.api.incoming import sweep
@@ -25,7 +25,7 @@ from service.settings import Settings
 DESCRIPTION = """\
 Upload LiDAR scans of a building, build a reference map of them, and ask, tile by tile, what a later visit found changed.
 
-A map and a survey are built by jobs: the answer to the POST names the job, and `GET /jobs/{id}` says how far it is.
+Maps, their versions and surveys are built by jobs: the answer to the POST names the job, and `GET /jobs/{id}` says how far it is.
 Every error is a problem document (RFC 9457) with a stable `type`.
 """
 
@@ -50,7 +50,7 @@ def create_app(settings: Settings, *, queue: Queue | None = None) -> FastAPI:
     app.state.metrics = Metrics()
     app.add_middleware(MetricsMiddleware, metrics=app.state.metrics)
     problems.add_handlers(app)
-    for part in (scans, maps, surveys, changes, jobs, models, health):
+    for part in (scans, maps, versions, anchors, surveys, changes, jobs, models, health):
         app.include_router(part.router)
     return app
 

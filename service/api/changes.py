@@ -116,7 +116,7 @@ def get_changes(
     for nothing found is not the same as no change.
     """
     catalog = services.catalog
-    catalog.maps.ready(map_id)
+    found = catalog.maps.ready(map_id)
     if asked.survey is not None and catalog.surveys.ready(asked.survey).map_id != map_id:
         raise NotFound(f"survey {asked.survey!r} is not of map {map_id!r}")
     since, until = (None, None) if asked.datetime is None else span_of(asked.datetime)
@@ -138,4 +138,4 @@ def get_changes(
     ]
     if page.following is not None:
         links.append(next_link(request, change_cursor(page.following), features.MEDIA_TYPE))
-    return feature_response(page.items, matched=page.matched, links=links)
+    return feature_response(page.items, matched=page.matched, links=links, anchor=found.anchor)

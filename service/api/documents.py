@@ -1,20 +1,17 @@
-"""What clients get, as documents; features are in features.py and problems in problems.py."""
+"""What clients get, as documents; maps are in map_documents.py, features in features.py and problems in problems.py."""
 
 from __future__ import annotations
 
 from datetime import datetime
-from typing import Any, Literal
+from typing import Literal
 
 from fastapi import Request
 from pydantic import BaseModel, ConfigDict, Field
 
 from service.api.problems import ProblemDocument, problem_of
 from service.catalog.records import (
-    Bounds,
     JobRecord,
     JobStatus,
-    MapRecord,
-    MapStatus,
     Matrix,
     Problem,
     ScanFormat,
@@ -55,29 +52,12 @@ class ScanDocument(Document):
     created: datetime
 
 
-class MapDocument(Document):
-    """A reference map and what became of its scans."""
-
-    map_id: str = Field(examples=["lobby"])
-    name: str | None
-    status: MapStatus
-    model: str = Field(examples=["spicd-net/1"])
-    settings: dict[str, Any]
-    scans: tuple[ScanOutcome, ...]
-    bounds: Bounds | None = Field(description="metres, map frame")
-    counts: dict[str, int] = Field(examples=[{"points": 181342, "tiles": 172, "scans": 25, "accepted": 24}])
-    job_id: str
-    problem: ProblemDocument | None
-    created: datetime
-    updated: datetime
-    links: list[Link]
-
-
 class SurveyDocument(Document):
     """A survey and what became of its scans."""
 
     survey_id: str = Field(examples=["survey-91c4"])
     map_id: str = Field(examples=["lobby"])
+    map_version: int = Field(description="of the map, that the survey is compared with", examples=[1])
     status: SurveyStatus
     model: str = Field(examples=["spicd-net/1"])
     threshold: float | None = Field(description="asked for, then the one that was used")
@@ -113,15 +93,6 @@ class JobDocument(Document):
     links: list[Link]
 
 
-class AcceptedMap(Document):
-    """A map that is going to be built."""
-
-    map_id: str = Field(examples=["lobby"])
-    job_id: str = Field(examples=["job-5f0c"])
-    status: MapStatus
-    links: list[Link]
-
-
 class AcceptedSurvey(Document):
     """A survey that is going to be compared."""
 
@@ -135,21 +106,6 @@ class AcceptedSurvey(Document):
 def scan_document(record: ScanRecord) -> ScanDocument:
     """A scan, less where its blob lies."""
     return ScanDocument(**record.model_dump(exclude={"key"}))
-
-
-def map_document(record: MapRecord, request: Request) -> MapDocument:
-    """A map with its links."""
-    here = f"/maps/{record.map_id}"
-    links = [link(request, here, "self"), link(request, f"/jobs/{record.job_id}", "monitor")]
-    if record.status == "ready":
-        links += [
-            link(request, f"{here}/manifest", "manifest"),
-            link(request, f"{here}/cloud.ply", "cloud", "application/octet-stream"),
-            link(request, f"{here}/changes", "changes", "application/geo+json"),
-        ]
-    return MapDocument(
-        **record.model_dump(exclude={"problem"}), problem=_problem(record.problem), links=links
-    )
 
 
 def survey_document(record: SurveyRecord, request: Request) -> SurveyDocument:
@@ -167,7 +123,7 @@ def survey_document(record: SurveyRecord, request: Request) -> SurveyDocument:
             link(request, f"{here}/picture.png", "preview", "image/png"),
         ]
     return SurveyDocument(
-        **record.model_dump(exclude={"problem"}), problem=_problem(record.problem), links=links
+        **record.model_dump(exclude={"problem"}), problem=problem_document(record.problem), links=links
     )
 
 
@@ -180,7 +136,7 @@ def job_document(record: JobRecord, request: Request) -> JobDocument:
     return JobDocument(
         jobID=record.job_id,
         processID=record.kind,
-        problem=_problem(record.problem),
+        problem=problem_document(record.problem),
         links=links,
         **record.model_dump(exclude={"job_id", "kind", "problem"}),
     )
@@ -191,5 +147,6 @@ def link(request: Request, path: str, rel: str, media_type: str = "application/j
     return Link(href=request.scope.get("root_path", "") + path, rel=rel, type=media_type)
 
 
-def _problem(problem: Problem | None) -> ProblemDocument | None:
+def problem_document(problem: Problem | None) -> ProblemDocument | None:
+    """The problem of a job that failed."""
     return None if problem is None else problem_of(problem)

@@ -1,7 +1,7 @@
 """Tiles as features: OGC Features and Geometries JSON 1.0 (JSON-FG, OGC 21-045r1), which is GeoJSON as well.
 
-A tile is a Prism in the map's own frame: metres, z up, origin unknown to the Earth. GeoJSON's `geometry`
-admits WGS 84 alone and so is null.
+A tile is a Prism in the map's own frame: metres, z up. GeoJSON's `geometry` admits WGS 84 alone (RFC 7946, Section 4): it is
+the footprint at the height of the tile's floor where the map has a geo-anchor, and null where nobody said where it lies.
 """
 
 from __future__ import annotations
@@ -13,8 +13,9 @@ from fastapi.responses import Response
 from pydantic import Field
 
 from service.api.documents import Document, Link
+from service.api.geodesy import ToWgs84, to_wgs84
 from service.catalog.clock import now, rfc3339
-from service.catalog.records import ChangeRecord, TileState, Vector3
+from service.catalog.records import Anchor, ChangeRecord, TileState, Vector3
 
 MEDIA_TYPE = "application/geo+json"
 CONFORMS_TO = (
@@ -35,6 +36,16 @@ class Polygon(Document):
     coordinates: tuple[tuple[Position2, ...]] = Field(
         examples=[[[[6.0, 3.0], [7.5, 3.0], [7.5, 4.5], [6.0, 4.5], [6.0, 3.0]]]]
     )
+
+
+class Footprint(Document):
+    """The footprint on the Earth: longitude, latitude (degrees), height of the tile's floor above the ellipsoid (metres).
+
+    Counter-clockwise and closed (RFC 7946, Section 3.1.6).
+    """
+
+    type: Literal["Polygon"] = "Polygon"
+    coordinates: tuple[tuple[Vector3, ...]]
 
 
 class Prism(Document):
@@ -67,6 +78,7 @@ class TileProperties(Document):
     n_reference: int = Field(description="points of the map in the tile", examples=[1904])
     n_current: int = Field(description="points of the survey in the tile", examples=[2210])
     map_id: str = Field(examples=["lobby"])
+    map_version: int = Field(description="that the survey was compared with", examples=[1])
     survey_id: str = Field(examples=["survey-91c4"])
     model: str = Field(examples=["spicd-net/1"])
     captured_at: str = Field(examples=["2026-03-01T12:00:00Z"])
@@ -77,7 +89,7 @@ class TileFeature(Document):
 
     type: Literal["Feature"] = "Feature"
     id: str = Field(examples=["survey-91c4.tile_004_002_000"])
-    geometry: None = None
+    geometry: Footprint | None = Field(description="WGS 84; null where the map has no geo-anchor")
     place: Prism
     time: Time
     properties: TileProperties
@@ -104,10 +116,11 @@ class FeatureResponse(Response):
 
 
 def feature_response(
-    changes: Iterable[ChangeRecord], *, matched: int, links: Iterable[Link]
+    changes: Iterable[ChangeRecord], *, matched: int, links: Iterable[Link], anchor: Anchor | None
 ) -> FeatureResponse:
-    """A collection of tiles; `matched` counts those of every page."""
-    features = [feature(change) for change in changes]
+    """A collection of tiles of a map that lies at `anchor`; `matched` counts those of every page."""
+    convert = None if anchor is None else to_wgs84(anchor)
+    features = [feature(change, convert) for change in changes]
     collection = TileCollection(
         timeStamp=rfc3339(now()),
         numberMatched=matched,
@@ -118,13 +131,14 @@ def feature_response(
     return FeatureResponse(collection.model_dump_json())
 
 
-def feature(change: ChangeRecord) -> TileFeature:
-    """One tile of a survey."""
+def feature(change: ChangeRecord, convert: ToWgs84 | None) -> TileFeature:
+    """One tile of a survey; `convert` takes points of the map frame to the Earth."""
     tile, captured_at = change.tile, rfc3339(change.captured_at)
     (x0, y0, z0), (x1, y1, z1) = tile.bounds.min, tile.bounds.max
     footprint = ((x0, y0), (x1, y0), (x1, y1), (x0, y1), (x0, y0))
     return TileFeature(
         id=f"{change.survey_id}.{tile.tile_id}",
+        geometry=None if convert is None else on_earth(footprint, z0, convert),
         place=Prism(base=Polygon(coordinates=(footprint,)), lower=z0, upper=z1),
         time=Time(timestamp=captured_at),
         properties=TileProperties(
@@ -138,10 +152,19 @@ def feature(change: ChangeRecord) -> TileFeature:
             n_reference=tile.n_reference,
             n_current=tile.n_current,
             map_id=change.map_id,
+            map_version=change.map_version,
             survey_id=change.survey_id,
             model=change.model,
             captured_at=captured_at,
         ),
+    )
+
+
+def on_earth(footprint: Iterable[Position2], lower: float, convert: ToWgs84) -> Footprint:
+    """The footprint in WGS 84, to about a millimetre: 9 decimals of a degree are 0.1 mm."""
+    corners = (convert((x, y, lower)) for x, y in footprint)
+    return Footprint(
+        coordinates=(tuple((round(lon, 9), round(lat, 9), round(height, 3)) for lon, lat, height in corners),)
     )
 
 

@@ -9,8 +9,9 @@ from fastapi.concurrency import run_in_threadpool
 
 from service.api import bodies, files
 from service.api.bodies import Body
-from service.api.documents import AcceptedMap, Document, Link, MapDocument, link, map_document
+from service.api.documents import Document, Link, link
 from service.api.files import blob_response
+from service.api.map_documents import AcceptedMap, MapDocument, map_document
 from service.api.paging import PageRequest, list_links
 from service.api.problems import documented
 from service.api.requests import MapRequest, checked
@@ -50,7 +51,7 @@ class MapList(Document):
     openapi_extra=body_of(json=MapRequest, form=MapRequest, file="scans"),
 )
 async def create_map(request: Request, response: Response, services: Provided) -> AcceptedMap:
-    """From scans uploaded before (`scan_ids`) or sent here (`scans`); the first one sets the frame of the map."""
+    """From scans uploaded before (`scan_ids`) or sent here (`scans`); their poses, where given, set the frame of the map."""
     async with bodies.received(
         request, services.settings, takes=(bodies.JSON, bodies.FORM), files="scans"
     ) as body:
@@ -72,7 +73,10 @@ def list_maps(request: Request, services: Provided, asked: Annotated[PageRequest
 
 @router.get("/maps/{map_id}", summary="Look at a map", responses=documented("not_found", "invalid_request"))
 def get_map(request: Request, services: Provided, map_id: MapId) -> MapDocument:
-    """Its state, what became of each scan, and its extent and counts once it is ready."""
+    """Its version in use: state, what became of each scan, and extent and counts once it is ready.
+
+    A map stays `ready` while a newer version builds, and when that fails; see its versions.
+    """
     return map_document(services.catalog.maps.get(map_id), request)
 
 
@@ -83,7 +87,7 @@ def get_map(request: Request, services: Provided, map_id: MapId) -> MapDocument:
     responses=documented("not_found", "invalid_request"),
 )
 def delete_map(services: Provided, map_id: MapId) -> None:
-    """With its surveys, jobs and files; jobs that still run are stopped first. Its scans stay."""
+    """With its versions, surveys, jobs and files; jobs that still run are stopped first. Its scans stay."""
     services.catalog.maps.get(map_id)
     for job in services.catalog.jobs.open_of(map_id):
         stop_if_open(services, job.job_id)
@@ -139,6 +143,7 @@ def _create(services: Services, wanted: MapRequest, body: Body) -> tuple[MapReco
             map_id=wanted.id,
             name=wanted.name,
             settings=wanted.settings.model_dump(mode="json", exclude_none=True),
+            anchor=None if wanted.anchor is None else wanted.anchor.anchor(),
         )
         submit(services, job, forget=lambda: catalog.maps.delete(record.map_id))
     return record, job

@@ -8,6 +8,7 @@ from fastapi.exceptions import RequestValidationError
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
 from service.api.values import DeviceId, Id, Instant, Model, Pose, Text, from_text, names_from_text
+from service.catalog.records import Anchor
 
 R = TypeVar("R", bound=BaseModel)
 
@@ -62,6 +63,30 @@ class MapSettings(Request):
     registration: RegistrationRequest = RegistrationRequest()
 
 
+class AnchorRequest(Request):
+    """Where a map lies on the Earth: the origin of its frame in WGS 84, and how the frame is turned; z points up there."""
+
+    longitude: Annotated[float, Field(ge=-180, le=180, description="degrees, of the origin", examples=[13.4])]
+    latitude: Annotated[float, Field(ge=-90, le=90, description="degrees, of the origin", examples=[52.5])]
+    height: Annotated[
+        float,
+        Field(ge=-1000, le=10_000, description="metres above the ellipsoid, of the origin", examples=[76.2]),
+    ]
+    heading: Annotated[
+        float,
+        Field(
+            ge=0,
+            lt=360,
+            description="degrees, clockwise from true north to the map's x axis; 90: x points east, y north",
+            examples=[90],
+        ),
+    ]
+
+    def anchor(self) -> Anchor:
+        """As the catalog keeps it."""
+        return Anchor(**self.model_dump())
+
+
 class MapRequest(Request):
     """A map of scans that were uploaded before, or come with the request."""
 
@@ -70,6 +95,21 @@ class MapRequest(Request):
     scan_ids: Annotated[tuple[Id, ...], BeforeValidator(names_from_text), Field(max_length=1000)] = ()
     settings: Annotated[MapSettings, BeforeValidator(from_text)] = MapSettings()
     model: Annotated[Model | None, Field(description="left out: the service's default")] = None
+    anchor: Annotated[
+        Annotated[AnchorRequest, BeforeValidator(from_text)] | None,
+        Field(description="left out: nobody knows where on the Earth it lies"),
+    ] = None
+    captured_at: Annotated[Instant | None, Field(description="of the files in this request")] = None
+    device_id: Annotated[DeviceId | None, Field(description="of the files in this request")] = None
+
+
+class VersionRequest(Request):
+    """A version of a map: of further scans, or of a survey that was accepted."""
+
+    scan_ids: Annotated[tuple[Id, ...], BeforeValidator(names_from_text), Field(max_length=1000)] = ()
+    survey_id: Annotated[
+        Id | None, Field(description="take over what this survey found changed; then without scans")
+    ] = None
     captured_at: Annotated[Instant | None, Field(description="of the files in this request")] = None
     device_id: Annotated[DeviceId | None, Field(description="of the files in this request")] = None
 

@@ -17,11 +17,11 @@ from pydantic.json_schema import models_json_schema
 
 from service.api.features import TileCollection
 from service.api.problems import ProblemDocument
-from service.api.requests import MapRequest, ScanRequest, SurveyRequest
+from service.api.requests import AnchorRequest, MapRequest, ScanRequest, SurveyRequest, VersionRequest
 
 FILE = Path("openapi/openapi.json")
 _REF = "#/components/schemas/{model}"
-_SENT: tuple[type[BaseModel], ...] = (ScanRequest, MapRequest, SurveyRequest)
+_SENT: tuple[type[BaseModel], ...] = (ScanRequest, MapRequest, VersionRequest, AnchorRequest, SurveyRequest)
 _ANSWERED: tuple[type[BaseModel], ...] = (ProblemDocument, TileCollection)
 _MODES: tuple[tuple[tuple[type[BaseModel], ...], Literal["validation", "serialization"]], ...] = (
     (_SENT, "validation"),
@@ -30,7 +30,11 @@ _MODES: tuple[tuple[tuple[type[BaseModel], ...], Literal["validation", "serializ
 
 
 def body_of(
-    *, json: type[BaseModel] | None = None, raw: bool = False, form: type[BaseModel], file: str
+    *,
+    json: type[BaseModel] | None = None,
+    raw: bool = False,
+    form: type[BaseModel] | None = None,
+    file: str = "file",
 ) -> dict[str, Any]:
     """The `openapi_extra` of a route that reads its body by hand; `file` is the form field of the file or files."""
     content: dict[str, Any] = {}
@@ -38,17 +42,16 @@ def body_of(
         content["application/octet-stream"] = {"schema": {"type": "string", "format": "binary"}}
     if json is not None:
         content["application/json"] = {"schema": {"$ref": _REF.format(model=json.__name__)}}
+    if form is not None:
+        content["multipart/form-data"] = {"schema": _form(form, file)}
+    return {"requestBody": {"required": True, "content": content}}
+
+
+def _form(form: type[BaseModel], file: str) -> dict[str, Any]:
     binary: dict[str, Any] = {"type": "string", "format": "binary"}
     files = binary if file == "file" else {"type": "array", "items": binary}
-    content["multipart/form-data"] = {
-        "schema": {
-            "allOf": [
-                {"$ref": _REF.format(model=form.__name__)},
-                {"type": "object", "properties": {file: files}},
-            ]
-        }
-    }
-    return {"requestBody": {"required": True, "content": content}}
+    named = {"type": "object", "properties": {file: files}}
+    return {"allOf": [{"$ref": _REF.format(model=form.__name__)}, named]}
 
 
 def describe(app: FastAPI) -> dict[str, Any]:

@@ -54,7 +54,7 @@ class SurveyList(Document):
 async def create_survey(
     request: Request, response: Response, services: Provided, map_id: MapId
 ) -> AcceptedSurvey:
-    """Of scans uploaded before (`scan_ids`) or sent here (`scans`)."""
+    """Of scans uploaded before (`scan_ids`) or sent here (`scans`), with the version of the map that is in use now."""
     reference = await run_in_threadpool(services.catalog.maps.ready, map_id)  # before a long upload
     async with bodies.received(
         request, services.settings, takes=(bodies.JSON, bodies.FORM), files="scans"
@@ -99,10 +99,13 @@ def get_survey(request: Request, services: Provided, survey_id: SurveyId) -> Sur
     "/surveys/{survey_id}",
     status_code=204,
     summary="Delete a survey",
-    responses=documented("not_found", "invalid_request"),
+    responses=documented("not_found", "conflict", "invalid_request"),
 )
 def delete_survey(services: Provided, survey_id: SurveyId) -> None:
-    """With its job and files; a job that still runs is stopped first. Its scans stay."""
+    """With its job and files; a job that still runs is stopped first. Its scans stay.
+
+    Versions of the map that took the survey over stay as well; while one is being built of it, this is a conflict.
+    """
     stop_if_open(services, services.catalog.surveys.get(survey_id).job_id)
     services.catalog.surveys.delete(survey_id)
 
@@ -116,10 +119,11 @@ def delete_survey(services: Provided, survey_id: SurveyId) -> None:
 )
 def get_tiles(request: Request, services: Provided, survey_id: SurveyId) -> FeatureResponse:
     """Unchanged, changed, inconsistent and unobserved tiles alike."""
-    services.catalog.surveys.ready(survey_id)
+    survey = services.catalog.surveys.ready(survey_id)
+    anchor = services.catalog.maps.get(survey.map_id).anchor
     tiles = services.catalog.changes.of_survey(survey_id)
     here = link(request, f"/surveys/{survey_id}/tiles", "self", features.MEDIA_TYPE)
-    return feature_response(tiles, matched=len(tiles), links=[here])
+    return feature_response(tiles, matched=len(tiles), links=[here], anchor=anchor)
 
 
 @router.get(

@@ -70,7 +70,7 @@ def show(ctx: typer.Context, map_id: str) -> None:
 
 
 def delete(ctx: typer.Context, map_id: str) -> None:
-    """Remove a map with its surveys."""
+    """Remove a map with its versions and surveys."""
     terminal: Terminal = ctx.obj
     with terminal.client() as client:
         client.delete_map(map_id)
@@ -101,13 +101,14 @@ def counts(document: Document) -> str:
 
 def scan_table(scans: list[Document]) -> Table:
     """How each scan was registered."""
-    table = columns("scan", "accepted", "fitness", "rmse (m)", "reason")
+    table = columns("scan", "accepted", "fitness", "rmse (m)", "sigma (m)", "reason")
     for scan in scans:
         table.add_row(
             scan["scan_id"],
             _ACCEPTED.get(scan.get("accepted"), Text()),
             number(scan.get("fitness"), 2),
             number(scan.get("rmse"), 3),
+            number(scan.get("translation_sigma"), 3),
             scan.get("reason"),
         )
     return table
@@ -139,6 +140,7 @@ def _whole(found: Document) -> Group:
         [
             ("map", found["map_id"]),
             ("name", found.get("name")),
+            ("version", found.get("version")),
             ("status", found["status"]),
             ("model", found.get("model")),
             ("counts", counts(found)),

@@ -25,6 +25,7 @@ def test_a_map_of_known_scans_is_accepted_and_its_job_submitted(client, catalog,
     assert queue.submitted == [(job_id, "map")]
     found = client.get("/maps/lobby").json()
     assert (found["status"], found["name"], found["model"]) == ("building", "Lobby", MODEL)
+    assert (found["version"], found["registration"], found["anchor"]) == (1, None, None)
     assert found["settings"] == {"registration": {"min_fitness": 0.6}}
     assert found["scans"] == [
         {
@@ -33,6 +34,9 @@ def test_a_map_of_known_scans_is_accepted_and_its_job_submitted(client, catalog,
             "fitness": None,
             "rmse": None,
             "map_from_scan": None,
+            "translation_sigma": None,
+            "rotation_sigma": None,
+            "path": None,
             "reason": None,
         }
     ]
@@ -106,6 +110,7 @@ def test_a_ready_map_shows_what_it_is_and_its_files(client, catalog):
     catalog.blobs.put_bytes(keys.map_cloud(job_id), b"ply\n0123456789")
     found = client.get("/maps/lobby").json()
     assert (found["status"], found["counts"]) == ("ready", {"tiles": 4})
+    assert (found["version"], found["registration"]) == (1, {"scans": 1})
     assert found["bounds"] == {"min": [0, 0, 0], "max": [3, 3, 1]}
     assert found["scans"][0]["map_from_scan"][3] == [0, 0, 0, 1]
     hrefs = {link["rel"]: link["href"] for link in found["links"]}

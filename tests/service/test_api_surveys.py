@@ -19,6 +19,7 @@ def test_a_survey_of_files_is_accepted_and_its_job_submitted(client, catalog, qu
     assert queue.submitted == [(accepted["job_id"], "survey")]
     found = client.get(f"/surveys/{accepted['survey_id']}").json()
     assert (found["status"], found["threshold"], found["map_id"]) == ("running", 0.7, "lobby")
+    assert found["map_version"] == 1
     assert (found["captured_at"], found["device_id"]) == ("2026-03-01T12:00:00Z", "robot-7")
     assert len(found["scans"]) == 2
     assert catalog.scans.get(found["scans"][0]["scan_id"]).captured_at == NOON
@@ -85,6 +86,7 @@ def test_the_tiles_are_features_in_the_frame_of_the_map(client, catalog):
         "n_reference": 900,
         "n_current": 800,
         "map_id": "lobby",
+        "map_version": 1,
         "survey_id": survey_id,
         "model": "spicd-net/1",
         "captured_at": "2026-03-01T12:00:00Z",

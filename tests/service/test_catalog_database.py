@@ -53,7 +53,9 @@ def test_a_row_without_its_parent_is_refused(tmp_path):
     database = Database(url(tmp_path))
     database.upgrade()
     with pytest.raises(IntegrityError), database.write() as session:
-        session.execute(text("INSERT INTO version_scans (job_id, scan_id, ordinal) VALUES ('none', 'none', 0)"))
+        session.execute(
+            text("INSERT INTO version_scans (job_id, scan_id, ordinal) VALUES ('none', 'none', 0)")
+        )
 
 
 def test_a_write_that_raises_leaves_nothing(tmp_path):

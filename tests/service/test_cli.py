@@ -170,6 +170,68 @@ def test_a_failed_job_is_one_sentence_on_stderr_status_1_and_with_json_its_docum
     assert said.err.split() == f"{problem['title']}: {problem['detail']}".split()
 
 
+VERSION = {
+    **{name: value for name, value in MAP.items() if name != "name"},
+    "version": 2,
+    "base_version": 1,
+    "survey_id": None,
+}
+
+
+def test_versions_add_uploads_further_scans_waits_and_shows_the_version(
+    service: Service, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    service.on("POST /scans", SCAN, status=201)
+    accepted = {"map_id": "lobby", "version": 2, "job_id": "job-1"}
+    service.on("POST /maps/lobby/versions", accepted, status=202)
+    service.on("GET /jobs/job-1", job("successful", 100))
+    service.on("GET /maps/lobby/versions/2", VERSION)
+    (tmp_path / "hall.ply").write_bytes(b"ply\n")
+    assert spicd("versions", "add", "lobby", str(tmp_path / "hall.ply"), "--wait") == 0
+    assert service.body(1) == {"scan_ids": ["scan-1"]}
+    shown = capsys.readouterr().out
+    assert "version 1 and further scans" in shown
+    assert "0.021" in shown
+
+
+def test_versions_add_takes_a_survey_over(service: Service, capsys: pytest.CaptureFixture[str]) -> None:
+    accepted = {"map_id": "lobby", "version": 2, "job_id": "job-1"}
+    service.on("POST /maps/lobby/versions", accepted, status=202)
+    assert spicd("versions", "add", "lobby", "--survey", "survey-1") == 0
+    assert service.body() == {"survey_id": "survey-1"}
+    assert capsys.readouterr().out.startswith("version 2 of map lobby: job job-1 is on its way")
+
+
+def test_versions_list_says_what_each_was_made_from(
+    service: Service, capsys: pytest.CaptureFixture[str]
+) -> None:
+    first = {**VERSION, "version": 1, "base_version": None}
+    third = {**VERSION, "version": 3, "base_version": 2, "survey_id": "survey-1", "status": "building"}
+    service.on("GET /maps/lobby/versions", {"versions": [third, VERSION, first], "links": []})
+    assert spicd("versions", "list", "lobby") == 0
+    lines = [line for line in capsys.readouterr().out.splitlines() if "building" in line or "ready" in line]
+    made = ("version 2 and survey survey-1", "version 1 and further scans", "scans")
+    assert len(lines) == 3
+    assert all(what in line for what, line in zip(made, lines, strict=True))
+
+
+def test_versions_delete_says_so(service: Service, capsys: pytest.CaptureFixture[str]) -> None:
+    service.on("DELETE /maps/lobby/versions/1", None, status=204)
+    assert spicd("versions", "delete", "lobby", "1") == 0
+    assert "version 1 of map lobby is deleted" in capsys.readouterr().out
+
+
+def test_the_client_sets_an_anchor_and_takes_it_away(service: Service) -> None:
+    service.on("PUT /maps/lobby/anchor", MAP)
+    service.on("DELETE /maps/lobby/anchor", None, status=204)
+    anchor = {"longitude": 13.4, "latitude": 52.5, "height": 76.0, "heading": 90.0}
+    with Client("http://there", transport=httpx.MockTransport(service)) as client:
+        client.set_anchor("lobby", anchor)
+        client.set_anchor("lobby", None)
+    assert service.body(0) == anchor
+    assert [request.method for request in service.requests] == ["PUT", "DELETE"]
+
+
 @pytest.mark.parametrize("name", ["a[/]b", "[old] hall", "[red]x", ":smile:"])
 def test_names_that_look_like_markup_are_printed_as_they_are(
     service: Service, tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
