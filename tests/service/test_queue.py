@@ -104,6 +104,18 @@ def test_a_step_whose_claims_are_released_is_queued_again_with_those_behind_it(
     assert redis.zrange("rq:deferred:inference", 0, -1) == ["s1-score"]
 
 
+def test_a_step_that_a_worker_took_and_never_began_is_queued_again_once_the_claims_are_released(
+    queue: JobQueue, redis: Redis
+) -> None:
+    queue.submit("m1", "map")
+    redis.lmove("rq:queue:geometry", "rq:queue:geometry:intermediate")
+    queue.submit("m1", "map")
+    assert redis.exists("rq:queue:geometry") == 0
+    queue.release_claims()
+    queue.submit("m1", "map")
+    assert redis.lrange("rq:queue:geometry", 0, -1) == ["m1-register"]
+
+
 def test_a_job_goes_on_with_the_step_that_had_not_finished(queue: JobQueue, redis: Redis) -> None:
     queue.submit("s1", "survey")
     begin(redis, "s1-register")
