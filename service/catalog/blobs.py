@@ -20,6 +20,13 @@ from obstore.store import LocalStore, ObjectStore, from_url
 from service.catalog import keys
 
 CHUNK = 1 << 20  #: bytes handed on at a time
+_NO_LINKS = (
+    errno.EPERM,
+    errno.EACCES,
+    errno.EOPNOTSUPP,
+    errno.EMLINK,
+    errno.EXDEV,
+)  #: by file system, or no more
 _PARTS_AT_ONCE = 2  #: obstore holds 12 parts of 5 MB by default, more than an upload may cost
 
 
@@ -49,6 +56,20 @@ class Blobs:
         obstore.put(self._store, key, path, max_concurrency=_PARTS_AT_ONCE)
         if move:
             path.unlink(missing_ok=True)
+
+    def copy(self, key: str, to: str) -> None:
+        """Put what lies under `key` under `to` as well, replacing what was there. Raises FileNotFoundError.
+
+        In a local folder both name one file on the disk where that can be: a blob is replaced, and never written to.
+        """
+        if self._root is None:
+            obstore.copy(self._store, key, to)
+        elif (source := self.path(key)) and not _linked(source, self._root / to):
+            self.put_file(to, source)
+
+    def under(self, prefix: str) -> list[str]:
+        """The keys that start with the folder `prefix`, in order; what is still being written is not among them."""
+        return sorted(str(entry["path"]) for page in obstore.list(self._store, prefix) for entry in page)
 
     def get_bytes(self, key: str) -> bytes:
         """The bytes under `key`. Raises FileNotFoundError."""
@@ -111,6 +132,18 @@ class Blobs:
         self.put_bytes(key, b"ping")
         with contextlib.suppress(FileNotFoundError):
             obstore.delete(self._store, key)
+
+
+def _linked(source: Path, target: Path) -> bool:
+    target.parent.mkdir(parents=True, exist_ok=True)
+    target.unlink(missing_ok=True)
+    try:
+        target.hardlink_to(source)
+    except OSError as error:
+        if error.errno in _NO_LINKS:
+            return False
+        raise
+    return True
 
 
 def _renamed(source: Path, target: Path) -> bool:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import pytest
 
@@ -93,6 +95,36 @@ def test_a_prefix_takes_its_blobs_and_no_others(either):
     assert not either.exists("maps/lobby/cloud.ply")
     assert not either.exists("maps/lobby/scans/a.npz")
     assert either.exists("maps/lobby2/cloud.ply")
+
+
+def test_a_copy_stays_as_it_was_when_the_first_is_replaced_or_deleted(either):
+    either.put_bytes("maps/one/scans/a.npz", b"first")
+    for _ in range(2):
+        either.copy("maps/one/scans/a.npz", "maps/two/scans/a.npz")
+    either.put_bytes("maps/one/scans/a.npz", b"second")
+    assert either.get_bytes("maps/two/scans/a.npz") == b"first"
+    either.delete_prefix("maps/one/")
+    assert either.get_bytes("maps/two/scans/a.npz") == b"first"
+    assert either.under("maps/") == ["maps/two/scans/a.npz"]
+    with pytest.raises(FileNotFoundError):
+        either.copy("maps/one/scans/a.npz", "maps/two/scans/b.npz")
+
+
+def test_where_the_disk_knows_no_links_a_copy_is_written(blobs, monkeypatch):
+    def refuse(path, target):
+        raise OSError(errno.EPERM, "Operation not permitted")
+
+    monkeypatch.setattr(Path, "hardlink_to", refuse)
+    blobs.put_bytes("a/b", b"x")
+    blobs.copy("a/b", "c/d")
+    assert blobs.get_bytes("c/d") == b"x"
+
+
+def test_the_keys_under_a_folder_are_its_own_and_no_others(either):
+    for key in ("maps/one/work/pairs-b.json", "maps/one/work/pairs-a.json", "maps/one2/work/pairs-c.json"):
+        either.put_bytes(key, b"[]")
+    assert either.under(keys.map_work("one")) == ["maps/one/work/pairs-a.json", "maps/one/work/pairs-b.json"]
+    assert either.under(keys.map_work("none")) == []
 
 
 @pytest.mark.parametrize(
