@@ -1,8 +1,11 @@
-"""How the numeric libraries' threads wait for each other."""
+"""How many threads the numeric libraries use, and how these wait for each other."""
 
 from __future__ import annotations
 
 import os
+
+_PAIR = 2  # a query of 30,000 points gains nothing from more
+_threads = _PAIR
 
 
 def wait_passively() -> None:
@@ -13,3 +16,16 @@ def wait_passively() -> None:
     environment sets stands.
     """
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+
+
+def one_thread() -> None:
+    """Keep this process to one thread: others like it have the other cores. Before Open3D is imported."""
+    global _threads  # noqa: PLW0603 - the state of a process, set once at its start
+    _threads = 1
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ[name] = "1"
+
+
+def query_threads() -> int:
+    """For SciPy's trees, which ask for a number at each query."""
+    return _threads

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 from worker.detectors.detector import Detector
-from worker.pipeline.chaining import Outcome, ScanFile
 from worker.pipeline.changes import ChangeSet
 from worker.pipeline.export import tile_results, write_coloured_cloud
 from worker.pipeline.features import feature_collection
@@ -22,6 +21,7 @@ from worker.pipeline.flow import (
     locate_survey,
 )
 from worker.pipeline.picture import draw_picture
+from worker.pipeline.placement import Outcome, ScanFile
 from worker.progress import Progress, silent
 
 
@@ -92,11 +92,15 @@ def _titled(phase: str, progress: Progress) -> Progress:
 
 
 def _registration(outcome: Outcome) -> dict[str, Any]:
+    placement = outcome.placement
+    sure = None if placement is None else placement.uncertainty
     return {
         "name": outcome.name,
-        "accepted": outcome.scan is not None,
+        "accepted": placement is not None,
         "fitness": outcome.fitness,
         "rmse": outcome.inlier_rmse,
-        "map_from_scan": None if outcome.scan is None else outcome.scan.map_from_scan.tolist(),
+        "map_from_scan": None if placement is None else placement.map_from_scan.tolist(),
+        "translation_sigma": None if sure is None else sure.translation,
+        "rotation_sigma": None if sure is None else sure.rotation,
         "reason": outcome.reason,
     }

@@ -32,34 +32,40 @@ def register_files(
     # Not at the head of the file: Open3D takes a second, which `--help` need not wait for.
     import numpy as np  # noqa: PLC0415
 
-    from worker.pipeline.chaining import ScanFile, chain, place  # noqa: PLC0415
+    from worker.pipeline.map_settings import MapSettings  # noqa: PLC0415
+    from worker.pipeline.placement import ScanFile  # noqa: PLC0415
+    from worker.pipeline.placing_settings import PlacingSettings  # noqa: PLC0415
     from worker.pipeline.poses import difference  # noqa: PLC0415
-    from worker.pipeline.registration import ScanRejected, surface_of  # noqa: PLC0415
+    from worker.pipeline.prepared import ScanRejected, prepare  # noqa: PLC0415
     from worker.pipeline.registration_settings import RegistrationSettings  # noqa: PLC0415
+    from worker.pipeline.scan import read_scan  # noqa: PLC0415
+    from worker.pipeline.survey_placing import place_on_map  # noqa: PLC0415
 
-    settings, most = RegistrationSettings(), 50_000_000
-    _, fused = chain([ScanFile(name=reference.name, path=reference)], settings=settings, max_points=most)
-    target = surface_of(fused, settings)
-    pose = None if start is None else np.loadtxt(start)
-    begun = time.perf_counter()
-    outcome = place(
-        ScanFile(name=current.name, path=current, pose=pose), target, settings=settings, max_points=most
+    settings = PlacingSettings(
+        registration=RegistrationSettings(), mapping=MapSettings(), max_points=50_000_000
     )
+    target = prepare(read_scan(reference), settings.registration).surface
+    file = ScanFile(name=current.name, path=current, pose=None if start is None else np.loadtxt(start))
+    begun = time.perf_counter()
+    (outcome,) = place_on_map([file], target, settings=settings)
     seconds = time.perf_counter() - begun
-    if outcome.scan is None:
+    found = outcome.placement
+    if found is None:
         raise ScanRejected(str(outcome.reason))
-    scan = outcome.scan
+    sure = found.uncertainty
     result: dict[str, Any] = {
-        "reference_from_current": scan.map_from_scan.tolist(),
-        "fitness": scan.fitness,
-        "inlier_rmse": scan.inlier_rmse,
-        "overlap": scan.overlap,
-        "agreement": scan.agreement,
-        "searched": scan.searched,
+        "reference_from_current": found.map_from_scan.tolist(),
+        "fitness": found.fitness,
+        "inlier_rmse": found.inlier_rmse,
+        "overlap": found.overlap,
+        "agreement": found.agreement,
+        "searched": found.searched,
+        "translation_sigma": None if sure is None else sure.translation,
+        "rotation_sigma": None if sure is None else sure.rotation,
         "seconds": seconds,
     }
     if truth is not None:
-        metres, radians = difference(np.loadtxt(truth), scan.map_from_scan)
+        metres, radians = difference(np.loadtxt(truth), found.map_from_scan)
         result["error"] = {"metres": metres, "degrees": float(np.degrees(radians))}
     if as_json:
         terminal.print_json(result)

@@ -27,14 +27,17 @@ from worker.evaluation.scenes import corridor
 from worker.evaluation.sensor import SimulatedScan
 from worker.evaluation.visits import visit
 from worker.pipeline import archive
-from worker.pipeline.chaining import Outcome, ScanFile, chain, place
 from worker.pipeline.changes import decide
 from worker.pipeline.export import tile_results, write_coloured_cloud
 from worker.pipeline.flow import PipelineSettings
-from worker.pipeline.mapping import ReferenceMap, current_map, reference_map
+from worker.pipeline.frame import fitted
+from worker.pipeline.mapping import ReferenceMap, current_map, fuse, reference_map
 from worker.pipeline.pcd import write_pcd
 from worker.pipeline.picture import draw_picture
-from worker.pipeline.poses import difference, inverse
+from worker.pipeline.placement import Outcome, ScanFile, placed
+from worker.pipeline.placing import place_together
+from worker.pipeline.poses import difference
+from worker.pipeline.survey_placing import place_on_map
 from worker.pipeline.tiling import TilePairs, Tiles, cut, grid_over, pair_tiles
 from worker.pipeline.values import Arrays, Matrix4
 from worker.pipeline.voxels import Voxels
@@ -118,11 +121,13 @@ class _Built:
     seconds: dict[str, float]
 
     def map_from_world(self, scans: tuple[SimulatedScan, ...]) -> Matrix4:
-        """By the first scan, which set the map's frame."""
-        first = self.outcomes[0].scan
-        if first is None:
-            raise ValueError("the first scan sets the frame and cannot be left out")
-        return first.map_from_scan @ inverse(scans[0].world_from_sensor)
+        """By all scans together: a map has the frame of the priors, which drifted."""
+        pairs = [
+            (scan.world_from_sensor, outcome.placement.map_from_scan)
+            for scan, outcome in zip(scans, self.outcomes, strict=True)
+            if outcome.placement
+        ]
+        return fitted([world for world, _ in pairs], [found for _, found in pairs])
 
 
 def _written(path: Path, scan: SimulatedScan) -> ScanFile:
@@ -133,9 +138,14 @@ def _written(path: Path, scan: SimulatedScan) -> ScanFile:
 def _map(files: list[ScanFile], detector: SpicdNet, settings: PipelineSettings, progress: Progress) -> _Built:
     watch = Stopwatch()
     with watch.stage("read and register"):
-        outcomes, fused = chain(
-            files, settings=settings.registration, max_points=settings.max_scan_points, progress=progress
+        outcomes = place_together(files, settings=settings.placing, progress=progress).outcomes
+    with watch.stage("read and fuse"):
+        accepted = (
+            placed(file, outcome.placement, max_points=settings.max_scan_points)
+            for file, outcome in zip(files, outcomes, strict=True)
+            if outcome.placement
         )
+        fused = fuse(accepted, voxel_size=settings.registration.voxel_size)
     with watch.stage("normals"):
         reference = reference_map(fused, settings=settings.registration)
     with watch.stage("tile"):
@@ -162,11 +172,12 @@ def _survey(
         reference = archive.load_reference(scratch / "reference.npz")
         surface = reference.surface()
     with watch.stage("read and register"):
-        outcome = place(file, surface, settings=settings.registration, max_points=settings.max_scan_points)
-    if outcome.scan is None:
+        (outcome,) = place_on_map([file], surface, settings=settings.placing)
+    if outcome.placement is None:
         return {"rejected": outcome.reason, **watch.seconds}
     with watch.stage("fuse and tile"):
-        current = current_map([outcome.scan], voxel_size=reference.voxel_size)
+        scan = placed(file, outcome.placement, max_points=settings.max_scan_points)
+        current = current_map([scan], voxel_size=reference.voxel_size)
         pairs = pair_tiles(built.tiles, current.points, settings=settings.tiling)
     with watch.stage("score"):
         scores = detector.score(pairs, description=built.description)
@@ -241,9 +252,9 @@ def _pose_errors(
     scans: tuple[SimulatedScan, ...], outcomes: tuple[Outcome, ...], map_from_world: Matrix4
 ) -> dict[str, Any]:
     off = [
-        difference(outcome.scan.map_from_scan, map_from_world @ scan.world_from_sensor)
+        difference(outcome.placement.map_from_scan, map_from_world @ scan.world_from_sensor)
         for scan, outcome in zip(scans, outcomes, strict=True)
-        if outcome.scan
+        if outcome.placement
     ]
     metres, radians = np.array(off).T
     return {

@@ -20,13 +20,17 @@ log = logging.getLogger("worker.jobs")
 
 #: The part of the whole job that each stage takes, about as `make bench` measures it.
 MAP_STAGES = {
-    "registering": (0.0, 0.85),
+    "reading": (0.0, 0.08),
+    "registering": (0.08, 0.5),
+    "refining": (0.5, 0.75),
+    "fusing": (0.75, 0.85),
     "tiling": (0.85, 0.88),
     "saving": (0.88, 0.9),
     "describing": (0.9, 1.0),
 }
 SURVEY_STAGES = {
-    "registering": (0.0, 0.5),
+    "registering": (0.0, 0.45),
+    "refining": (0.45, 0.5),
     "tiling": (0.5, 0.52),
     "saving": (0.52, 0.55),
     "scoring": (0.55, 0.8),

@@ -8,6 +8,7 @@ a place the map has not seen, not a contradiction), and close to that neighbour'
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
 import numpy as np
@@ -40,14 +41,16 @@ def agreement(
     source: Surface, target: Surface, target_from_source: Matrix4, *, reach: float, surface_distance: float
 ) -> Agreement:
     """Compare both clouds under the pose; `reach` and `surface_distance` are metres."""
-    overlap, forward = _on_surface(source, target, target_from_source, reach, surface_distance)
-    _, backward = _on_surface(target, source, inverse(target_from_source), reach, surface_distance)
+    look = functools.partial(surface_share, reach=reach, surface_distance=surface_distance)
+    overlap, forward = look(source, target, target_from_source)
+    _, backward = look(target, source, inverse(target_from_source))
     return Agreement(overlap=overlap, forward=forward, backward=backward)
 
 
-def _on_surface(
-    cloud: Surface, surface: Surface, surface_from_cloud: Matrix4, reach: float, surface_distance: float
+def surface_share(
+    cloud: Surface, surface: Surface, surface_from_cloud: Matrix4, *, reach: float, surface_distance: float
 ) -> tuple[float, float]:
+    """Share of the cloud within reach of the surface and seen from its side, and of that the share that lies on it."""
     points = transformed(cloud.points, surface_from_cloud)
     distance, index = surface.nearest(points, within=reach)
     near = np.isfinite(distance)

@@ -13,7 +13,7 @@ import numpy as np
 
 from worker.detectors.detector import TileScores
 from worker.pipeline.mapping import CurrentMap, ReferenceMap
-from worker.pipeline.registration import RegisteredScan
+from worker.pipeline.placement import RegisteredScan
 from worker.pipeline.tiling import TileGrid, TilePairs, Tiles, tile_id
 from worker.pipeline.values import Arrays, Points
 
@@ -76,6 +76,18 @@ def save_scan(path: Path, scan: RegisteredScan) -> None:
     save_arrays(path, {"points": scan.points, "map_from_scan": scan.map_from_scan, **origin, **colors})
 
 
+def load_scan(path: Path) -> RegisteredScan:
+    """Read what `save_scan` wrote; its name is the file's."""
+    arrays = load_arrays(path)
+    return RegisteredScan(
+        name=path.name,
+        points=arrays["points"],
+        colors=arrays.get("colors"),
+        map_from_scan=arrays["map_from_scan"],
+        sensor_origin=arrays.get("sensor_origin"),
+    )
+
+
 def save_tiles(path: Path, tiles: Tiles, *, patches: Sequence[Points]) -> None:
     """Keep the grid, and for each tile `dense/<tile_id>` (n, 3) and `patch/<tile_id>` (paper, Table A1)."""
     arrays = _grid_arrays(tiles)
@@ -123,13 +135,17 @@ def _grid_arrays(tiles: Tiles) -> Arrays:
         "origin": grid.origin,
         "size": grid.size,
         "shape": np.array(grid.shape, np.int64),
+        "lowest": np.array(grid.lowest, np.int64),
         "indices": tiles.indices,
     }
 
 
 def _grid(arrays: Mapping[str, Any]) -> TileGrid:
     i, j, k = (int(count) for count in arrays["shape"])
-    return TileGrid(origin=arrays["origin"], size=arrays["size"], shape=(i, j, k))
+    # files of maps that had one version only say nothing of the lowest index
+    lowest = arrays.get("lowest", (0, 0, 0))
+    a, b, c = (int(number) for number in lowest)
+    return TileGrid(origin=arrays["origin"], size=arrays["size"], shape=(i, j, k), lowest=(a, b, c))
 
 
 def _tiles(arrays: Arrays) -> Tiles:

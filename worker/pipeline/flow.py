@@ -2,20 +2,39 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+import itertools
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 
 from pydantic import BaseModel, ConfigDict, Field
 
 from worker.detectors.card import Preprocessing
 from worker.detectors.detector import Detector
 from worker.errors import MapFailed, RegistrationFailed
-from worker.pipeline.chaining import Outcome, ScanFile, chain, place
 from worker.pipeline.changes import ChangeSet, decide
-from worker.pipeline.mapping import CurrentMap, ReferenceMap, current_map, reference_map
+from worker.pipeline.map_report import MapReport
+from worker.pipeline.map_settings import MapSettings
+from worker.pipeline.mapping import CurrentMap, ReferenceMap, current_map, fuse, reference_map
+from worker.pipeline.pair_memory import PairMemory
+from worker.pipeline.pairwise import PairResult
+from worker.pipeline.placement import Outcome, RegisteredScan, ScanFile, placed
+from worker.pipeline.placing import place_together
+from worker.pipeline.placing_settings import PlacingSettings
 from worker.pipeline.registration_settings import RegistrationSettings
-from worker.pipeline.tiling import TilePairs, Tiles, TilingSettings, cut, grid_over, pair_tiles
-from worker.pipeline.values import Arrays
+from worker.pipeline.survey_placing import place_on_map
+from worker.pipeline.tiling import (
+    TileGrid,
+    TilePairs,
+    Tiles,
+    TilingSettings,
+    cut,
+    grid_over,
+    grown,
+    inside_tiles,
+    pair_tiles,
+)
+from worker.pipeline.values import Arrays, Indices
+from worker.pipeline.voxels import Voxels
 from worker.progress import Progress, silent
 
 
@@ -25,6 +44,7 @@ class PipelineSettings(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     registration: RegistrationSettings = Field(default_factory=RegistrationSettings)
+    mapping: MapSettings = Field(default_factory=MapSettings)
     tiling: TilingSettings = Field(default_factory=TilingSettings)
     max_scan_points: int = Field(50_000_000, gt=0)
 
@@ -39,6 +59,13 @@ class PipelineSettings(BaseModel):
             }
         )
 
+    @property
+    def placing(self) -> PlacingSettings:
+        """What placing scans needs of these."""
+        return PlacingSettings(
+            registration=self.registration, mapping=self.mapping, max_points=self.max_scan_points
+        )
+
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class BuiltMap:
@@ -46,7 +73,19 @@ class BuiltMap:
 
     reference: ReferenceMap
     tiles: Tiles
-    outcomes: tuple[Outcome, ...]
+    outcomes: tuple[Outcome, ...]  #: of the files, in their order
+    report: MapReport
+    kept: tuple[PairResult, ...] = ()  #: the registrations that the map rests on
+    contradicted: tuple[PairResult, ...] = ()  #: accepted ones that loops do not close over
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class KeptMap:
+    """A map as an earlier build left it; its scans are loaded one at a time."""
+
+    reference: ReferenceMap
+    grid: TileGrid
+    scans: Sequence[Callable[[], RegisteredScan]]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -78,23 +117,79 @@ class NothingToTile(MapFailed):
 
 
 def build_map(
-    files: Sequence[ScanFile], *, settings: PipelineSettings, progress: Progress = silent
+    files: Sequence[ScanFile],
+    *,
+    settings: PipelineSettings,
+    pairs: PairMemory | None = None,
+    processes: int | None = None,
+    progress: Progress = silent,
 ) -> BuiltMap:
     """Stage 1: place the scans in one frame, fuse them, cut the map into tiles.
 
-    Raises ScanError for a file that cannot be read, MapFailed where no scan holds a pose, and NothingToTile.
+    `pairs` keeps registered pairs, so that a build that was killed goes on; `processes` is one a core if None.
+    Raises ScanError where no file can be read, MapFailed where no scan holds a pose, and NothingToTile.
     """
-    outcomes, fused = chain(
-        files, settings=settings.registration, max_points=settings.max_scan_points, progress=progress
+    placing = place_together(
+        files, settings=settings.placing, memory=pairs, processes=processes, progress=progress
     )
-    progress("tiling", 0.0)
-    reference = reference_map(fused, settings=settings.registration)
-    grid = grid_over(reference.points, tile_size=settings.tiling.tile_size, voxel_size=fused.size)
-    tiles = cut(reference.points, grid, min_points=settings.tiling.min_points)
-    if not tiles.points:
-        raise NothingToTile(outcomes, points=len(reference.points), min_points=settings.tiling.min_points)
-    progress("tiling", 1.0)
-    return BuiltMap(reference=reference, tiles=tiles, outcomes=outcomes)
+    fused = _fused(_accepted(files, placing.outcomes, settings), len(files), settings, progress)
+    reference, tiles = _tiled(fused, None, placing.outcomes, settings, progress)
+    return BuiltMap(
+        reference=reference,
+        tiles=tiles,
+        outcomes=placing.outcomes,
+        report=placing.report,
+        kept=placing.kept,
+        contradicted=placing.contradicted,
+    )
+
+
+def extend_map(
+    base: KeptMap, files: Sequence[ScanFile], *, settings: PipelineSettings, progress: Progress = silent
+) -> BuiltMap:
+    """A new version: further scans placed on the map and fused with what it was made of; tiles keep their ids.
+
+    The outcomes are those of the new files. Raises ScanError where no file can be read, NoScanAccepted where none
+    finds a place, and NothingToTile.
+    """
+    outcomes = place_on_map(
+        files, base.reference.surface(), settings=settings.placing, growing=True, progress=progress
+    )
+    if not any(outcome.placement for outcome in outcomes):
+        raise NoScanAccepted(outcomes)
+    scans = itertools.chain((load() for load in base.scans), _accepted(files, outcomes, settings))
+    fused = _fused(scans, len(base.scans) + len(files), settings, progress)
+    reference, tiles = _tiled(fused, base.grid, outcomes, settings, progress)
+    return BuiltMap(
+        reference=reference, tiles=tiles, outcomes=outcomes, report=MapReport.of_outcomes(outcomes)
+    )
+
+
+def renew_map(
+    base: KeptMap,
+    seen: Sequence[Callable[[], RegisteredScan]],
+    *,
+    replaced: Indices,
+    settings: PipelineSettings,
+    progress: Progress = silent,
+) -> BuiltMap:
+    """A new version: a survey that was accepted as the new state of things; tiles keep their ids.
+
+    In the tiles `replaced` (T, 3) the survey's points take the place of the older ones, elsewhere they join them.
+    Raises NothingToTile.
+    """
+    older = (without(load(), base.grid, replaced) for load in base.scans)
+    scans = itertools.chain(older, (load() for load in seen))
+    fused = _fused(scans, len(base.scans) + len(seen), settings, progress)
+    reference, tiles = _tiled(fused, base.grid, (), settings, progress)
+    return BuiltMap(reference=reference, tiles=tiles, outcomes=(), report=MapReport.of_outcomes(()))
+
+
+def without(scan: RegisteredScan, grid: TileGrid, tiles: Indices) -> RegisteredScan:
+    """The scan less its points in these tiles (T, 3)."""
+    stays = ~inside_tiles(scan.points, grid, tiles)
+    colors = None if scan.colors is None else scan.colors[stays]
+    return replace(scan, points=scan.points[stays], colors=colors)
 
 
 def locate_survey(
@@ -105,19 +200,19 @@ def locate_survey(
     settings: PipelineSettings,
     progress: Progress = silent,
 ) -> LocatedSurvey:
-    """Stage 3, first half: register each scan to the map, fuse those accepted, pair the tiles.
+    """Stage 3, first half: place the scans on the map, fuse those accepted, pair the tiles.
 
-    Raises ScanError for a file that cannot be read, NoScanAccepted where none is left to compare.
+    Raises ScanError where no file can be read, NoScanAccepted where none is left to compare.
     """
-    outcomes = _place_all(files, reference, settings, progress)
-    accepted = [outcome.scan for outcome in outcomes if outcome.scan]
-    if not accepted:
+    outcomes = place_on_map(files, reference.surface(), settings=settings.placing, progress=progress)
+    if not any(outcome.placement for outcome in outcomes):
         raise NoScanAccepted(outcomes)
     progress("tiling", 0.0)
+    accepted = _accepted(files, outcomes, settings)
     current = current_map(accepted, voxel_size=reference.voxel_size)
     pairs = pair_tiles(tiles, current.points, settings=settings.tiling)
     progress("tiling", 1.0)
-    return LocatedSurvey(current=current, pairs=pairs, outcomes=tuple(outcomes))
+    return LocatedSurvey(current=current, pairs=pairs, outcomes=outcomes)
 
 
 def detect(
@@ -133,24 +228,41 @@ def detect(
     return decide(pairs, scores, threshold=detector.card.threshold if threshold is None else threshold)
 
 
-def _place_all(
-    files: Sequence[ScanFile], reference: ReferenceMap, settings: PipelineSettings, progress: Progress
-) -> list[Outcome]:
-    target = reference.surface()
-    outcomes = []
-    for done, file in enumerate(files):
+def _accepted(
+    files: Sequence[ScanFile], outcomes: Sequence[Outcome], settings: PipelineSettings
+) -> Iterator[RegisteredScan]:
+    """The points of each accepted scan, read again: no two scans are held at once."""
+    for file, outcome in zip(files, outcomes, strict=True):
+        if outcome.placement is not None:
+            yield placed(file, outcome.placement, max_points=settings.max_scan_points)
 
-        def tick(share: float = done / len(files)) -> None:
-            progress("registering", share)
 
-        outcomes.append(
-            place(
-                file,
-                target,
-                settings=settings.registration,
-                max_points=settings.max_scan_points,
-                tick=tick,
-            )
-        )
-    progress("registering", 1.0)
-    return outcomes
+def _fused(
+    scans: Iterable[RegisteredScan], count: int, settings: PipelineSettings, progress: Progress
+) -> Voxels:
+    def told() -> Iterator[RegisteredScan]:
+        for done, scan in enumerate(scans):
+            progress("fusing", done / max(count, 1))
+            yield scan
+        progress("fusing", 1.0)
+
+    return fuse(told(), voxel_size=settings.registration.voxel_size)
+
+
+def _tiled(
+    fused: Voxels,
+    grid: TileGrid | None,
+    outcomes: Sequence[Outcome],
+    settings: PipelineSettings,
+    progress: Progress,
+) -> tuple[ReferenceMap, Tiles]:
+    """The map with its normals, cut along a grid of its own or along one that there was."""
+    progress("tiling", 0.0)
+    reference = reference_map(fused, settings=settings.registration)
+    if grid is None:
+        grid = grid_over(reference.points, tile_size=settings.tiling.tile_size, voxel_size=fused.size)
+    tiles = cut(reference.points, grown(grid, reference.points), min_points=settings.tiling.min_points)
+    if not tiles.points:
+        raise NothingToTile(outcomes, points=len(reference.points), min_points=settings.tiling.min_points)
+    progress("tiling", 1.0)
+    return reference, tiles

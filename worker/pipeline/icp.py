@@ -17,8 +17,7 @@ from scipy.spatial import cKDTree
 
 from worker.pipeline.poses import exponential, transformed
 from worker.pipeline.values import Bools, Floats, Matrix4
-
-_THREADS = 2  # a query of 30,000 points gains nothing from more
+from worker.threads import query_threads
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -40,7 +39,7 @@ class Surface:
 
     def nearest(self, points: Floats, *, within: float = np.inf) -> tuple[Floats, NDArray[np.intp]]:
         """Distance (N,) in metres and index (N,) of the nearest point; inf and M where none is near enough."""
-        distance, index = self.tree.query(points, distance_upper_bound=within, workers=_THREADS)
+        distance, index = self.tree.query(points, distance_upper_bound=within, workers=query_threads())
         return np.asarray(distance, np.float64), np.asarray(index, np.intp)
 
 
@@ -95,6 +94,46 @@ def icp(
         pose = exponential(step) @ pose
         converged = bool(np.abs(step).max() < tolerance)
     return _evaluated(points, target, pose, max_correspondence_distance, converged, iterations)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class NormalEquations:
+    """The point-to-plane problem at one pose: a small twist d of the source costs d'Hd + 2g'd more.
+
+    Twists are (rotation, translation) about the origin of the frame that everything is given in.
+    """
+
+    information: Floats  #: (6, 6) H, sum of the outer products of the Jacobian's rows; divide by sigma^2
+    gradient: Floats  #: (6,) g
+    num_inliers: int
+    square_residual: float  #: square metres, mean of the squared distances to the tangent planes
+
+
+def normal_equations(
+    source: Surface,
+    target: Surface,
+    target_from_source: Matrix4,
+    *,
+    within: float,
+    every: int = 1,
+    frame_from_target: Matrix4 | None = None,
+) -> NormalEquations:
+    """Pairs nearer than `within` metres; twists act in the target's frame, or in the one that is given."""
+    moved = transformed(source.points[::every], target_from_source)
+    distance, index = target.nearest(moved, within=within)
+    pair = facing(source, target, target_from_source, index, np.isfinite(distance), every=every)
+    moved, index = moved[pair], index[pair]
+    normals = target.normals[index]
+    residual = np.einsum("ij,ij->i", moved - target.points[index], normals)
+    if frame_from_target is not None:
+        moved, normals = transformed(moved, frame_from_target), normals @ frame_from_target[:3, :3].T
+    jacobian = np.hstack([np.cross(moved, normals), normals])
+    return NormalEquations(
+        information=every * (jacobian.T @ jacobian),
+        gradient=every * (jacobian.T @ residual),
+        num_inliers=every * len(residual),
+        square_residual=float(np.mean(residual**2)) if len(residual) else 0.0,
+    )
 
 
 def facing(

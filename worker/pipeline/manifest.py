@@ -18,8 +18,8 @@ def manifest(
 ) -> dict[str, Any]:
     """Table A1's fields for the map cloud (M, 3) and its tiles; JSON-ready, metres, map frame.
 
-    Two differences: `file` and `dense_file` name an array within one archive, and `tile_origin` is added, so
-    that the grid can be rebuilt exactly. `dense_voxel` is the map's voxel size.
+    Two differences: `file` and `dense_file` name an array within one archive, and `tile_origin` and
+    `tile_lowest_idx` are added, so that the grid can be rebuilt exactly. `dense_voxel` is the map's voxel size.
     """
     size = [float(edge) for edge in tiles.grid.size]
     n_cells = tiles.grid.shape[0] * tiles.grid.shape[1] * tiles.grid.shape[2]
@@ -36,6 +36,7 @@ def manifest(
             "max": [float(value) for value in points.max(axis=0)],
         },
         "n_tiles_grid": list(tiles.grid.shape),
+        "tile_lowest_idx": list(tiles.grid.lowest),
         "patches": [
             {
                 "patch_id": tile_id(index),

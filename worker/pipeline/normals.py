@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from worker.pipeline.values import Normals
+from worker.threads import query_threads
 
 SPARSE = 8  #: neighbours below which a wider look is taken
 WIDER = 3.0  #: times the radius
@@ -26,7 +27,9 @@ def estimate_normals(points: NDArray[Any], *, radius: float, max_neighbors: int)
     normals = _estimated(cloud, radius, max_neighbors)
     if len(points) <= SPARSE:
         return normals
-    distance, _ = cKDTree(points).query(points, k=SPARSE + 1, distance_upper_bound=radius, workers=2)
+    distance, _ = cKDTree(points).query(
+        points, k=SPARSE + 1, distance_upper_bound=radius, workers=query_threads()
+    )
     sparse = np.isinf(np.asarray(distance)[:, -1])
     if sparse.any():
         normals[sparse] = _estimated(cloud, WIDER * radius, max_neighbors)[sparse]

@@ -40,5 +40,12 @@ class RegistrationSettings(BaseModel):
     min_overlap_vouched: float = Field(0.3, ge=0, le=1, description="the same near a prior")
     prior_distance: float = Field(1.0, ge=0, description="metres; how far a given prior may be off")
     prior_angle: float = Field(0.26, ge=0, description="radians; likewise (15 degrees)")
+    max_seen_through: float = Field(
+        0.01,
+        ge=0,
+        le=1,
+        description="share of one scan's points that stand where another scan saw free space",
+    )
+    max_seen_through_vouched: float = Field(0.03, ge=0, le=1, description="the same near a prior")
     min_constraint: float = Field(0.002, ge=0, description="smallest eigenvalue of the scene's normal matrix")
     min_points: int = Field(500, ge=6, description="voxels that a scan needs to be registered at all")

@@ -31,11 +31,15 @@ class TilingSettings(BaseModel):
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class TileGrid:
-    """A regular grid in the map frame; tile (i, j, k) starts at `origin + (i, j, k) * size`."""
+    """A regular grid in the map frame; tile (i, j, k) starts at `origin + (i, j, k) * size`.
+
+    Indices below zero come with a map that grew: tiles keep their ids from version to version.
+    """
 
     origin: Floats  #: (3,) metres, map frame, minimum corner of tile (0, 0, 0)
     size: Floats  #: (3,) metres
     shape: tuple[int, int, int]  #: number of tiles along x, y, z
+    lowest: tuple[int, int, int] = (0, 0, 0)  #: indices of the first tile
 
     def lower(self, indices: Indices) -> Floats:
         """(T, 3) metres, map frame: minimum corners."""
@@ -77,11 +81,27 @@ def grid_over(points: Points, *, tile_size: tuple[float, float, float], voxel_si
     """
     size = np.asarray(tile_size, np.float64)
     origin = np.floor(points.min(axis=0).astype(np.float64) / voxel_size) * voxel_size
-    count = np.floor((points.max(axis=0) - origin) / size).astype(np.int64) + 1
+    return _spanned(points, origin, size)
+
+
+def grown(grid: TileGrid, points: Points) -> TileGrid:
+    """The same grid over the points of a newer version; a tile that both have keeps its index. Raises MapFailed."""
+    return _spanned(points, grid.origin, grid.size)
+
+
+def _spanned(points: Points, origin: Floats, size: Floats) -> TileGrid:
+    low = np.floor((points.min(axis=0) - origin) / size).astype(np.int64)
+    count = np.floor((points.max(axis=0) - origin) / size).astype(np.int64) + 1 - low
     if count.prod() > _MOST_TILES:
         extent = " x ".join(f"{edge:.0f}" for edge in count * size)
         raise MapFailed(f"the map spans {extent} m; remove stray points, or cut it into several maps")
-    return TileGrid(origin=origin, size=size, shape=(int(count[0]), int(count[1]), int(count[2])))
+    shape, lowest = (tuple(int(value) for value in each) for each in (count, low))
+    return TileGrid(
+        origin=origin,
+        size=size,
+        shape=(shape[0], shape[1], shape[2]),
+        lowest=(lowest[0], lowest[1], lowest[2]),
+    )
 
 
 def cut(points: Points, grid: TileGrid, *, min_points: int) -> Tiles:
@@ -91,7 +111,7 @@ def cut(points: Points, grid: TileGrid, *, min_points: int) -> Tiles:
     kept = np.flatnonzero(np.diff(bounds) >= min_points)
     return Tiles(
         grid=grid,
-        indices=np.stack(np.unravel_index(cells[kept], grid.shape), axis=1).astype(np.int32),
+        indices=(np.stack(np.unravel_index(cells[kept], grid.shape), axis=1) + grid.lowest).astype(np.int32),
         points=tuple(ordered[bounds[tile] : bounds[tile + 1]] for tile in kept),
     )
 
@@ -100,7 +120,8 @@ def pair_tiles(reference: Tiles, current: Points, *, settings: TilingSettings) -
     """Put beside each reference tile the survey's points (N, 3), map frame, of the same box (Section 3.9.2)."""
     cells, starts, ordered = _by_cell(current, reference.grid)
     bounds = np.append(starts, len(ordered))
-    wanted = np.ravel_multi_index(tuple(reference.indices.T), reference.grid.shape)
+    grid = reference.grid
+    wanted = np.ravel_multi_index(tuple((reference.indices - grid.lowest).T), grid.shape)
     place = np.searchsorted(cells, wanted)
     found = place < len(cells)
     found[found] = cells[place[found]] == wanted[found]
@@ -116,9 +137,23 @@ def pair_tiles(reference: Tiles, current: Points, *, settings: TilingSettings) -
     )
 
 
+def inside_tiles(points: Points, grid: TileGrid, indices: Indices) -> Bools:
+    """(N,) which points (N, 3) of the map frame lie in one of the tiles (T, 3)."""
+    cells = np.floor((points - grid.origin) / grid.size).astype(np.int64) - grid.lowest
+    within = np.all((cells >= 0) & (cells < grid.shape), axis=1)
+    wanted = indices.astype(np.int64) - grid.lowest
+    wanted = wanted[np.all((wanted >= 0) & (wanted < grid.shape), axis=1)]
+    found = np.zeros(len(points), bool)
+    found[within] = np.isin(
+        np.ravel_multi_index(tuple(cells[within].T), grid.shape),
+        np.ravel_multi_index(tuple(wanted.T), grid.shape),
+    )
+    return found
+
+
 def _by_cell(points: Points, grid: TileGrid) -> tuple[NDArray[np.int64], NDArray[np.intp], Points]:
     """The occupied cells (flat, ascending), where each begins, and the points ordered by cell."""
-    index = np.floor((points - grid.origin) / grid.size).astype(np.int64)
+    index = np.floor((points - grid.origin) / grid.size).astype(np.int64) - grid.lowest
     inside = np.all((index >= 0) & (index < grid.shape), axis=1)
     flat = np.ravel_multi_index(tuple(index[inside].T), grid.shape)
     order = np.argsort(flat, kind="stable")

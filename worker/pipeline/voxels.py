@@ -41,14 +41,20 @@ class Voxels:
         `origin` (3,) is where they were seen from, in their frame. Raises MapFailed for a point that is farther
         from the frame's origin than the cells can count.
         """
+        keys = cls.keys_of(points, size=size)
+        columns = [points, _directions(points, origin)] + ([] if colors is None else [colors])
+        values = np.hstack(columns).astype(np.float64)
+        return _summed(size, keys, np.ones(len(keys), np.int64), values)
+
+    @staticmethod
+    def keys_of(points: NDArray[Any], *, size: float) -> NDArray[np.int64]:
+        """(N,) packed index of the cell that each point (N, 3) lies in; raises MapFailed as `of` does."""
         cells = np.floor(points / size).astype(np.int64) + (1 << (_BITS - 1))
         if len(cells) and (cells.min() < 0 or cells.max() >> _BITS):
             farthest = float(np.abs(points).max()) / 1000
             raise MapFailed(f"a point lies {farthest:.0f} km from the map's origin; check the pose priors")
-        keys = (cells[:, 0] << (2 * _BITS)) | (cells[:, 1] << _BITS) | cells[:, 2]
-        columns = [points, _directions(points, origin)] + ([] if colors is None else [colors])
-        values = np.hstack(columns).astype(np.float64)
-        return _summed(size, keys, np.ones(len(keys), np.int64), values)
+        keys: NDArray[np.int64] = (cells[:, 0] << (2 * _BITS)) | (cells[:, 1] << _BITS) | cells[:, 2]
+        return keys
 
     def merged(self, other: Voxels) -> Voxels:
         """Both together; colours are kept only where both have them."""

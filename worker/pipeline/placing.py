@@ -1,0 +1,271 @@
+"""Placing: many scans in one frame (Stage 1; paper, Section 3.3.2).
+
+Overlap culling, pairwise ICP in parallel processes, pose graph, largest component, shortest paths, joint refinement;
+then what was left out is looked for in the map that now exists.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+from worker.errors import MapFailed, ScanError
+from worker.pipeline.frame import map_from_reference
+from worker.pipeline.map_report import MapReport
+from worker.pipeline.map_settings import MapSettings
+from worker.pipeline.pair_memory import Forgetful, PairMemory
+from worker.pipeline.pair_work import Folder, Read, Reading, forget_loaded, read_and_prepare
+from worker.pipeline.pairing import PairWork, Sound, register_all
+from worker.pipeline.pairwise import PairResult
+from worker.pipeline.placement import Outcome, Placement, ScanFile
+from worker.pipeline.placing_settings import PlacingSettings
+from worker.pipeline.poses import transformed
+from worker.pipeline.refinement import Refined, refine_jointly
+from worker.pipeline.registration_settings import RegistrationSettings
+from worker.pipeline.rescue import Rescued, rescue
+from worker.pipeline.solution import Solution, solve_graph
+from worker.pipeline.values import Matrix4
+from worker.processes import default_processes, open_processes
+from worker.progress import Progress, silent
+
+_FEW = 4  # scans up to which processes cost more than they bring
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Placed:
+    """Every scan's outcome, in the order of the files, and how it came about."""
+
+    outcomes: tuple[Outcome, ...]
+    report: MapReport
+    kept: tuple[PairResult, ...]  #: the registrations that the map rests on
+    contradicted: tuple[PairResult, ...]  #: accepted ones that were thrown out
+
+
+def place_together(
+    files: Sequence[ScanFile],
+    *,
+    settings: PlacingSettings,
+    memory: PairMemory | None = None,
+    processes: int | None = None,
+    progress: Progress = silent,
+) -> Placed:
+    """Find a pose for every scan that has one among the others; name the rest with a reason.
+
+    `processes` is one a core if None. Raises MapFailed where no scan can hold a pose, and ScanError where none can
+    be read.
+    """
+    count = default_processes() if processes is None else processes
+    with TemporaryDirectory(prefix="spicd-scans-") as root, open_processes(_worth(count, files)) as pool:
+        try:
+            build = _Build(
+                files=files,
+                registration=settings.registration,
+                mapping=settings.mapping,
+                max_points=settings.max_points,
+                work=PairWork(
+                    folder=Folder(root=Path(root)),
+                    processes=pool,
+                    registration=settings.registration,
+                    mapping=settings.mapping,
+                    memory=Forgetful() if memory is None else memory,
+                ),
+                progress=progress,
+            )
+            return build.run()
+        finally:
+            forget_loaded()
+
+
+def _worth(count: int, files: Sequence[ScanFile]) -> int:
+    return 1 if len(files) <= _FEW else count
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class _Build:
+    """One build: its inputs, and each stage as a method."""
+
+    files: Sequence[ScanFile]
+    registration: RegistrationSettings
+    mapping: MapSettings
+    max_points: int
+    work: PairWork
+    progress: Progress
+
+    def run(self) -> Placed:
+        """The whole of it, in order."""
+        read = self._read()
+        sound = self._sound(read)
+        pairs = register_all(sound, self.work, progress=lambda share: self.progress("registering", share))
+        self.progress("registering", 1.0)
+        self.progress("refining", 0.0)
+        solution = solve_graph(sorted(sound), pairs, self.mapping)
+        refined = self._refined(solution, solution.poses, sound, first=True)
+        missing = sorted(set(sound) - set(refined.poses))
+        rescued = rescue(missing, refined.poses, solution.reference, sound, self.work)
+        found = {number: each.pose for number, each in rescued.items() if each.pose is not None}
+        if found:
+            refined = self._refined(solution, refined.poses | found, sound, first=False)
+        self.progress("refining", 1.0)
+        return self._placed(read, sound, pairs, solution, refined, rescued)
+
+    def _read(self) -> dict[int, Read]:
+        tasks = [
+            Reading(
+                folder=self.work.folder,
+                index=index,
+                file=file,
+                settings=self.registration,
+                max_points=self.max_points,
+            )
+            for index, file in enumerate(self.files)
+        ]
+        read = {}
+        for done, each in enumerate(self.work.processes.each(read_and_prepare, tasks)):
+            read[each.index] = each
+            self.progress("reading", done / len(tasks))
+        self.progress("reading", 1.0)
+        return read
+
+    def _sound(self, read: Mapping[int, Read]) -> dict[int, Sound]:
+        """The scans that can hold a pose; raises where there is none."""
+        sound = {}
+        for index, each in sorted(read.items()):
+            if each.points is not None and each.sensor_pose is not None:
+                sound[index] = Sound(points=each.points, prior=self.files[index].start(each.sensor_pose))
+        if sound:
+            return sound
+        errors = [read[index].error for index in sorted(read) if read[index].error]
+        if len(errors) == len(read) and errors[0] is not None:
+            raise errors[0]
+        raise MapFailed("; ".join(str(each.error or each.reason) for _, each in sorted(read.items())))
+
+    def _refined(
+        self, solution: Solution, poses: Mapping[int, Matrix4], sound: Mapping[int, Sound], *, first: bool
+    ) -> Refined:
+        """Refine jointly; leave out, worst first, whom the free space of the others contradicts, and refine again."""
+        current = dict(poses)
+        while True:
+            refined = refine_jointly(
+                current,
+                {number: sound[number].points for number in current},
+                fixed=solution.reference,
+                also=[(edge.target, edge.source) for edge in solution.kept],
+                folder=self.work.folder,
+                processes=self.work.processes,
+                settings=self.mapping,
+                progress=lambda share: self.progress("refining", (0.6 if first else 0.9) * share),
+            )
+            worst = max(refined.seen_through, key=lambda number: refined.seen_through[number])
+            if (
+                refined.seen_through[worst] <= self.registration.max_seen_through
+                or worst == solution.reference
+            ):
+                return refined
+            current = {number: pose for number, pose in refined.poses.items() if number != worst}
+
+    def _placed(
+        self,
+        read: Mapping[int, Read],
+        sound: Mapping[int, Sound],
+        pairs: Sequence[PairResult],
+        solution: Solution,
+        refined: Refined,
+        rescued: Mapping[int, Rescued],
+    ) -> Placed:
+        priors = {number: scan.prior for number, scan in sound.items() if scan.prior is not None}
+        frame = map_from_reference(refined.poses, priors, solution.reference)
+        kept = tuple(
+            edge for edge in solution.kept if edge.target in refined.poses and edge.source in refined.poses
+        )
+        numbers = _numbers(kept)
+        outcomes = []
+        for index, file in enumerate(self.files):
+            if index not in refined.poses:
+                outcomes.append(_left_out(file, read[index], rescued.get(index)))
+                continue
+            placement = self._placement(index, frame, solution, refined, rescued, numbers.get(index, []))
+            outcomes.append(
+                Outcome(
+                    name=file.name,
+                    placement=placement,
+                    fitness=placement.fitness,
+                    inlier_rmse=placement.inlier_rmse,
+                )
+            )
+        report = MapReport.of(
+            scans=len(self.files),
+            accepted=len(refined.poses),
+            pairs=pairs,
+            kept=kept,
+            reference=solution.reference,
+        )
+        return Placed(outcomes=tuple(outcomes), report=report, kept=kept, contradicted=solution.contradicted)
+
+    def _placement(
+        self,
+        index: int,
+        frame: Matrix4,
+        solution: Solution,
+        refined: Refined,
+        rescued: Mapping[int, Rescued],
+        edges: Sequence[PairResult],
+    ) -> Placement:
+        pose = frame @ refined.poses[index]
+        origin = self.work.folder.load(index).origin
+        late = rescued.get(index)
+        if late is not None and late.placement is not None:
+            placement, path = late.placement, (*solution.paths.get(late.beside, ()), index)
+        else:
+            placement, path = _of_edges(edges), solution.paths[index]
+        return replace(
+            placement,
+            map_from_scan=pose,
+            sensor_origin=None if origin is None else transformed(origin[None], pose)[0],
+            uncertainty=refined.uncertainties[index] if len(refined.poses) > 1 else None,
+            path=path,
+        )
+
+
+def _of_edges(edges: Sequence[PairResult]) -> Placement:
+    """The numbers of a scan: means over its registrations, and the best cover."""
+    best = max(edges, key=lambda edge: edge.score, default=None)
+    return Placement(
+        map_from_scan=np.eye(4),
+        sensor_origin=None,
+        fitness=float(np.mean([edge.fitness for edge in edges])) if edges else None,
+        inlier_rmse=float(np.mean([edge.inlier_rmse for edge in edges])) if edges else None,
+        overlap=1.0 if best is None else best.overlap,
+        agreement=1.0 if best is None else best.agreement,
+        searched=best is not None and not best.vouched,
+        uncertainty=None,
+    )
+
+
+def _numbers(edges: Sequence[PairResult]) -> dict[int, list[PairResult]]:
+    by_scan = defaultdict(list)
+    for edge in edges:
+        by_scan[edge.target].append(edge)
+        by_scan[edge.source].append(edge)
+    return by_scan
+
+
+def _left_out(file: ScanFile, read: Read, rescued: Rescued | None) -> Outcome:
+    if rescued is not None:
+        reason, fitness, rmse = rescued.reason, rescued.fitness, rescued.inlier_rmse
+        if reason is None:
+            reason = (
+                f"scan {file.name}: it contradicts what its neighbours saw as free space; scan there again"
+            )
+        return Outcome(name=file.name, placement=None, reason=reason, fitness=fitness, inlier_rmse=rmse)
+    error: ScanError | str | None = read.error or read.reason
+    reason = (
+        f"scan {file.name}: it contradicts what its neighbours saw as free space; scan there again"
+        if error is None
+        else str(error)
+    )
+    return Outcome(name=file.name, placement=None, reason=reason)

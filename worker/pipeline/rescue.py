@@ -1,0 +1,121 @@
+"""A second chance: scans that no single scan wanted are looked for in the map of all that were placed."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from worker.pipeline.frame import map_from_reference
+from worker.pipeline.icp import Surface
+from worker.pipeline.pair_work import Folder, assembled
+from worker.pipeline.pairing import PairWork, Sound
+from worker.pipeline.placement import Placement
+from worker.pipeline.poses import inverse
+from worker.pipeline.prepared import PreparedScan, ScanRejected, seen_through
+from worker.pipeline.registration import placement_of, register
+from worker.pipeline.registration_settings import RegistrationSettings
+from worker.pipeline.values import Matrix4
+
+_NEAR = 6.0  # metres between sensors, within which one scan can speak of another
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Rescued:
+    """What became of one scan that was left over."""
+
+    number: int
+    pose: Matrix4 | None = None  #: in the frame of the poses that were given; None where it has no place
+    beside: int = -1  #: the placed scan nearest to it
+    placement: Placement | None = None  #: its numbers
+    reason: str | None = None
+    fitness: float | None = None
+    inlier_rmse: float | None = None
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class _Looking:
+    folder: Folder
+    number: int
+    start: Matrix4 | None
+    map_path: Path
+    poses: tuple[tuple[int, Matrix4], ...]
+    settings: RegistrationSettings
+
+
+def rescue(
+    missing: Sequence[int],
+    poses: Mapping[int, Matrix4],
+    reference: int,
+    scans: Mapping[int, Sound],
+    work: PairWork,
+) -> dict[int, Rescued]:
+    """Register each missing scan to the placed ones as a survey is registered to a map; all in one frame."""
+    if not missing:
+        return {}
+    surface = assembled(work.folder, list(poses.items()), voxel_size=work.registration.voxel_size)
+    path = work.folder.root / "map.npz"
+    PreparedScan(name="map", surface=surface, image=None, sensor_pose=np.eye(4)).save(path)
+    priors = {number: scan.prior for number, scan in scans.items() if scan.prior is not None}
+    frame = inverse(map_from_reference(poses, priors, reference))
+    tasks = [
+        _Looking(
+            folder=work.folder,
+            number=number,
+            start=frame @ priors[number] if number in priors else None,
+            map_path=path,
+            poses=tuple(poses.items()),
+            settings=work.registration,
+        )
+        for number in missing
+    ]
+    return {each.number: each for each in work.processes.each(_look, tasks)}
+
+
+@functools.lru_cache(maxsize=1)
+def _map(path: Path) -> Surface:
+    return PreparedScan.load(path).surface
+
+
+def _look(task: _Looking) -> Rescued:
+    scan = task.folder.load(task.number)
+    try:
+        best = register(scan, _map(task.map_path), start=task.start, settings=task.settings)
+    except ScanRejected as error:
+        return Rescued(
+            number=task.number, reason=str(error), fitness=error.fitness, inlier_rmse=error.inlier_rmse
+        )
+    pose = best.found.target_from_source
+    near = _by_distance(pose, task.poses)
+    through = _contradicted(scan, pose, near, task.folder)
+    limit = task.settings.max_seen_through_vouched if best.vouched else task.settings.max_seen_through
+    if through > limit:
+        reason = (
+            f"scan {scan.name}: {through:.1%} of its points stand where its neighbours saw free space (at most "
+            f"{limit:.1%} is accepted); give an initial pose, or scan there again"
+        )
+        return Rescued(
+            number=task.number,
+            reason=reason,
+            fitness=best.found.fitness,
+            inlier_rmse=best.found.inlier_rmse,
+        )
+    return Rescued(
+        number=task.number, pose=pose, beside=near[0][0], placement=placement_of(best, scan.origin)
+    )
+
+
+def _by_distance(pose: Matrix4, poses: Sequence[tuple[int, Matrix4]]) -> list[tuple[int, Matrix4]]:
+    return sorted(poses, key=lambda other: float(np.linalg.norm(other[1][:3, 3] - pose[:3, 3])))
+
+
+def _contradicted(
+    scan: PreparedScan, pose: Matrix4, near: Sequence[tuple[int, Matrix4]], folder: Folder
+) -> float:
+    """Mean share of points in free space over the placed scans that are near enough to say so."""
+    beside = [other for other in near if np.linalg.norm(other[1][:3, 3] - pose[:3, 3]) < _NEAR]
+    shares = [seen_through(scan, folder.load(number), inverse(other) @ pose) for number, other in beside[:8]]
+    return float(np.mean(shares)) if shares else 0.0
