@@ -12,7 +12,7 @@ import pytest
 
 from service.catalog import keys
 from service.catalog.jobs import Jobs
-from service.catalog.records import JobRecord
+from service.catalog.records import JobRecord, ScanRecord
 from service.catalog.steps import STEPS, JobKind
 from service.settings import Settings
 from tests.integration.house import MAP, MODEL, OTHER_CUT, SAME_CUT, SEEN_TO, House, Material, run
@@ -212,13 +212,16 @@ def test_a_job_of_a_deleted_map_does_nothing(house: House, visited: JobRecord) -
     assert house.files() == files
 
 
-@pytest.mark.parametrize("kind", ["map", "survey"])
-def test_a_broken_scan_fails_the_job_and_is_named(house: House, kind: JobKind) -> None:
-    whole = house.add("whole.pcd", house.material.after)
+def half_of(house: House, name: str, whole: ScanRecord) -> ScanRecord:
     with house.catalog.blobs.local(whole.key) as path:
         content = path.read_bytes()
-    cut = house.add_file("cut short.pcd", content[: len(content) // 2])
-    job = house.map_of(whole, cut, map_id="hall") if kind == "map" else house.survey_of(whole, cut)
+    return house.add_file(name, content[: len(content) // 2])
+
+
+@pytest.mark.parametrize("kind", ["map", "survey"])
+def test_a_job_whose_only_scan_is_broken_fails_and_names_it(house: House, kind: JobKind) -> None:
+    cut = half_of(house, "cut short.pcd", house.add("whole.pcd", house.material.after))
+    job = house.map_of(cut, map_id="hall") if kind == "map" else house.survey_of(cut)
     with pytest.raises(ScanError):
         run(job, "register")
     assert failed(house, job, "scan_unreadable").startswith("cut short.pcd: ")
@@ -226,6 +229,17 @@ def test_a_broken_scan_fails_the_job_and_is_named(house: House, kind: JobKind) -
     assert status == "failed"
     run(job)  # what still stood in the queue
     failed(house, job, "scan_unreadable")
+
+
+@pytest.mark.parametrize("kind", ["map", "survey"])
+def test_a_broken_scan_beside_a_whole_one_is_left_out_and_named(house: House, kind: JobKind) -> None:
+    whole = house.add("whole.pcd", house.material.after)
+    cut = half_of(house, "cut short.pcd", whole)
+    job = house.map_of(whole, cut, map_id="hall") if kind == "map" else house.survey_of(whole, cut)
+    run(job, "register")
+    scans = house.catalog.maps.get("hall").scans if kind == "map" else house.survey(job).scans
+    assert [scan.accepted for scan in scans] == [True, False]
+    assert str(scans[1].reason).startswith("cut short.pcd: ")
 
 
 def test_a_survey_of_another_place_fails_and_lists_each_scans_numbers(house: House) -> None:

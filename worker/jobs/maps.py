@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import functools
 import json
-from contextlib import ExitStack
 
 from service.catalog import keys
 from service.catalog.records import Bounds
 from worker.detectors.card import Preprocessing
 from worker.detectors.store import open_card
 from worker.jobs.models import kept_detector, pipeline_settings
-from worker.jobs.scans import save_scans, scan_files, scan_outcomes
 from worker.jobs.step import Context, put, step
+from worker.jobs.versions import make_version
 from worker.pipeline import archive
-from worker.pipeline.flow import BuiltMap, NothingToTile, build_map
+from worker.pipeline.flow import BuiltMap
 from worker.pipeline.manifest import manifest, padded_patches
 from worker.pipeline.ply import write_ply
 from worker.pipeline.values import Points
@@ -22,43 +20,35 @@ from worker.pipeline.values import Points
 
 @step
 def register_map(at: Context) -> None:
-    """Scans to a fused, tiled map."""
-    record = at.catalog.versions.of_job(at.job.job_id)
-    card = open_card(at.settings.model_store, record.model)
-    with ExitStack() as stack:
-        files = scan_files(at, record.scans, stack)
-        try:
-            built = build_map(files, settings=pipeline_settings(at, record, card), progress=at.report)
-        except NothingToTile as error:
-            outcomes = scan_outcomes(record.scans, error.outcomes)
-            at.catalog.versions.save_outcomes(at.job.job_id, outcomes)
-            raise
-    at.report("saving", 0.0)
-    outcomes = scan_outcomes(record.scans, built.outcomes)
-    save_scans(at, record.scans, built.outcomes, functools.partial(keys.map_scan, at.job.job_id))
-    _put_map(at, built, card.preprocessing)
+    """Scans to a fused, tiled map: the first version of it, or a later one."""
+    version = at.catalog.versions.of_job(at.job.job_id)
+    card = open_card(at.settings.model_store, version.model)
+    made = make_version(at, version, pipeline_settings(at, version, card))
+    _put_map(at, made.built, card.preprocessing)
     at.catalog.versions.save_result(
         at.job.job_id,
-        outcomes=outcomes,
-        bounds=_bounds(built.reference.points),
+        outcomes=made.outcomes,
+        bounds=_bounds(made.built.reference.points),
         counts={
-            "points": len(built.reference.points),
-            "tiles": len(built.tiles.points),
-            "scans": len(built.outcomes),
-            "accepted": sum(outcome.scan is not None for outcome in built.outcomes),
+            "points": len(made.built.reference.points),
+            "tiles": len(made.built.tiles.points),
+            "scans": len(made.outcomes),
+            "accepted": sum(outcome.accepted is True for outcome in made.outcomes),
         },
+        registration=made.registration(),
     )
+    at.catalog.blobs.delete_prefix(keys.map_work(at.job.job_id))
 
 
 @step
 def describe_map(at: Context) -> None:
     """What the model can know of the reference alone; then the map is ready."""
-    record = at.catalog.versions.of_job(at.job.job_id)
-    detector = kept_detector(at.settings, record.model)
+    version = at.catalog.versions.of_job(at.job.job_id)
+    detector = kept_detector(at.settings, version.model)
     with at.catalog.blobs.local(keys.map_tiles(at.job.job_id)) as path:
         tiles = archive.load_tiles(path)
     description = detector.describe(tiles, progress=lambda _, share: at.report("describing", share))
-    key = keys.map_description(at.job.job_id, record.model)
+    key = keys.map_description(at.job.job_id, version.model)
     put(at, key, lambda path: archive.save_arrays(path, description))
     at.catalog.jobs.succeed(at.job.job_id)
 

@@ -1,4 +1,4 @@
-"""A job's scans: uploads as local files, and what became of them."""
+"""A job's scans: uploads as local files, what became of them, and those that were accepted."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from service.catalog.records import ScanOutcome
 from worker.jobs.step import Context, put
 from worker.pipeline import archive
-from worker.pipeline.chaining import Outcome, ScanFile
+from worker.pipeline.placement import Outcome, RegisteredScan, ScanFile, placed
 
 
 def scan_files(at: Context, scans: Sequence[ScanOutcome], stack: ExitStack) -> list[ScanFile]:
@@ -25,28 +25,51 @@ def scan_files(at: Context, scans: Sequence[ScanOutcome], stack: ExitStack) -> l
     return files
 
 
-def scan_outcomes(scans: Sequence[ScanOutcome], outcomes: Sequence[Outcome]) -> list[ScanOutcome]:
-    return [
-        ScanOutcome(
-            scan_id=scan.scan_id,
-            accepted=outcome.scan is not None,
-            fitness=outcome.fitness,
-            rmse=outcome.inlier_rmse,
-            map_from_scan=None if outcome.scan is None else outcome.scan.map_from_scan.tolist(),
-            reason=outcome.reason,
-        )
-        for scan, outcome in zip(scans, outcomes, strict=True)
-    ]
+def scan_outcomes(scans: Sequence[ScanOutcome], outcomes: Sequence[Outcome]) -> tuple[ScanOutcome, ...]:
+    """What became of each scan, as it is recorded."""
+    ids = [scan.scan_id for scan in scans]
+    return tuple(_recorded(scan_id, outcome, ids) for scan_id, outcome in zip(ids, outcomes, strict=True))
 
 
 def save_scans(
     at: Context,
     scans: Sequence[ScanOutcome],
+    files: Sequence[ScanFile],
     outcomes: Sequence[Outcome],
     key_of: Callable[[str], str],
 ) -> None:
-    for done, (each, outcome) in enumerate(zip(scans, outcomes, strict=True)):
+    """Keep the points of every accepted scan; one file is read at a time."""
+    for done, (each, file, outcome) in enumerate(zip(scans, files, outcomes, strict=True)):
         at.report("saving", done / len(scans))
-        scan = outcome.scan
-        if scan is not None:
+        if outcome.placement is not None:
+            scan = placed(file, outcome.placement, max_points=at.settings.max_scan_points)
             put(at, key_of(each.scan_id), functools.partial(archive.save_scan, scan=scan))
+
+
+def kept_scan(at: Context, key: str) -> RegisteredScan:
+    """An accepted scan as `save_scans` kept it."""
+    with at.catalog.blobs.local(key) as path:
+        return archive.load_scan(path)
+
+
+def _recorded(scan_id: str, outcome: Outcome, ids: Sequence[str]) -> ScanOutcome:
+    found = outcome.placement
+    if found is None:
+        return ScanOutcome(
+            scan_id=scan_id,
+            accepted=False,
+            fitness=outcome.fitness,
+            rmse=outcome.inlier_rmse,
+            reason=outcome.reason,
+        )
+    return ScanOutcome(
+        scan_id=scan_id,
+        accepted=True,
+        fitness=outcome.fitness,
+        rmse=outcome.inlier_rmse,
+        map_from_scan=found.map_from_scan.tolist(),
+        translation_sigma=None if found.uncertainty is None else found.uncertainty.translation,
+        rotation_sigma=None if found.uncertainty is None else found.uncertainty.rotation,
+        path=tuple(ids[at] for at in found.path) or None,
+        reason=outcome.reason,
+    )

@@ -40,11 +40,11 @@ def register_survey(at: Context) -> None:
         except NoScanAccepted as error:
             at.catalog.surveys.save_outcomes(survey_id, scan_outcomes(survey.scans, error.outcomes))
             raise
-    at.report("saving", 0.0)
+        key_of = functools.partial(keys.survey_scan, survey_id)
+        save_scans(at, survey.scans, files, located.outcomes, key_of)
     at.catalog.surveys.save_outcomes(survey_id, scan_outcomes(survey.scans, located.outcomes))
     put(at, keys.survey_current(survey_id), lambda path: archive.save_current(path, located.current))
     put(at, keys.survey_pairs(survey_id), lambda path: archive.save_pairs(path, located.pairs))
-    save_scans(at, survey.scans, located.outcomes, functools.partial(keys.survey_scan, survey_id))
 
 
 @step

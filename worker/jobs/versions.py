@@ -1,0 +1,136 @@
+"""What a version of a map is made of: scans alone, or the version before it and what came since."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from service.catalog import keys
+from service.catalog.records import ScanOutcome, VersionRecord
+from worker.jobs.pair_memory import KeptPairs
+from worker.jobs.scans import kept_scan, save_scans, scan_files, scan_outcomes
+from worker.jobs.step import Context, put
+from worker.pipeline import archive
+from worker.pipeline.flow import (
+    BuiltMap,
+    KeptMap,
+    NoScanAccepted,
+    NothingToTile,
+    PipelineSettings,
+    build_map,
+    extend_map,
+    renew_map,
+    without,
+)
+from worker.pipeline.values import Indices
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Made:
+    """A version that was built; its scans are kept, all else of it is still to be saved."""
+
+    built: BuiltMap
+    outcomes: tuple[ScanOutcome, ...]  #: of every scan of the version
+
+    def registration(self) -> dict[str, Any]:
+        """The totals of the registration, with the reference scan by its id."""
+        found = self.built.report.document()
+        reference = found["reference"]
+        return {**found, "reference": None if reference is None else self.outcomes[reference].scan_id}
+
+
+def make_version(at: Context, version: VersionRecord, settings: PipelineSettings) -> Made:
+    """Build a version. What became of its scans is recorded also where that fails."""
+    if version.base_version is None:
+        return _first(at, version, settings)
+    base = at.catalog.versions.get(version.map_id, version.base_version)
+    if version.survey_id is None:
+        return _extended(at, version, base, settings)
+    return _renewed(at, version, base, version.survey_id, settings)
+
+
+def _first(at: Context, version: VersionRecord, settings: PipelineSettings) -> Made:
+    with ExitStack() as stack:
+        files = scan_files(at, version.scans, stack)
+        with _recorded_anyway(at, version.scans):
+            pairs = KeptPairs(at.catalog.blobs, at.job.job_id)
+            built = build_map(files, settings=settings, pairs=pairs, progress=at.report)
+        save_scans(at, version.scans, files, built.outcomes, _key_of(at))
+    return Made(built=built, outcomes=scan_outcomes(version.scans, built.outcomes))
+
+
+def _extended(at: Context, version: VersionRecord, base: VersionRecord, settings: PipelineSettings) -> Made:
+    older, further = _kept(base), _further(version, base)
+    with ExitStack() as stack:
+        files = scan_files(at, further, stack)
+        with _recorded_anyway(at, further):
+            built = extend_map(_kept_map(at, base), files, settings=settings, progress=at.report)
+        for scan in older:
+            at.catalog.blobs.copy(keys.map_scan(base.job_id, scan.scan_id), _key_of(at)(scan.scan_id))
+        save_scans(at, further, files, built.outcomes, _key_of(at))
+    return Made(built=built, outcomes=(*older, *scan_outcomes(further, built.outcomes)))
+
+
+def _renewed(
+    at: Context, version: VersionRecord, base: VersionRecord, survey_id: str, settings: PipelineSettings
+) -> Made:
+    older, seen = _kept(base), _further(version, base)
+    kept, replaced = _kept_map(at, base), _changed(at, survey_id)
+    survey_keys = [keys.survey_scan(survey_id, scan.scan_id) for scan in seen]
+    loads = [functools.partial(kept_scan, at, key) for key in survey_keys]
+    built = renew_map(kept, loads, replaced=replaced, settings=settings, progress=at.report)
+    for done, (scan, load) in enumerate(zip(older, kept.scans, strict=True)):
+        at.report("saving", done / len(older))
+        rest = without(load(), kept.grid, replaced)
+        put(at, _key_of(at)(scan.scan_id), functools.partial(archive.save_scan, scan=rest))
+    for scan, key in zip(seen, survey_keys, strict=True):
+        at.catalog.blobs.copy(key, _key_of(at)(scan.scan_id))
+    return Made(built=built, outcomes=(*older, *seen))
+
+
+def _kept_map(at: Context, base: VersionRecord) -> KeptMap:
+    blobs = at.catalog.blobs
+    with blobs.local(keys.map_reference(base.job_id)) as path:
+        reference = archive.load_reference(path)
+    with blobs.local(keys.map_tiles(base.job_id)) as path:
+        grid = archive.load_tiles(path).grid
+    scans = [
+        functools.partial(kept_scan, at, keys.map_scan(base.job_id, scan.scan_id)) for scan in _kept(base)
+    ]
+    return KeptMap(reference=reference, grid=grid, scans=scans)
+
+
+def _kept(base: VersionRecord) -> list[ScanOutcome]:
+    return [scan for scan in base.scans if scan.accepted]
+
+
+def _further(version: VersionRecord, base: VersionRecord) -> list[ScanOutcome]:
+    """What the version has beside its base; an earlier run of the step may have recorded outcomes of these."""
+    older = {scan.scan_id for scan in _kept(base)}
+    return [scan for scan in version.scans if scan.scan_id not in older]
+
+
+def _changed(at: Context, survey_id: str) -> Indices:
+    """(T, 3) the tiles that the survey found changed."""
+    found = at.catalog.changes.of_survey(survey_id)
+    changed = [each.tile.tile_index for each in found if each.tile.state == "changed"]
+    return np.array(changed, np.int32).reshape(-1, 3)
+
+
+def _key_of(at: Context) -> functools.partial[str]:
+    return functools.partial(keys.map_scan, at.job.job_id)
+
+
+@contextmanager
+def _recorded_anyway(at: Context, scans: Sequence[ScanOutcome]) -> Iterator[None]:
+    """Record what became of the scans where no map comes of them."""
+    try:
+        yield
+    except (NoScanAccepted, NothingToTile) as error:
+        at.catalog.versions.save_outcomes(at.job.job_id, scan_outcomes(scans, error.outcomes))
+        raise
