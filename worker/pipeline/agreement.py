@@ -17,6 +17,8 @@ from worker.pipeline.icp import Surface, facing
 from worker.pipeline.poses import inverse, transformed
 from worker.pipeline.values import Matrix4
 
+_SAMPLE = 10_000  # points asked in each direction; a share of them is known to half a percent
+
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Agreement:
@@ -42,15 +44,37 @@ def agreement(
 ) -> Agreement:
     """Compare both clouds under the pose; `reach` and `surface_distance` are metres."""
     look = functools.partial(surface_share, reach=reach, surface_distance=surface_distance)
-    overlap, forward = look(source, target, target_from_source)
-    _, backward = look(target, source, inverse(target_from_source))
+    overlap, forward = look(_sampled(source), target, target_from_source)
+    source_from_target = inverse(target_from_source)
+    _, backward = look(
+        _sampled(_around(target, source, source_from_target, reach)), source, source_from_target
+    )
     return Agreement(overlap=overlap, forward=forward, backward=backward)
+
+
+def _sampled(surface: Surface) -> Surface:
+    return surface.thinned(max(1, len(surface.points) // _SAMPLE))
+
+
+def _around(target: Surface, source: Surface, source_from_target: Matrix4, reach: float) -> Surface:
+    """What of the target can be near the source: a scan covers little of a large map."""
+    points = transformed(target.points, source_from_target)
+    low, high = source.points.min(axis=0) - reach, source.points.max(axis=0) + reach
+    near = np.all((points > low) & (points < high), axis=1)
+    return Surface(
+        points=target.points[near],
+        normals=target.normals[near],
+        oriented=target.oriented[near],
+        tree=target.tree,
+    )
 
 
 def surface_share(
     cloud: Surface, surface: Surface, surface_from_cloud: Matrix4, *, reach: float, surface_distance: float
 ) -> tuple[float, float]:
     """Share of the cloud within reach of the surface and seen from its side, and of that the share that lies on it."""
+    if not len(cloud.points):
+        return 0.0, 0.0
     points = transformed(cloud.points, surface_from_cloud)
     distance, index = surface.nearest(points, within=reach)
     near = np.isfinite(distance)

@@ -10,11 +10,14 @@ import numpy as np
 from worker.pipeline.agreement import Agreement, agreement
 from worker.pipeline.global_search import candidate_poses
 from worker.pipeline.icp import IcpResult, Surface, icp
+from worker.pipeline.plan_view import plan_candidates
 from worker.pipeline.poses import difference, exponential, transformed
 from worker.pipeline.registration_settings import RegistrationSettings
+from worker.pipeline.rough import REACH, best_rough, rough_pose
 from worker.pipeline.values import Matrix4
 
-REACH = 0.3  #: metres; farther from the map than this, a point is where the map has nothing to say
+_PLANS = 12  # places that the plans name
+_BEST_PLANS = 4  # of those that get a full ICP
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -32,35 +35,51 @@ class Candidate:
 def searched(
     source: Surface,
     target: Surface,
-    best: Candidate,
+    best: Candidate | None,
     prior: Matrix4 | None,
     refine: Callable[[Matrix4], Candidate],
     settings: RegistrationSettings,
 ) -> Candidate:
-    """The best pose of the global search, or what was there before it; `prior` is map_from_scan."""
-    seeds = settings.search_seeds if prior is None else 1
-    candidates = candidate_poses(source, target, resolutions=settings.search_resolutions, seeds=seeds)
-    for pose in candidates:
+    """The best pose of the search, or what was there before it; `prior` is map_from_scan."""
+    for pose in _anywhere(source, target, prior, settings):
         if prior is not None and not _is_near(pose, prior, settings):
             continue
-        best = better(best, refine(pose))
+        best = refine(pose) if best is None else better(best, refine(pose))
         if (
             is_accepted(best, settings)
             and best.seen.mutual > needed_agreement(best, settings) + settings.sure_margin
         ):
             break
-    return best
+    return refine(np.eye(4)) if best is None else best
 
 
-def turned(source: Surface, best: Candidate, refine: Callable[[Matrix4], Candidate]) -> Candidate:
+def _anywhere(
+    source: Surface, target: Surface, prior: Matrix4 | None, settings: RegistrationSettings
+) -> Iterator[Matrix4]:
+    """Candidates: identity and what plans say, after a rough look; then, more slowly, what local features say."""
+    starts = [np.eye(4)] if prior is None else []
+    if settings.search_resolutions:
+        plans = plan_candidates(source, target, count=_PLANS if prior is None else 4 * _PLANS)
+        starts += [start for start in plans if prior is None or _is_near(start, prior, settings)]
+    for rough in best_rough(source, target, starts)[:_BEST_PLANS]:
+        yield rough.target_from_source
+    seeds = settings.search_seeds if prior is None else 1
+    yield from candidate_poses(source, target, resolutions=settings.search_resolutions, seeds=seeds)
+
+
+def turned(
+    source: Surface, target: Surface, best: Candidate, refine: Callable[[Matrix4], Candidate]
+) -> Candidate:
     """The best of a pose and its quarter turns: a rectangular room fits itself turned about its middle.
 
-    Not asked where a prior vouches for the pose.
+    Not asked where a prior vouches for the pose, nor of a turn that does worse even at a lenient look.
     """
     if best.vouched:
         return best
     for pose in _quarter_turns(source, best.found.target_from_source):
-        best = better(best, refine(pose))
+        rough = rough_pose(source, target, pose)
+        if rough.score >= best.seen.score:
+            best = better(best, refine(rough.target_from_source))
     return best
 
 

@@ -19,6 +19,8 @@ from worker.pipeline.poses import exponential, transformed
 from worker.pipeline.values import Bools, Floats, Matrix4
 from worker.threads import query_threads
 
+_WORTH_A_THREAD = 4000  # points of a query; SciPy starts its threads anew for each
+
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Surface:
@@ -37,9 +39,21 @@ class Surface:
         points = points.astype(np.float64)
         return cls(points=points, normals=normals.astype(np.float64), oriented=oriented, tree=cKDTree(points))
 
+    def thinned(self, every: int) -> Surface:
+        """One point of so many; the tree stays that of all, so this is something to move, not to be asked."""
+        if every == 1:
+            return self
+        return Surface(
+            points=self.points[::every],
+            normals=self.normals[::every],
+            oriented=self.oriented[::every],
+            tree=self.tree,
+        )
+
     def nearest(self, points: Floats, *, within: float = np.inf) -> tuple[Floats, NDArray[np.intp]]:
         """Distance (N,) in metres and index (N,) of the nearest point; inf and M where none is near enough."""
-        distance, index = self.tree.query(points, distance_upper_bound=within, workers=query_threads())
+        threads = query_threads() if len(points) > _WORTH_A_THREAD else 1
+        distance, index = self.tree.query(points, distance_upper_bound=within, workers=threads)
         return np.asarray(distance, np.float64), np.asarray(index, np.intp)
 
 

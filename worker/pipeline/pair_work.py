@@ -13,11 +13,12 @@ from worker.errors import ScanError
 from worker.pipeline import plan_view
 from worker.pipeline.icp import Surface, normal_equations
 from worker.pipeline.optimisation import Term
-from worker.pipeline.pairwise import PairResult, RoughPose, register_pair, rough_pose
+from worker.pipeline.pairwise import PairResult, register_pair, rough_pair
 from worker.pipeline.placement import ScanFile
 from worker.pipeline.poses import inverse
 from worker.pipeline.prepared import PreparedScan, ScanRejected, prepare, seen_through
 from worker.pipeline.registration_settings import RegistrationSettings
+from worker.pipeline.rough import RoughPose
 from worker.pipeline.values import Floats, Matrix4, Points
 from worker.pipeline.voxels import Voxels
 
@@ -125,7 +126,7 @@ def search(task: Searching) -> list[Found]:
         spectra = plan_view.spectrum(other, size)
         matches = plan_view.matches(view, turned, other, spectra, count=task.candidates)
         starts = [np.eye(4), *(match.target_from_source for match in matches)]
-        rough = [rough_pose(source, target, start, task.settings) for start in starts]
+        rough = [rough_pair(source, target, start, task.settings) for start in starts]
         best = sorted((each for each in rough if each.score > 0), key=lambda each: -each.score)
         results.append(Found(target=number, source=task.source, poses=tuple(best[:_BEST_ROUGH])))
     return results

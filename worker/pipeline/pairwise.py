@@ -9,16 +9,14 @@ from typing import Any, Self
 
 import numpy as np
 
-from worker.pipeline.agreement import surface_share
-from worker.pipeline.candidate import REACH, Candidate, better, is_accepted, refined
-from worker.pipeline.icp import Surface, icp, normal_equations
+from worker.pipeline.candidate import Candidate, better, is_accepted, refined
+from worker.pipeline.icp import normal_equations
 from worker.pipeline.prepared import PreparedScan, seen_through
 from worker.pipeline.registration_settings import RegistrationSettings
+from worker.pipeline.rough import RoughPose, rough_pose
 from worker.pipeline.values import Floats, Matrix4
 
-_SAMPLE = 800  # points that a rough look takes
-_ROUGH_GATE, _ROUGH_STEPS = 0.6, 6  # metres; iterations of ICP
-_ROUGH_SURFACE = 0.1  # metres
+_ROUGHLY_THROUGH = 10  # times the share that is accepted: a candidate is decimetres off
 _DOUBTFUL, _CERTAIN = 0.8, 0.95  # agreement
 _FREE = 0.001  # share of points in free space at which half of the confidence is gone
 
@@ -139,44 +137,13 @@ def judged(
     )
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class RoughPose:
-    """A candidate after a quick look."""
-
-    target_from_source: Matrix4
-    score: float  #: share of the source on the target's surfaces, 0..1; 0 where free space says no
-
-
-def rough_pose(
+def rough_pair(
     source: PreparedScan, target: PreparedScan, start: Matrix4, settings: RegistrationSettings
 ) -> RoughPose:
-    """A few steps of ICP with a few hundred points, and free space asked before and after (10 ms)."""
-    if seen_through(source, target, start, every=16) > 10 * settings.max_seen_through:
-        return RoughPose(target_from_source=start, score=0.0)
-    every = max(1, len(source.surface.points) // _SAMPLE)
-    found = icp(
-        source.surface,
-        target.surface,
-        start,
-        max_correspondence_distance=_ROUGH_GATE,
-        max_iterations=_ROUGH_STEPS,
-        soft=True,
-        every=every,
-    )
-    pose = found.target_from_source
-    if seen_through(source, target, pose, every=16) > 2 * settings.max_seen_through:
-        return RoughPose(target_from_source=pose, score=0.0)
-    overlap, on_surface = surface_share(
-        _thinned(source.surface, every), target.surface, pose, reach=REACH, surface_distance=_ROUGH_SURFACE
-    )
-    return RoughPose(target_from_source=pose, score=overlap * on_surface)
-
-
-def _thinned(surface: Surface, every: int) -> Surface:
-    """Some of the points; the tree stays that of all and is not to be asked."""
-    return Surface(
-        points=surface.points[::every],
-        normals=surface.normals[::every],
-        oriented=surface.oriented[::every],
-        tree=surface.tree,
-    )
+    """A quick look at one candidate, with free space asked before and after (10 ms); score 0 where that says no."""
+    nowhere = RoughPose(target_from_source=start, score=0.0)
+    if seen_through(source, target, start, every=16) > _ROUGHLY_THROUGH * settings.max_seen_through:
+        return nowhere
+    rough = rough_pose(source.surface, target.surface, start)
+    through = seen_through(source, target, rough.target_from_source, every=16)
+    return nowhere if through > 2 * settings.max_seen_through else rough

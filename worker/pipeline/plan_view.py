@@ -71,7 +71,7 @@ class PlanView:
 
 
 def size_for(*views: PlanView) -> int:
-    """Pixels along a side, so that two of these views can be shifted over each other without wrapping much."""
+    """Pixels along a side, so that the larger of these views fits; what is shifted over its edge wraps around."""
     reach = max((view.reach for view in views), default=0.0)
     return int(scipy.fft.next_fast_len(max(int(2 * reach / CELL) + 8, 32)))
 
@@ -118,6 +118,16 @@ def matches(
         )
         _blot_out(scores, turn, row, column)
     return found
+
+
+def plan_candidates(source: Surface, target: Surface, *, count: int) -> list[Matrix4]:
+    """target_from_source, best first; none where a cloud shows no walls whose seen side is known."""
+    view, other = PlanView.of(source), PlanView.of(target)
+    if not len(view.places) or not len(other.places):
+        return []
+    size = size_for(view, other)
+    found = matches(view, turned_spectra(view, size), other, spectrum(other, size), count=count)
+    return [match.target_from_source for match in found]
 
 
 def _pictures(places: Floats, facing: Floats, upper: NDArray[np.bool_], size: int) -> Complexes:

@@ -44,15 +44,15 @@ def register(
     """
     source = scan.surface
     refine = functools.partial(refined, source, target, start, settings=settings, tick=tick)
-    best = refine(None)
-    if start is not None and not is_accepted(best, settings):
+    best = None if start is None else refine(None)
+    if best is not None and not is_accepted(best, settings):
         # where little is shared the wide gates may drag a good prior away
         narrow = settings.model_copy(update={"coarse_distances": settings.coarse_distances[-1:]})
-        best = better(best, refined(source, target, start, None, settings=narrow, tick=tick))
-    if not is_accepted(best, settings):
+        best = better(best, refine(None, settings=narrow))
+    if best is None or not is_accepted(best, settings):
         best = searched(source, target, best, start, refine, settings)
     if is_accepted(best, settings):
-        best = turned(source, best, refine)
+        best = turned(source, target, best, refine)
     else:
         raise _rejected(scan.name, best, _why_not(best, settings))
     _require_held(scan.name, source, target, best, settings)
