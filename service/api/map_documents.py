@@ -27,7 +27,7 @@ class _Built(Document):
     bounds: Bounds | None = Field(description="metres, map frame")
     counts: dict[str, int] = Field(examples=[{"points": 181342, "tiles": 172, "scans": 25, "accepted": 24}])
     registration: dict[str, Any] | None = Field(
-        description="totals of the registration of the scans (paper, Table 2); null until it is built",
+        description="totals of the registration of what is new in it (paper, Table 2); null until it is built",
         examples=[
             {"scans": 25, "accepted": 24, "pairs_possible": 300, "pairs_tried": 61, "pairs_accepted": 58}
         ],

@@ -69,10 +69,14 @@ class ScanOutcome(Record):
     fitness: float | None = None  #: inlier fraction, 0..1
     rmse: float | None = None  #: metres, over the inliers
     map_from_scan: Matrix | None = None
-    translation_sigma: float | None = None  #: metres, one sigma, in the direction that is held worst
-    rotation_sigma: float | None = None  #: radians, likewise
-    path: tuple[str, ...] | None = (
-        None  #: scan ids from the map's reference scan to this one; None in surveys
+    translation_sigma: float | None = Field(
+        None, description="metres, one sigma of where the scan stands, in the direction that is held worst"
+    )
+    rotation_sigma: float | None = Field(None, description="radians, likewise")
+    path: tuple[str, ...] | None = Field(
+        None,
+        description="scan ids from the map's reference scan to this one, by the registrations that placed it; null in "
+        "surveys and for scans that joined the map later",
     )
     reason: str | None = None  #: why it was left out
 
