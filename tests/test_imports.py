@@ -31,6 +31,8 @@ MAY_IMPORT = {
     "worker.errors": (),
     "worker.progress": (),
     "worker.reporting": ("worker.errors",),
+    "worker.threads": (),
+    "worker.processes": ("worker.errors", "worker.threads"),
     # the values that a detector is given, and nothing that the pipeline does
     "worker.detectors": (
         "worker.pipeline.values",
@@ -39,7 +41,13 @@ MAY_IMPORT = {
         "worker.errors",
         "worker.progress",
     ),
-    "worker.pipeline": ("worker.detectors", "worker.errors", "worker.progress"),
+    "worker.pipeline": (
+        "worker.detectors",
+        "worker.errors",
+        "worker.progress",
+        "worker.processes",
+        "worker.threads",
+    ),
     "worker.training": (
         "worker.detectors.spicd_net",
         "worker.pipeline.values",
