@@ -11,7 +11,7 @@ from worker.evaluation.scenes import random_room
 from worker.evaluation.sensor import SimulatedScan
 from worker.evaluation.visits import visit
 from worker.pipeline.icp import Surface
-from worker.pipeline.registration import surface_of
+from worker.pipeline.prepared import surface_of
 from worker.pipeline.registration_settings import RegistrationSettings
 from worker.pipeline.scan import Scan
 from worker.pipeline.values import Matrix4, Points

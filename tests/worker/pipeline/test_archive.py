@@ -7,13 +7,14 @@ from typing import Any
 import numpy as np
 import pytest
 from rooms import scores_of
-from tilings import row_of
+from tilings import grid_of, in_tile, row_of
 
 from worker.pipeline import archive
 from worker.pipeline.manifest import manifest, padded_patches
 from worker.pipeline.mapping import CurrentMap, ReferenceMap
+from worker.pipeline.placement import RegisteredScan
 from worker.pipeline.poses import exponential
-from worker.pipeline.registration import RegisteredScan
+from worker.pipeline.tiling import TilingSettings, cut, grown, pair_tiles
 
 RNG = np.random.default_rng(0)
 POINTS = RNG.normal(size=(7, 3)).astype(np.float32)
@@ -92,29 +93,41 @@ def test_scores_come_back_equal_with_nan(tmp_path: Path) -> None:
     assert_same(scores, archive.load_scores(tmp_path / "s.npz"))
 
 
+@pytest.mark.parametrize("colors", [COLORS, None])
 @pytest.mark.parametrize("origin", [np.array([1.0, 2.0, 0.3]), None])
-def test_a_scan_is_kept_with_its_pose_and_its_sensors_place_where_known(
-    tmp_path: Path, origin: np.ndarray | None
+def test_a_scan_comes_back_with_its_pose_and_its_sensors_place_where_known(
+    tmp_path: Path, origin: np.ndarray | None, colors: np.ndarray | None
 ) -> None:
     scan = RegisteredScan(
-        name="now.pcd",
+        name="now.npz",
         points=POINTS,
-        colors=COLORS,
+        colors=colors,
         map_from_scan=exponential(np.array([0, 0, 1, 2, 3, 4.0])),
         sensor_origin=origin,
-        fitness=0.9,
-        inlier_rmse=0.02,
-        overlap=0.8,
-        agreement=0.95,
-        searched=False,
     )
-    archive.save_scan(tmp_path / "s.npz", scan)
-    kept = archive.load_arrays(tmp_path / "s.npz")
-    assert set(kept) == {"points", "map_from_scan", "colors"} | (
-        {"sensor_origin"} if origin is not None else set()
-    )
-    for name, values in kept.items():
-        assert_same(getattr(scan, name), values)
+    archive.save_scan(tmp_path / "now.npz", scan)
+    assert_same(scan, archive.load_scan(tmp_path / "now.npz"))
+
+
+def test_a_grid_keeps_the_indices_below_zero_that_it_grew(tmp_path: Path) -> None:
+    points = np.concatenate([in_tile(-2, 0, 0, 9), in_tile(0, 0, 0, 9)])
+    tiles = cut(points, grown(grid_of(1, 1, 1), points), min_points=1)
+    assert tiles.grid.lowest == (-2, 0, 0)
+    archive.save_tiles(tmp_path / "t.npz", tiles, patches=padded_patches(tiles, size=10, seed=42))
+    assert_same(tiles, archive.load_tiles(tmp_path / "t.npz"))
+    pairs = pair_tiles(tiles, points, settings=TilingSettings(min_points=1))
+    archive.save_pairs(tmp_path / "p.npz", pairs)
+    assert_same(pairs, archive.load_pairs(tmp_path / "p.npz"))
+
+
+def test_tiles_that_say_nothing_of_a_lowest_index_begin_at_0(tmp_path: Path) -> None:
+    """Maps that were written before a map could grow."""
+    tiles = row_of([6, 1], [6, 1], observed=[True, True]).reference
+    archive.save_tiles(tmp_path / "new.npz", tiles, patches=padded_patches(tiles, size=10, seed=42))
+    arrays = archive.load_arrays(tmp_path / "new.npz")
+    del arrays["lowest"]
+    archive.save_arrays(tmp_path / "old.npz", arrays)
+    assert_same(tiles, archive.load_tiles(tmp_path / "old.npz"))
 
 
 def test_the_same_values_give_the_same_bytes(tmp_path: Path) -> None:

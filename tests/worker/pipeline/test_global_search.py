@@ -10,7 +10,7 @@ from worker.pipeline import global_search
 from worker.pipeline.global_search import candidate_poses
 from worker.pipeline.icp import Surface
 from worker.pipeline.poses import difference, transformed
-from worker.pipeline.registration import surface_of
+from worker.pipeline.prepared import surface_of
 from worker.pipeline.registration_settings import RegistrationSettings
 from worker.pipeline.values import Matrix4
 from worker.pipeline.voxels import Voxels

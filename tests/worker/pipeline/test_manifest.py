@@ -8,7 +8,7 @@ import pytest
 from tilings import grid_of, in_tile
 
 from worker.pipeline.manifest import PATCHES, manifest
-from worker.pipeline.tiling import TileGrid, cut
+from worker.pipeline.tiling import TileGrid, cut, grown
 
 FIELDS = {
     "tile_size", "patch_size", "min_points", "save_dense_tiles", "dense_voxel", "map_bounds",
@@ -29,8 +29,8 @@ def listing() -> dict[str, Any]:
     return read
 
 
-def test_the_fields_are_those_of_table_a1_and_the_origin(listing: dict[str, Any]) -> None:
-    assert set(listing) == FIELDS | {"tile_origin"}
+def test_the_fields_are_those_of_table_a1_and_where_the_grid_begins(listing: dict[str, Any]) -> None:
+    assert set(listing) == FIELDS | {"tile_origin", "tile_lowest_idx"}
     assert all(set(patch) == PATCH_FIELDS for patch in listing["patches"])
 
 
@@ -66,10 +66,26 @@ def test_valid_and_skipped_tiles_add_up_to_the_grid(listing: dict[str, Any]) -> 
 
 
 def test_the_grid_can_be_rebuilt_from_the_manifest(listing: dict[str, Any]) -> None:
-    grid = TileGrid(
+    again = cut(POINTS, _rebuilt(listing), min_points=listing["min_points"])
+    assert again.indices.tolist() == [patch["tile_idx"] for patch in listing["patches"]]
+
+
+def test_the_grid_of_a_map_that_grew_below_its_origin_can_be_rebuilt_too() -> None:
+    points = np.concatenate([in_tile(-2, 0, -1, 600), POINTS])
+    tiles = cut(points, grown(grid_of(3, 2, 2), points), min_points=512)
+    listing = manifest(points, tiles, patch_size=4096, min_points=512, voxel_size=0.05)
+    assert listing["tile_lowest_idx"] == [-2, 0, -1]
+    assert listing["n_tiles_grid"] == [5, 2, 3]
+    assert listing["patches"][0]["patch_id"] == "tile_-02_000_-01"
+    again = cut(points, _rebuilt(listing), min_points=512)
+    assert again.indices.tolist() == [patch["tile_idx"] for patch in listing["patches"]]
+    assert again.indices.tolist() == [[-2, 0, -1], [0, 0, 0], [2, 1, 1]]
+
+
+def _rebuilt(listing: dict[str, Any]) -> TileGrid:
+    return TileGrid(
         origin=np.array(listing["tile_origin"]),
         size=np.array(listing["tile_size"]),
         shape=tuple(listing["n_tiles_grid"]),
+        lowest=tuple(listing["tile_lowest_idx"]),
     )
-    again = cut(POINTS, grid, min_points=listing["min_points"])
-    assert again.indices.tolist() == [patch["tile_idx"] for patch in listing["patches"]]

@@ -1,13 +1,16 @@
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 import pytest
 
 from worker.errors import MapFailed
 from worker.pipeline.mapping import current_map, fuse, reference_map
-from worker.pipeline.registration import RegisteredScan
+from worker.pipeline.placement import RegisteredScan
 from worker.pipeline.registration_settings import RegistrationSettings
 from worker.pipeline.values import Colors, Floats
+from worker.pipeline.voxels import Voxels
 
 SETTINGS = RegistrationSettings()
 
@@ -21,11 +24,6 @@ def scan_of(
         colors=colors,
         map_from_scan=np.eye(4),
         sensor_origin=origin,
-        fitness=1.0,
-        inlier_rmse=0.0,
-        overlap=1.0,
-        agreement=1.0,
-        searched=False,
     )
 
 
@@ -46,6 +44,25 @@ def test_two_scans_fuse_to_the_same_map_in_either_order() -> None:
     rng = np.random.default_rng(0)
     a, b = (scan_of(rng.uniform(-1, 1, (5000, 3))) for _ in range(2))
     assert fuse([a, b], voxel_size=0.05).points == pytest.approx(fuse([b, a], voxel_size=0.05).points)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 4, 5, 8, 11])
+def test_fusing_many_scans_gives_what_merging_them_one_by_one_gives(count: int) -> None:
+    """Sums of like size are merged first; nobody may be lost on the way, whatever the sizes."""
+    rng = np.random.default_rng(count)
+    scans = [
+        scan_of(
+            rng.uniform(-1, 1, (int(size), 3)) + np.array([number, 0, 0]), origin=np.array([0.0, 0.0, 5.0])
+        )
+        for number, size in enumerate(rng.integers(10, 3000, count))
+    ]
+    fused = fuse(iter(scans), voxel_size=0.1)
+    one_by_one = functools.reduce(Voxels.merged, (scan.voxels(0.1) for scan in scans))
+    assert fused.keys.tolist() == one_by_one.keys.tolist()
+    assert fused.counts.tolist() == one_by_one.counts.tolist()
+    assert fused.counts.sum() == sum(len(scan.points) for scan in scans)
+    assert fused.points == pytest.approx(one_by_one.points, abs=1e-6)
+    assert fused.views == pytest.approx(one_by_one.views, abs=1e-9)
 
 
 def test_no_scan_makes_no_map() -> None:

@@ -5,7 +5,7 @@ import pytest
 from tilings import ORIGIN, SIZE, grid_of, in_tile
 
 from worker.errors import MapFailed
-from worker.pipeline.tiling import TilingSettings, cut, grid_over, pair_tiles, tile_id
+from worker.pipeline.tiling import TilingSettings, cut, grid_over, grown, inside_tiles, pair_tiles, tile_id
 
 SETTINGS = TilingSettings()
 
@@ -155,3 +155,40 @@ def test_a_share_of_0_leaves_only_the_number_of_points() -> None:
     reference = cut(in_tile(0, 0, 0, 4000), grid_of(1, 1, 1), min_points=512)
     settings = SETTINGS.model_copy(update={"min_observed_share": 0.0})
     assert pair_tiles(reference, in_tile(0, 0, 0, 512), settings=settings).observed.tolist() == [True]
+
+
+def test_a_grid_that_grows_keeps_its_origin_and_the_index_of_every_tile() -> None:
+    before = np.concatenate([in_tile(i, 0, 0, 20) for i in range(2)])
+    more = np.concatenate([in_tile(-3, 0, 0, 20), in_tile(1, 2, -1, 20)])
+    grid = grid_of(2, 1, 1)
+    wider = grown(grid, np.concatenate([before, more]))
+    assert wider.origin.tolist() == grid.origin.tolist()
+    assert (wider.lowest, wider.shape) == ((-3, 0, -1), (5, 3, 2))
+    tiles = cut(np.concatenate([before, more]), wider, min_points=1)
+    assert tiles.indices.tolist() == [[-3, 0, 0], [0, 0, 0], [1, 0, 0], [1, 2, -1]]
+    assert wider.lower(tiles.indices)[0] == pytest.approx(np.add(ORIGIN, (-4.5, 0, 0)))
+    old = cut(before, grid, min_points=1)
+    assert [part.tolist() for part in old.points] == [part.tolist() for part in tiles.points[1:3]]
+
+
+def test_a_grid_that_grew_into_nothing_shrinks_around_the_points_and_keeps_the_indices() -> None:
+    narrow = grown(grid_of(9, 9, 9), in_tile(4, 5, 6, 10))
+    assert (narrow.lowest, narrow.shape) == ((4, 5, 6), (1, 1, 1))
+    assert cut(in_tile(4, 5, 6, 10), narrow, min_points=1).indices.tolist() == [[4, 5, 6]]
+
+
+def test_pairs_of_a_grid_below_zero_hold_the_points_of_the_same_box() -> None:
+    points = np.concatenate([in_tile(i, 0, 0, 600) for i in (-2, -1, 1)])
+    reference = cut(points, grown(grid_of(1, 1, 1), points), min_points=512)
+    seen = {i: in_tile(i, 0, 0, 550 + i, seed=1) for i in (-2, 1, 5)}
+    pairs = pair_tiles(reference, np.concatenate(list(seen.values())), settings=SETTINGS)
+    assert [part.tolist() for part in pairs.current] == [seen[-2].tolist(), [], seen[1].tolist()]
+
+
+def test_points_inside_of_tiles_are_told_from_those_beside_and_beyond_the_grid() -> None:
+    cells = [(-1, 0, 0), (0, 0, 0), (1, 0, 0), (0, 3, 0)]
+    points = np.concatenate([in_tile(*cell, 5) for cell in cells])
+    grid = grown(grid_of(2, 1, 1), points[:15])
+    wanted = np.array([[-1, 0, 0], [1, 0, 0], [7, 7, 7]], np.int32)
+    assert inside_tiles(points, grid, wanted).tolist() == [True] * 5 + [False] * 5 + [True] * 5 + [False] * 5
+    assert not inside_tiles(points, grid, np.empty((0, 3), np.int32)).any()

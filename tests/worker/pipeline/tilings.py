@@ -16,7 +16,7 @@ ORIGIN = (10.0, -3.0, 0.5)  # metres; not 0, so that a forgotten origin shows
 
 def in_tile(i: int, j: int, k: int, count: int, *, seed: int = 0) -> Points:
     """(count, 3) points well inside the box of tile (i, j, k)."""
-    inside = np.random.default_rng([seed, i + 1, j + 1, k + 1]).uniform(0.05, 0.95, (count, 3))
+    inside = np.random.default_rng([seed, *(np.array([i, j, k]) % 1000 + 1)]).uniform(0.05, 0.95, (count, 3))
     return (np.array(ORIGIN) + (np.array([i, j, k]) + inside) * SIZE).astype(np.float32)
 
 
