@@ -111,8 +111,8 @@ def test_few_right_edges_win_over_more_wrong_ones_of_lower_confidence() -> None:
     assert worst(found, truth) < 0.03
 
 
-def test_a_scan_that_hangs_on_a_thrown_out_edge_alone_falls_out_with_it() -> None:
-    """Scan 12 has one registration to each side of the ring, of which only one can be true; both are doubted."""
+def test_of_two_registrations_of_one_scan_that_contradict_each_other_the_surer_one_stays() -> None:
+    """Scan 12 hangs on one scan at either side of the ring."""
     truth = ring(12) | {12: shifted(8.0, 0, 0.35)}
     right = edge(truth, 0, 12)
     wrong = edge(truth, 6, 12, error=shifted(2.0), **DOUBTFUL)
