@@ -6,7 +6,7 @@ import sys
 
 import typer
 
-from worker.cli import bench, demo, detect, register, terminal, train
+from worker.cli import bench, demo, detect, evaluate, register, terminal, train
 from worker.demo.failure import DemoFailed
 from worker.errors import PipelineError
 from worker.threads import wait_passively
@@ -33,6 +33,6 @@ def _commands() -> typer.Typer:
         pretty_exceptions_enable=False,
         help="Compares LiDAR scans of a space on this machine, trains the detector, and shows the whole service.",
     )
-    for part in (detect, register, train, demo, bench):
+    for part in (detect, register, train, demo, bench, evaluate):
         part.register(commands)
     return commands

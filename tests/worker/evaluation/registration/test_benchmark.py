@@ -1,0 +1,89 @@
+"""The command from end to end on one small room: quick, and too small for figures worth citing."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from worker.cli import main
+from worker.evaluation.registration.benchmark import BenchmarkSettings, evaluate
+
+WORDS = [
+    "evaluate",
+    "registration",
+    "--building",
+    "room",
+    "--scans",
+    "4",
+    "--foreign",
+    "1",
+    "--standing",
+    "2",
+]
+
+
+def run(*words: str) -> int:
+    try:
+        main([*WORDS, *words])
+    except SystemExit as end:
+        return int(end.code or 0)
+    return 0
+
+
+def test_a_small_walk_is_built_measured_and_drawn(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["--seeds", "3", "--scenarios", "drifted,drifted+foreign", "--plain-pairs", "2"]
+    assert run(*words, "--json", "--out", str(tmp_path / "out")) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert json.loads((tmp_path / "out" / "registration.json").read_text()) == told
+    plain, foreign = told["scenarios"]
+    assert (plain["scenario"], plain["seed"], plain["of"], plain["foreign"]) == ("drifted", 3, 4, 0)
+    assert (foreign["scenario"], foreign["of"], foreign["foreign"]) == ("drifted+foreign", 4, 1)
+    for row in (plain, foreign):
+        assert row["accepted"] == 4
+        assert row["foreign_accepted"] == row["wrong"] == 0
+        assert row["centimetres"]["worst"] < 3
+        assert row["degrees"]["worst"] < 0.5
+        assert row["seconds"]["total"] == pytest.approx(
+            sum(seconds for stage, seconds in row["seconds"].items() if stage != "total")
+        )
+        for what in ("map", "errors"):
+            picture = tmp_path / "out" / f"{what}-{row['scenario']}-3.png"
+            assert picture.read_bytes().startswith(b"\x89PNG")
+    assert [way["gates"][0] for way in told["plain"]] == [0.6, 0.05]
+    assert all(way["pairs_possible"] == 6 for way in told["plain"])
+    assert told["survey"]["centimetres"] < 3
+
+
+def test_tables_are_shown_where_json_is_not_asked_for(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("--seeds", "3", "--scenarios", "drifted", "--no-survey") == 0
+    shown = capsys.readouterr().out
+    assert "4 of 4" in shown
+    assert "25 of 42" in shown
+    assert "warm map" not in shown
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["--scenarios", "upright"], "no scenario upright"),
+        (["--seeds", "1;2"], "whole numbers with commas"),
+        (["--scenarios", "lost", "--plain"], "`drifted`"),
+    ],
+)
+def test_what_cannot_be_run_is_told_in_a_sentence(
+    words: list[str], sentence: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(*words) == 1
+    assert sentence in capsys.readouterr().err
+
+
+def test_real_scans_are_joined_as_the_given_transforms_have_it_and_strangers_are_not(
+    shared_data: Path,
+) -> None:
+    real = evaluate(BenchmarkSettings(kinds=(), survey=False, real=shared_data))["real"]
+    assert all(row["joined"] for row in real["pairs"])
+    assert all(row["centimetres"] < 6 and row["degrees"] < 1 for row in real["pairs"])
+    assert real["frames"]["accepted"] == 5
+    assert not any(row["joined"] for row in real["foreign"])

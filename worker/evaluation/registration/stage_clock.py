@@ -1,0 +1,33 @@
+"""Seconds by stage, read off the reports that a piece of work makes about itself."""
+
+from __future__ import annotations
+
+import time
+
+from worker.progress import Progress
+
+
+class StageClock:
+    """A `Progress` that passes everything on and counts the time since the last report for the stage before."""
+
+    def __init__(self, progress: Progress, *, prefix: str = "") -> None:
+        self._progress = progress
+        self._prefix = prefix
+        self._stage = "reading"  # what comes before the first report
+        self._begun = self._last = time.perf_counter()
+        self._seconds: dict[str, float] = {}
+
+    def __call__(self, stage: str, share: float) -> None:
+        self._count()
+        self._stage = stage
+        self._progress(self._prefix + stage, share)
+
+    def seconds(self) -> dict[str, float]:
+        """By stage in the order of their first reports, and in `total`; time goes on until this is asked."""
+        self._count()
+        return {**self._seconds, "total": self._last - self._begun}
+
+    def _count(self) -> None:
+        now = time.perf_counter()
+        self._seconds[self._stage] = self._seconds.get(self._stage, 0.0) + now - self._last
+        self._last = now
