@@ -38,6 +38,9 @@ class RegistrationSettings(BaseModel):
     sure_margin: float = Field(0.03, ge=0, le=1, description="agreement over the least; the search then ends")
     min_overlap: float = Field(0.5, ge=0, le=1, description="share of the scan that the map covers")
     min_overlap_vouched: float = Field(0.3, ge=0, le=1, description="the same near a prior")
+    max_rival_distance: float = Field(
+        0.05, gt=0, description="metres; as good a pose farther away than this leaves the scan undecided"
+    )
     prior_distance: float = Field(1.0, ge=0, description="metres; how far a given prior may be off")
     prior_angle: float = Field(0.26, ge=0, description="radians; likewise (15 degrees)")
     max_seen_through: float = Field(
