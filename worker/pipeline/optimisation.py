@@ -102,16 +102,16 @@ def _edge_term(poses: Poses, edge: PairResult, weight: float) -> Term:
     target = poses[edge.target]
     wanted = target @ edge.target_from_source @ inverse(poses[edge.source])
     twist = np.r_[Rotation.from_matrix(wanted[:3, :3]).as_rotvec(), wanted[:3, 3]]
-    back = _adjoint(inverse(target))
-    information = weight * (back.T @ edge.information @ back)
     # a direction that the pair leaves free is held a little, so that every graph has a solution
-    information = information + 1e-6 * np.trace(information) / 6 * np.eye(6)
+    held = edge.information + 1e-6 * np.trace(edge.information) / 6 * np.eye(6)
+    back = adjoint(inverse(target))
+    information = weight * (back.T @ held @ back)
     return Term(
         target=edge.target, source=edge.source, information=information, gradient=-information @ twist
     )
 
 
-def _adjoint(pose: Matrix4) -> Floats:
+def adjoint(pose: Matrix4) -> Floats:
     """(6, 6): a twist (rotation, translation) in one frame as the same motion in another."""
     x, y, z = pose[:3, 3]
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])

@@ -13,10 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from worker.pipeline.map_settings import MapSettings
-from worker.pipeline.optimisation import Term, covariances, moved, solve
+from worker.pipeline.optimisation import Term, adjoint, covariances, moved, solve
 from worker.pipeline.overlap import Extent, likely_pairs
 from worker.pipeline.pair_work import Folder, Linearised, Linearising, linearise
 from worker.pipeline.placement import Uncertainty
+from worker.pipeline.poses import inverse
 from worker.pipeline.values import Floats, Matrix4, Points
 from worker.processes import Processes
 
@@ -61,7 +62,7 @@ def refine_jointly(
         terms = linearised(current, pairs, folder, processes, within=_GATES[level], every=_EVERY[level])
         progress((number + 1) / (rounds + 1))
         if number < rounds and len(current) > 1:
-            steps = solve(list(current), _held(terms), fixed=fixed)
+            steps = solve(list(current), _held(terms, current), fixed=fixed)
             current = moved(current, steps)
     return Refined(
         poses=current,
@@ -107,7 +108,7 @@ def uncertainties(
     inliers = np.array([term.num_inliers for term in terms])
     squares = np.array([term.square_residual for term in terms])
     variance = float((inliers * squares).sum() / max(inliers.sum(), 1)) * CORRELATED
-    blocks = covariances(list(poses), _held(terms), fixed=fixed, variance=variance)
+    blocks = covariances(list(poses), _held(terms, poses), fixed=fixed, variance=variance)
     for scan, block in blocks.items():
         x, y, z = poses[scan][:3, 3]
         # how the sensor's place moves with the twist (rotation, translation) of the pose
@@ -135,12 +136,19 @@ def _pairs(
     return sorted({*near, *known})
 
 
-def _held(terms: Sequence[Linearised]) -> list[Term]:
-    """The terms, each with a little of itself in every direction: one that nobody holds stays where it is."""
+def _held(terms: Sequence[Linearised], poses: Mapping[int, Matrix4]) -> list[Term]:
+    """The terms, each with a little of itself in every direction: one that nobody holds stays where it is.
+
+    A little as seen from the scan: about an origin that is far away, a turn of the scan looks like a long way, and
+    holding that a little would hold the turn fast.
+    """
     held = []
     for each in terms:
-        term = each.term
-        little = 1e-6 * max(float(np.trace(term.information)) / 6, 1.0) * np.eye(6)
+        term, here = each.term, np.eye(4)
+        here[:3, 3] = poses[term.source][:3, 3]
+        there, back = adjoint(here), adjoint(inverse(here))
+        strength = float(np.trace(there.T @ term.information @ there)) / 6
+        little = 1e-6 * max(strength, 1.0) * (back.T @ back)
         held.append(
             Term(
                 target=term.target,

@@ -9,7 +9,7 @@ from graphs import INFORMATION, along, around, edge, line, ring, shifted
 from worker.pipeline.map_settings import MapSettings
 from worker.pipeline.optimisation import (
     Term,
-    _adjoint,
+    adjoint,
     covariances,
     moved,
     optimised,
@@ -33,7 +33,7 @@ def test_a_twist_in_one_frame_is_the_same_motion_in_another() -> None:
         there, back = (pose @ exponential(sign * twist) @ inverse(pose) for sign in (1, -1))
         spin = (there - back)[:3, :3] / (2 * step)
         expected = np.r_[spin[2, 1], spin[0, 2], spin[1, 0], (there - back)[:3, 3] / (2 * step)]
-        assert _adjoint(pose)[:, axis] == pytest.approx(expected, abs=1e-6)
+        assert adjoint(pose)[:, axis] == pytest.approx(expected, abs=1e-6)
 
 
 @pytest.mark.parametrize("scan", [1, 3, 7])
