@@ -1,0 +1,83 @@
+"""Scans of the simulated room as files and as prepared scans, thinned so that a test takes no longer than it must."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from rooms import as_scan
+
+from worker.evaluation.sensor import SimulatedScan
+from worker.pipeline.map_settings import MapSettings
+from worker.pipeline.pair_work import Folder, thin
+from worker.pipeline.pcd import write_pcd
+from worker.pipeline.placement import Outcome, Placement, ScanFile
+from worker.pipeline.placing_settings import PlacingSettings
+from worker.pipeline.poses import difference, inverse
+from worker.pipeline.prepared import prepare
+from worker.pipeline.registration_settings import RegistrationSettings
+from worker.pipeline.values import Matrix4, Points
+
+THIN = 3  #: every third point of a scan does here
+MANY = 1_000_000
+#: without the slow part of the global search; plans are still asked
+QUICK = RegistrationSettings(max_iterations=12, search_resolutions=(0.3,), search_seeds=1)
+
+
+def placing(registration: RegistrationSettings = QUICK, **mapping: float) -> PlacingSettings:
+    """Of these settings."""
+    return PlacingSettings(
+        registration=registration, mapping=MapSettings().model_copy(update=mapping), max_points=MANY
+    )
+
+
+def written(
+    path: Path,
+    scan: SimulatedScan,
+    *,
+    between: tuple[float, float] = (-np.inf, np.inf),
+    pose: Matrix4 | None = None,
+    viewpoint: Matrix4 | None = None,
+    more: Points | None = None,
+    thinned: int = THIN,
+) -> ScanFile:
+    """What the scan saw for x of the world in `between`, and `more` (N, 3) of the sensor frame.
+
+    `pose` is the prior that is given, `viewpoint` where the sensor stood in the frame of the file.
+    """
+    x = scan.world_points[::thinned, 0]
+    points = scan.points[::thinned][(x > between[0]) & (x < between[1])].astype(np.float64)
+    if more is not None:
+        points = np.concatenate([points, more])
+    if viewpoint is not None:
+        points = points @ viewpoint[:3, :3].T + viewpoint[:3, 3]
+    write_pcd(path, points.astype(np.float32), sensor_pose=viewpoint)
+    return ScanFile(name=path.name, path=path, pose=pose)
+
+
+def prepared_folder(root: Path, scans: Mapping[int, SimulatedScan]) -> tuple[Folder, dict[int, Points]]:
+    """The scans prepared under their numbers, and their thinned points."""
+    folder, points = Folder(root=root), {}
+    for number, scan in scans.items():
+        ready = prepare(as_scan(scan.points[::THIN], name=f"{number}.pcd"), QUICK)
+        ready.save(folder.path(number))
+        points[number] = thin(ready.surface.points)
+    return folder, points
+
+
+def placement(outcome: Outcome) -> Placement:
+    """Of a scan that must have been accepted."""
+    assert outcome.placement is not None, outcome.reason
+    assert outcome.reason is None
+    return outcome.placement
+
+
+def off(pose: Matrix4, truth: Matrix4) -> float:
+    """Metres."""
+    return difference(pose, truth)[0]
+
+
+def spread(poses: Mapping[int, Matrix4], truth: Mapping[int, Matrix4]) -> float:
+    """Metres that two scans are off each other at most."""
+    return max(off(inverse(poses[a]) @ poses[b], inverse(truth[a]) @ truth[b]) for a in poses for b in poses)
