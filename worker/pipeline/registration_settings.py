@@ -44,7 +44,7 @@ class RegistrationSettings(BaseModel):
     prior_distance: float = Field(1.0, ge=0, description="metres; how far a given prior may be off")
     prior_angle: float = Field(0.26, ge=0, description="radians; likewise (15 degrees)")
     max_seen_through: float = Field(
-        0.01,
+        0.004,
         ge=0,
         le=1,
         description="share of one scan's points that stand where another scan saw free space",
