@@ -90,7 +90,7 @@ def _pair(folder: Path, pair: Pair, progress: Progress) -> dict[str, Any]:
         "centimetres": 100 * metres,
         "degrees": float(np.degrees(radians)),
         "seconds": seconds,
-        **_numbers(built),
+        **_fit(built),
     }
 
 
@@ -113,7 +113,7 @@ def _frames(folder: Path, progress: Progress) -> dict[str, Any]:
         "centimetres_worst": 100 * max((metres for metres, _ in off), default=0.0),
         "degrees_worst": float(np.degrees(max((radians for _, radians in off), default=0.0))),
         "seconds": seconds,
-        **_numbers(built),
+        **_fit(built),
     }
 
 
@@ -143,11 +143,12 @@ def _relative(built: BuiltMap, first: int, second: int) -> Matrix4 | None:
     return relative
 
 
-def _numbers(built: BuiltMap | None) -> dict[str, Any]:
-    if built is None:
-        return {}
-    rmse = built.report.mean_rmse
+def _fit(built: BuiltMap | None) -> dict[str, Any]:
+    """The mean over all that were fitted to something, which the scan that sets the frame was not."""
+    outcomes = [] if built is None else built.outcomes
+    fitness = [outcome.fitness for outcome in outcomes if outcome.fitness is not None]
+    rmse = [outcome.inlier_rmse for outcome in outcomes if outcome.inlier_rmse is not None]
     return {
-        "fitness": built.report.mean_fitness,
-        "rmse_centimetres": None if rmse is None else 100 * rmse,
+        "fitness": float(np.mean(fitness)) if fitness else None,
+        "rmse_centimetres": 100 * float(np.mean(rmse)) if rmse else None,
     }
