@@ -77,14 +77,16 @@ def _why_not(best: Candidate, settings: RegistrationSettings) -> str:
         f"fitness {best.found.fitness:.2f} (over {settings.min_fitness:g} is accepted), "
         f"inlier RMSE {best.found.inlier_rmse * 100:.1f} cm, agreement {best.seen.mutual:.2f} "
         f"(at least {needed_agreement(best, settings):g}) over {best.seen.overlap:.0%} of the scan; "
-        + _ADVICE[best.contradicts_prior]
+        + _advice(best)
     )
 
 
-_ADVICE = {
-    False: "give an initial pose, or check that the place is in the map",
-    True: "it ends far from the pose prior that was given; check the prior, or leave it out",
-}
+def _advice(best: Candidate) -> str:
+    if best.contradicts_prior:
+        return "it ends far from the pose prior that was given; check the prior, or leave it out"
+    if best.vouched:
+        return "check the pose prior that was given, and that the place is in the map"
+    return "give an initial pose, or check that the place is in the map"
 
 
 def _require_held(

@@ -95,7 +95,8 @@ def _look(task: _Looking) -> Rescued:
     if through > limit:
         reason = (
             f"scan {scan.name}: {through:.1%} of its points stand where its neighbours saw free space (at most "
-            f"{limit:.1%} is accepted); give an initial pose, or scan there again"
+            f"{limit:.1%} is accepted); {'check its pose prior' if best.vouched else 'give an initial pose'}, "
+            "or scan there again"
         )
         return Rescued(
             number=task.number,
