@@ -14,13 +14,14 @@ from worker.pipeline.pair_work import Folder, thin
 from worker.pipeline.pcd import write_pcd
 from worker.pipeline.placement import Outcome, Placement, ScanFile
 from worker.pipeline.placing_settings import PlacingSettings
-from worker.pipeline.poses import difference, inverse
+from worker.pipeline.poses import difference, inverse, transformed
 from worker.pipeline.prepared import prepare
 from worker.pipeline.registration_settings import RegistrationSettings
 from worker.pipeline.values import Matrix4, Points
 
 THIN = 3  #: every third point of a scan does here
 MANY = 1_000_000
+FREE = np.array([2.7, 1.45, 1.6])  #: metres, world frame: the emptiest place of the room
 #: without the slow part of the global search; plans are still asked
 QUICK = RegistrationSettings(max_iterations=12, search_resolutions=(0.3,), search_seeds=1)
 
@@ -54,6 +55,15 @@ def written(
         points = points @ viewpoint[:3, :3].T + viewpoint[:3, 3]
     write_pcd(path, points.astype(np.float32), sensor_pose=viewpoint)
     return ScanFile(name=path.name, path=path, pose=pose)
+
+
+def hanging(scan: SimulatedScan, *, size: float) -> Points:
+    """(N, 3) sensor frame: a board of `size` metres upright in the air of the room, where nothing is within 1.3 m."""
+    side = np.arange(-size / 2, size / 2, 0.025)
+    across, up = (each.ravel() for each in np.meshgrid(side, side))
+    board = FREE + np.column_stack([across, np.zeros_like(across), up])
+    points: Points = transformed(board, inverse(scan.world_from_sensor)).astype(np.float32)
+    return points
 
 
 def prepared_folder(root: Path, scans: Mapping[int, SimulatedScan]) -> tuple[Folder, dict[int, Points]]:
