@@ -17,3 +17,14 @@ class Progress(Protocol):
 
 def silent(stage: str, share: float) -> None:
     """Report nothing."""
+
+
+def rising(progress: Progress) -> Progress:
+    """The same, for work whose rounds begin anew: a share that would fall is told as the highest so far."""
+    highest: dict[str, float] = {}
+
+    def told(stage: str, share: float) -> None:
+        highest[stage] = max(highest.get(stage, 0.0), share)
+        progress(stage, highest[stage])
+
+    return told

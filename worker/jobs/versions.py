@@ -37,8 +37,10 @@ class Made:
     built: BuiltMap
     outcomes: tuple[ScanOutcome, ...]  #: of every scan of the version
 
-    def registration(self) -> dict[str, Any]:
-        """The totals of the registration, with the reference scan by its id."""
+    def registration(self) -> dict[str, Any] | None:
+        """The totals of the registration, with the reference scan by its id; None where there was none."""
+        if self.built.report is None:
+            return None
         found = self.built.report.document()
         reference = found["reference"]
         return {**found, "reference": None if reference is None else self.outcomes[reference].scan_id}

@@ -74,7 +74,7 @@ class BuiltMap:
     reference: ReferenceMap
     tiles: Tiles
     outcomes: tuple[Outcome, ...]  #: of the files, in their order
-    report: MapReport
+    report: MapReport | None  #: None where nothing was registered anew
     kept: tuple[PairResult, ...] = ()  #: the registrations that the map rests on
     contradicted: tuple[PairResult, ...] = ()  #: accepted ones that loops do not close over
 
@@ -182,7 +182,7 @@ def renew_map(
     scans = itertools.chain(older, (load() for load in seen))
     fused = _fused(scans, len(base.scans) + len(seen), settings, progress)
     reference, tiles = _tiled(fused, base.grid, (), settings, progress)
-    return BuiltMap(reference=reference, tiles=tiles, outcomes=(), report=MapReport.of_outcomes(()))
+    return BuiltMap(reference=reference, tiles=tiles, outcomes=(), report=None)
 
 
 def without(scan: RegisteredScan, grid: TileGrid, tiles: Indices) -> RegisteredScan:

@@ -17,6 +17,9 @@ class MapSettings(BaseModel):
     max_height_difference: float = Field(1.5, gt=0, description="metres between the centroids, along z")
     partners: int = Field(4, ge=1, description="pairs that a scan proposes, the likeliest first")
     searched_partners: int = Field(6, ge=1, description="the same where a pair had to be searched")
+    pairing_rounds: int = Field(
+        3, ge=1, description="of registering pairs, as long as they leave the scans in several parts"
+    )
     candidates: int = Field(6, ge=1, description="places looked at where a pair has no start")
     loop_distance: float = Field(
         0.1, gt=0, description="metres a registration may be off those of the others around a loop"

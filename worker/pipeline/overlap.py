@@ -38,9 +38,14 @@ class Extent:
 
 def likely_pairs(extents: Mapping[int, Extent], settings: MapSettings) -> list[tuple[int, int]]:
     """Pairs (lower index, higher index), sorted; at most `partners` a scan proposes."""
+    return best_pairs(sorted(extents), overlap_rank(extents, settings), settings.partners)
+
+
+def overlap_rank(extents: Mapping[int, Extent], settings: MapSettings) -> Floats:
+    """(S, S) how likely two scans see the same, 0..1, in the order of their indices; 0 where they are culled."""
     numbers = sorted(extents)
-    if len(numbers) < 2:
-        return []
+    if not numbers:
+        return np.zeros((0, 0))
     low, high, centroid = (
         np.stack([getattr(extents[number], name) for number in numbers])
         for name in ("low", "high", "centroid")
@@ -57,8 +62,8 @@ def likely_pairs(extents: Mapping[int, Extent], settings: MapSettings) -> list[t
     )
     np.fill_diagonal(likely, False)
     # the two boxes' common part of what they cover together: one box inside another is no close relative
-    rank = np.where(likely, both / (volume[:, None] + volume - both), 0.0)
-    return best_pairs(numbers, rank, settings.partners)
+    rank: Floats = np.where(likely, both / (volume[:, None] + volume - both), 0.0)
+    return rank
 
 
 def best_pairs(numbers: list[int], rank: Floats, partners: int) -> list[tuple[int, int]]:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from worker.pipeline.map_settings import MapSettings
-from worker.pipeline.overlap import Extent, best_pairs, likely_pairs
+from worker.pipeline.overlap import Extent, best_pairs, overlap_rank
 from worker.pipeline.pair_memory import PairMemory
 from worker.pipeline.pair_work import (
     Folder,
@@ -22,7 +22,7 @@ from worker.pipeline.pair_work import (
 from worker.pipeline.pairwise import PairResult
 from worker.pipeline.poses import inverse
 from worker.pipeline.registration_settings import RegistrationSettings
-from worker.pipeline.values import Matrix4, Points
+from worker.pipeline.values import Floats, Matrix4, Points
 from worker.processes import Processes
 
 Share = Callable[[float], None]
@@ -47,27 +47,55 @@ class PairWork:
     memory: PairMemory
 
 
-def register_all(scans: Mapping[int, Sound], work: PairWork, *, progress: Share) -> list[PairResult]:
-    """The pairs that are worth it, registered; sorted by target and source.
+@dataclass(frozen=True, kw_only=True, slots=True)
+class PairPlan:
+    """Every pair that may be worth an ICP, ranked."""
 
-    Scans with a prior are paired by where the priors put them. The others are searched in all scans, and paired with
-    those in which they were found.
-    """
+    numbers: list[int]  #: indices of the scans, ascending
+    rank: Floats  #: (S, S) 0..1; by the priors' boxes, or by how much of a scan was found in the other
+    starts: dict[tuple[int, int], tuple[Matrix4, ...]]  #: (lower, higher): where a searched pair was found
+
+    def first(self, mapping: MapSettings) -> list[tuple[int, int]]:
+        """The pairs to begin with: a few that each scan proposes."""
+        searched = np.zeros_like(self.rank, dtype=bool)
+        at = {number: row for row, number in enumerate(self.numbers)}
+        for a, b in self.starts:
+            searched[at[a], at[b]] = searched[at[b], at[a]] = True
+        by_prior = best_pairs(self.numbers, np.where(searched, 0.0, self.rank), mapping.partners)
+        by_search = best_pairs(self.numbers, np.where(searched, self.rank, 0.0), mapping.searched_partners)
+        return sorted({*by_prior, *by_search})
+
+    def across(
+        self, parts: Sequence[Sequence[int]], tried: Collection[tuple[int, int]], mapping: MapSettings
+    ) -> list[tuple[int, int]]:
+        """The best pairs between scans of different parts that were not tried yet."""
+        at = {number: row for row, number in enumerate(self.numbers)}
+        open_ = np.ones_like(self.rank, dtype=bool)
+        for part in parts:
+            rows = [at[number] for number in part]
+            open_[np.ix_(rows, rows)] = False
+        for a, b in tried:
+            open_[at[a], at[b]] = open_[at[b], at[a]] = False
+        return best_pairs(self.numbers, np.where(open_, self.rank, 0.0), mapping.searched_partners)
+
+
+def plan_pairs(scans: Mapping[int, Sound], work: PairWork, *, progress: Share) -> PairPlan:
+    """Rank the pairs: scans with a prior by where the priors put them, the others by looking for them in all scans."""
+    numbers = sorted(scans)
     extents = {
         number: Extent.of(scan.points, scan.prior) for number, scan in scans.items() if scan.prior is not None
     }
-    starts: dict[tuple[int, int], tuple[Matrix4, ...]] = dict.fromkeys(
-        likely_pairs(extents, work.mapping), ()
-    )
-    lost = [number for number in scans if number not in extents]
-    if lost:
-        half = 0.5
-        found = _search_all(scans, lost, work, progress=lambda share: progress(half * share))
-        starts |= _worth_it(found, work.mapping)
-    else:
-        half = 0.0
-    results = _register(starts, scans, work, progress=lambda share: progress(half + (1 - half) * share))
-    return sorted(results, key=lambda result: (result.target, result.source))
+    rank = np.zeros((len(numbers), len(numbers)))
+    known = [row for row, number in enumerate(numbers) if number in extents]
+    rank[np.ix_(known, known)] = overlap_rank(extents, work.mapping)
+    lost = [number for number in numbers if number not in extents]
+    at = {number: row for row, number in enumerate(numbers)}
+    starts = {}
+    for found in _search_all(scans, lost, work, progress=progress) if lost else ():
+        a, b = at[found.target], at[found.source]
+        rank[a, b] = rank[b, a] = found.score
+        starts[found.target, found.source] = tuple(pose.target_from_source for pose in found.poses)
+    return PairPlan(numbers=numbers, rank=rank, starts=starts)
 
 
 def _search_all(
@@ -91,48 +119,35 @@ def _search_all(
     return list(_gathered(work.processes.each(search, tasks), len(tasks), progress))
 
 
-def _worth_it(found: Sequence[Found], mapping: MapSettings) -> dict[tuple[int, int], tuple[Matrix4, ...]]:
-    """The pairs in which a scan looks most at home, with their starts."""
-    numbers = sorted({number for each in found for number in (each.target, each.source)})
-    at = {number: row for row, number in enumerate(numbers)}
-    rank = np.zeros((len(numbers), len(numbers)))
-    for each in found:
-        rank[at[each.target], at[each.source]] = rank[at[each.source], at[each.target]] = each.score
-    poses = {(each.target, each.source): tuple(p.target_from_source for p in each.poses) for each in found}
-    return {pair: poses[pair] for pair in best_pairs(numbers, rank, mapping.searched_partners)}
-
-
-def _register(
-    starts: Mapping[tuple[int, int], tuple[Matrix4, ...]],
+def register_planned(
+    pairs: Sequence[tuple[int, int]],
+    plan: PairPlan,
     scans: Mapping[int, Sound],
     work: PairWork,
     *,
     progress: Share,
 ) -> list[PairResult]:
-    """All pairs by target, for its tree is then built once; what an earlier run left is not done again."""
-    known = {(result.target, result.source): result for result in work.memory.load()}
-    done = [known[pair] for pair in starts if pair in known]
+    """The registrations of these pairs, sorted; what an earlier run left is not done again.
+
+    By target, for its tree is then built once.
+    """
+    wanted = set(pairs)
+    done = {(each.target, each.source): each for each in work.memory.load()}
+    done = {pair: result for pair, result in done.items() if pair in wanted}
     by_target = defaultdict(list)
-    for pair in starts:
-        if pair not in known:
-            by_target[pair[0]].append(pair[1])
+    for target, source in pairs:
+        if (target, source) not in done:
+            prior = _prior(scans[target], scans[source])
+            by_target[target].append((source, prior, plan.starts.get((target, source), ())))
     tasks = [
-        Pairing(
-            folder=work.folder,
-            target=target,
-            sources=tuple(
-                (source, _prior(scans[target], scans[source]), starts[target, source]) for source in sources
-            ),
-            settings=work.registration,
-        )
+        Pairing(folder=work.folder, target=target, sources=tuple(sources), settings=work.registration)
         for target, sources in sorted(by_target.items())
     ]
-    batches = work.processes.each(register_pairs, tasks)
-    for number, batch in enumerate(batches, start=1):
+    for number, batch in enumerate(work.processes.each(register_pairs, tasks), start=1):
         work.memory.save(batch)
-        done += batch
+        done |= {(result.target, result.source): result for result in batch}
         progress(number / len(tasks))
-    return done
+    return [done[pair] for pair in sorted(done)]
 
 
 def _prior(target: Sound, source: Sound) -> Matrix4 | None:

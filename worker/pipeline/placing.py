@@ -7,7 +7,7 @@ then what was left out is looked for in the map that now exists.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -20,10 +20,11 @@ from worker.pipeline.map_report import MapReport
 from worker.pipeline.map_settings import MapSettings
 from worker.pipeline.pair_memory import Forgetful, PairMemory
 from worker.pipeline.pair_work import Folder, Read, Reading, forget_loaded, read_and_prepare
-from worker.pipeline.pairing import PairWork, Sound, register_all
+from worker.pipeline.pairing import PairWork, Sound, plan_pairs, register_planned
 from worker.pipeline.pairwise import PairResult
 from worker.pipeline.placement import Outcome, Placement, ScanFile
 from worker.pipeline.placing_settings import PlacingSettings
+from worker.pipeline.pose_graph import components
 from worker.pipeline.poses import transformed
 from worker.pipeline.refinement import Refined, refine_jointly
 from worker.pipeline.registration_settings import RegistrationSettings
@@ -31,7 +32,7 @@ from worker.pipeline.rescue import Rescued, rescue
 from worker.pipeline.solution import Solution, solve_graph
 from worker.pipeline.values import Matrix4
 from worker.processes import default_processes, open_processes
-from worker.progress import Progress, silent
+from worker.progress import Progress, rising, silent
 
 _FEW = 4  # scans up to which processes cost more than they bring
 
@@ -74,7 +75,7 @@ def place_together(
                     mapping=settings.mapping,
                     memory=Forgetful() if memory is None else memory,
                 ),
-                progress=progress,
+                progress=rising(progress),
             )
             return build.run()
         finally:
@@ -100,16 +101,21 @@ class _Build:
         """The whole of it, in order."""
         read = self._read()
         sound = self._sound(read)
-        pairs = register_all(sound, self.work, progress=lambda share: self.progress("registering", share))
+        pairs, solution = self._connected(sound)
         self.progress("registering", 1.0)
         self.progress("refining", 0.0)
-        solution = solve_graph(sorted(sound), pairs, self.mapping)
         refined = self._refined(solution, solution.poses, sound, first=True)
-        missing = sorted(set(sound) - set(refined.poses))
-        rescued = rescue(missing, refined.poses, solution.reference, sound, self.work)
-        found = {number: each.pose for number, each in rescued.items() if each.pose is not None}
-        if found:
+        rescued: dict[int, Rescued] = {}
+        while missing := sorted(set(sound) - set(refined.poses)):
+            tried = rescue(missing, refined.poses, solution.reference, sound, self.work)
+            found = {number: each.pose for number, each in tried.items() if each.pose is not None}
+            rescued |= tried
+            if not found:
+                break
+            before = len(refined.poses)
             refined = self._refined(solution, refined.poses | found, sound, first=False)
+            if len(refined.poses) <= before:  # who was found is contradicted by the others
+                break
         self.progress("refining", 1.0)
         return self._placed(read, sound, pairs, solution, refined, rescued)
 
@@ -143,6 +149,27 @@ class _Build:
         if len(errors) == len(read) and errors[0] is not None:
             raise errors[0]
         raise MapFailed("; ".join(str(each.error or each.reason) for _, each in sorted(read.items())))
+
+    def _connected(self, sound: Mapping[int, Sound]) -> tuple[list[PairResult], Solution]:
+        """Register the likeliest pairs; as long as that leaves several parts, the likeliest between them as well."""
+        searching = any(scan.prior is None for scan in sound.values())
+        half = 0.5 if searching else 0.0
+        span = (1 - half) / self.mapping.pairing_rounds
+        plan = plan_pairs(sound, self.work, progress=self._part(0.0, half))
+        wanted, pairs = plan.first(self.mapping), []
+        for round_ in range(self.mapping.pairing_rounds):
+            begin = half + span * round_
+            pairs += register_planned(wanted, plan, sound, self.work, progress=self._part(begin, span))
+            solution = solve_graph(plan.numbers, pairs, self.mapping)
+            parts = components(plan.numbers, [*solution.kept, *solution.elsewhere])
+            wanted = plan.across(parts, {(pair.target, pair.source) for pair in pairs}, self.mapping)
+            if not wanted:
+                break
+        return pairs, solution
+
+    def _part(self, begin: float, span: float) -> Callable[[float], None]:
+        """Progress of a part of the registration."""
+        return lambda share: self.progress("registering", begin + span * share)
 
     def _refined(
         self, solution: Solution, poses: Mapping[int, Matrix4], sound: Mapping[int, Sound], *, first: bool

@@ -23,6 +23,7 @@ class Solution:
     poses: dict[int, Matrix4]  #: reference_from_scan
     paths: dict[int, tuple[int, ...]]  #: from the reference to the scan, both named
     kept: tuple[PairResult, ...]  #: the registrations between these scans that agree
+    elsewhere: tuple[PairResult, ...]  #: accepted ones between scans of smaller sets
     contradicted: tuple[PairResult, ...]  #: accepted ones that loops do not close over
 
 
@@ -48,6 +49,7 @@ def solve_graph(scans: Sequence[int], pairs: Sequence[PairResult], settings: Map
                 poses=poses,
                 paths=chains.paths,
                 kept=tuple(within),
+                elsewhere=tuple(edge for edge in edges if edge.target not in inside),
                 contradicted=tuple(contradicted),
             )
         contradicted += [edge for edge in within if id(edge) in wrong]

@@ -25,7 +25,7 @@ from worker.pipeline.refinement import Refined, refine_jointly, uncertainties
 from worker.pipeline.registration import placement_of, register
 from worker.pipeline.values import Matrix4
 from worker.processes import Processes
-from worker.progress import Progress, silent
+from worker.progress import Progress, rising, silent
 
 MAP = -1  #: the map's number among the scans; the lowest, so that it is the target of every pair
 _GATE, _EVERY = 0.05, 2  # metres; points: how a scan by itself is weighed
@@ -52,7 +52,7 @@ def place_on_map(
                 target=target,
                 folder=Folder(root=Path(root)),
                 settings=settings,
-                progress=progress,
+                progress=rising(progress),
             )
             return visit.run(growing=growing)
         finally:

@@ -66,11 +66,12 @@ class Run:
 
     def document(self) -> dict[str, Any]:
         """JSON-ready."""
+        report = self.built.report
         return {
             "scenario": self.scenario.kind,
             "seed": self.seed,
             **self.assessment.document(),
-            "report": self.built.report.document(),
+            "report": None if report is None else report.document(),
             "tiles": len(self.built.tiles.points),
             "map_points": len(self.built.reference.points),
             "seconds": self.seconds,
