@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from graphs import shifted
 from rooms import Room, as_scan
-from visits import prepared_folder, spread
+from visits import corridor_points, prepared_folder, spread
 
 from worker.pipeline.map_settings import MapSettings
 from worker.pipeline.optimisation import Term, covariances
@@ -127,24 +127,7 @@ def test_a_scan_a_metre_and_a_half_off_is_seen_through_and_those_beside_it_less(
 
 
 def corridor(*, ends: bool, seed: int) -> PreparedScan:
-    """Ten metres of floor, ceiling and walls 2.2 m apart, along x; with end walls or without."""
-    rng = np.random.default_rng(seed)
-    x, across = rng.uniform(-5, 5, (4, 5000)), rng.uniform(-1.1, 1.1, (4, 5000))
-    up = rng.uniform(-0.35, 2.2, (4, 5000))
-    parts = [
-        np.column_stack([x[0], across[0], np.full(5000, -0.35)]),
-        np.column_stack([x[1], across[1], np.full(5000, 2.2)]),
-        np.column_stack([x[2], np.full(5000, -1.1), up[2]]),
-        np.column_stack([x[3], np.full(5000, 1.1), up[3]]),
-    ]
-    if ends:
-        parts += [
-            np.column_stack([np.full(2500, side * 5.0), across[side][:2500], up[side][:2500]])
-            for side in (-1, 1)
-        ]
-    points = np.concatenate(parts) + rng.normal(0, 0.01, (sum(map(len, parts)), 3))
-    lenient = RegistrationSettings(min_constraint=0.0)
-    return prepare(as_scan(points.astype(np.float32)), lenient)
+    return prepare(as_scan(corridor_points(ends=ends, seed=seed)), RegistrationSettings(min_constraint=0.0))
 
 
 def corridor_term(*, ends: bool) -> Linearised:

@@ -66,6 +66,26 @@ def hanging(scan: SimulatedScan, *, size: float) -> Points:
     return points
 
 
+def corridor_points(*, ends: bool, seed: int, half: float = 5.0) -> Points:
+    """Floor, ceiling and walls 2.2 m apart along x, `half` metres each way; with end walls or without."""
+    rng = np.random.default_rng(seed)
+    x, across = rng.uniform(-half, half, (4, 5000)), rng.uniform(-1.1, 1.1, (4, 5000))
+    up = rng.uniform(-0.35, 2.2, (4, 5000))
+    parts = [
+        np.column_stack([x[0], across[0], np.full(5000, -0.35)]),
+        np.column_stack([x[1], across[1], np.full(5000, 2.2)]),
+        np.column_stack([x[2], np.full(5000, -1.1), up[2]]),
+        np.column_stack([x[3], np.full(5000, 1.1), up[3]]),
+    ]
+    if ends:
+        parts += [
+            np.column_stack([np.full(2500, side * half), across[side][:2500], up[side][:2500]])
+            for side in (-1, 1)
+        ]
+    points = np.concatenate(parts) + rng.normal(0, 0.01, (sum(map(len, parts)), 3))
+    return points.astype(np.float32)
+
+
 def prepared_folder(root: Path, scans: Mapping[int, SimulatedScan]) -> tuple[Folder, dict[int, Points]]:
     """The scans prepared under their numbers, and their thinned points."""
     folder, points = Folder(root=root), {}
