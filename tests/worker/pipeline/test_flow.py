@@ -9,24 +9,26 @@ import numpy as np
 import pytest
 from rooms import Room
 from tilings import row_of
+from visits import placement
 
 from worker.detectors.card import Card, Preprocessing
 from worker.detectors.detector import TileScores
 from worker.errors import Cancelled, ScanError
 from worker.evaluation.scenes import random_room
 from worker.evaluation.visits import visit
-from worker.pipeline.chaining import ScanFile
 from worker.pipeline.changes import TileState
 from worker.pipeline.flow import (
     BuiltMap,
     LocatedSurvey,
     NoScanAccepted,
+    NothingToTile,
     PipelineSettings,
     build_map,
     detect,
     locate_survey,
 )
 from worker.pipeline.pcd import write_pcd
+from worker.pipeline.placement import ScanFile
 from worker.pipeline.poses import difference, inverse, transformed
 from worker.pipeline.registration_settings import RegistrationSettings
 from worker.pipeline.tiling import TilePairs, Tiles
@@ -97,7 +99,7 @@ def files(room: Room, tmp_path_factory: pytest.TempPathFactory) -> list[ScanFile
 def told(files: list[ScanFile]) -> Told:
     of_map: list[tuple[str, float]] = []
     of_survey: list[tuple[str, float]] = []
-    built = build_map(files, settings=SETTINGS, progress=lambda *at: of_map.append(at))
+    built = build_map(files, settings=SETTINGS, processes=1, progress=lambda *at: of_map.append(at))
     survey = locate_survey(
         files, built.reference, built.tiles, settings=SETTINGS, progress=lambda *at: of_survey.append(at)
     )
@@ -155,8 +157,7 @@ def test_voxel_and_tile_sizes_come_from_the_card() -> None:
 
 def test_the_map_holds_every_scan_in_its_place(room: Room, told: Told) -> None:
     for outcome, scan in zip(told.built.outcomes, room.before[:2], strict=True):
-        assert outcome.scan is not None
-        assert difference(outcome.scan.map_from_scan, scan.world_from_sensor)[0] < 0.015
+        assert difference(placement(outcome).map_from_scan, scan.world_from_sensor)[0] < 0.015
 
 
 def test_the_map_is_cut_into_tiles_of_512_points_and_more(told: Told) -> None:
@@ -175,10 +176,8 @@ def test_the_same_scans_again_change_nothing(told: Told) -> None:
 
 
 def test_a_box_moves_no_scan(told: Told, boxed: tuple[LocatedSurvey, int]) -> None:
-    for with_it, without in zip(boxed[0].outcomes, told.survey.outcomes, strict=True):
-        assert with_it.scan is not None
-        assert without.scan is not None
-        metres, radians = difference(with_it.scan.map_from_scan, without.scan.map_from_scan)
+    for with_box, plain in zip(boxed[0].outcomes, told.survey.outcomes, strict=True):
+        metres, radians = difference(placement(with_box).map_from_scan, placement(plain).map_from_scan)
         assert metres < 0.002
         assert radians < 0.001
 
@@ -222,7 +221,7 @@ def test_a_survey_of_another_place_is_refused_with_every_scans_numbers(told: Tol
     assert error.value.code == "registration_failed"
     assert [outcome.name for outcome in error.value.outcomes] == ["foreign-0.pcd", "foreign-1.pcd"]
     for outcome in error.value.outcomes:
-        assert outcome.scan is None
+        assert outcome.placement is None
         assert outcome.reason
         assert outcome.fitness is not None
 
@@ -236,28 +235,90 @@ def test_a_foreign_scan_leaves_the_survey_as_it_is_without_it(
     found = locate_survey(
         [files[0], foreign, files[1]], told.built.reference, told.built.tiles, settings=SETTINGS
     )
-    assert [outcome.scan is not None for outcome in found.outcomes] == [True, False, True]
+    assert [outcome.placement is not None for outcome in found.outcomes] == [True, False, True]
     assert found.current.points.tolist() == told.survey.current.points.tolist()
 
 
-def test_a_survey_with_a_file_that_is_no_scan_names_it(
+def test_a_survey_with_a_file_that_is_no_scan_goes_on_with_the_others_and_names_it(
     told: Told, files: list[ScanFile], tmp_path: Path
 ) -> None:
-    (tmp_path / "x").write_bytes(b"ply\nbut no more")
-    broken = ScanFile(name="hall 3.ply", path=tmp_path / "x")
+    broken = _broken(tmp_path)
+    found = locate_survey([broken, *files], told.built.reference, told.built.tiles, settings=SETTINGS)
+    assert [outcome.placement is not None for outcome in found.outcomes] == [False, True, True]
+    assert str(found.outcomes[0].reason).startswith("hall 3.ply: ")
+    assert found.current.points.tolist() == told.survey.current.points.tolist()
+
+
+def test_a_map_with_a_file_that_is_no_scan_goes_on_with_the_others_and_names_it(
+    told: Told, files: list[ScanFile], tmp_path: Path
+) -> None:
+    built = build_map([files[0], _broken(tmp_path), files[1]], settings=SETTINGS, processes=1)
+    assert [outcome.placement is not None for outcome in built.outcomes] == [True, False, True]
+    assert str(built.outcomes[1].reason).startswith("hall 3.ply: ")
+    assert (built.report.scans, built.report.accepted, built.report.discarded) == (3, 2, 1)
+    assert built.reference.points == pytest.approx(told.built.reference.points, abs=1e-4)
+
+
+def test_where_no_file_is_a_scan_neither_a_map_nor_a_survey_is_made(told: Told, tmp_path: Path) -> None:
+    broken = [_broken(tmp_path)]
     with pytest.raises(ScanError, match=r"^hall 3\.ply: "):
-        locate_survey([files[1], broken], told.built.reference, told.built.tiles, settings=SETTINGS)
+        build_map(broken, settings=SETTINGS, processes=1)
+    with pytest.raises(ScanError, match=r"^hall 3\.ply: "):
+        locate_survey(broken, told.built.reference, told.built.tiles, settings=SETTINGS)
 
 
-@pytest.mark.parametrize("half", ["of_map", "of_survey"])
+def _broken(folder: Path) -> ScanFile:
+    (folder / "x").write_bytes(b"ply\nbut no more")
+    return ScanFile(name="hall 3.ply", path=folder / "x")
+
+
+def test_a_map_too_thin_for_a_tile_says_how_many_points_one_needs(files: list[ScanFile]) -> None:
+    dense = SETTINGS.model_copy(
+        update={"tiling": SETTINGS.tiling.model_copy(update={"min_points": 1_000_000})}
+    )
+    with pytest.raises(NothingToTile, match="no tile holds 1000000 points") as error:
+        build_map(files[:1], settings=dense, processes=1)
+    assert [outcome.placement is not None for outcome in error.value.outcomes] == [True]
+
+
+def test_the_report_of_a_map_names_its_reference_and_its_registrations(told: Told) -> None:
+    report = told.built.report
+    assert (report.scans, report.accepted, report.pairs_possible, report.pairs_tried) == (2, 2, 1, 1)
+    assert (report.pairs_accepted, report.pairs_contradicted) == (1, 0)
+    assert report.reference in (0, 1)
+    assert [(edge.target, edge.source) for edge in told.built.kept] == [(0, 1)]
+    assert report.mean_fitness == told.built.kept[0].fitness
+    assert (report.std_fitness, report.std_rmse) == (0.0, 0.0)
+    assert report.document()["calls_saved"] == 0.0
+
+
+STAGES = {
+    "of_map": ["reading", "registering", "refining", "fusing", "tiling"],
+    "of_survey": ["registering", "refining", "tiling"],
+}
+
+
+@pytest.mark.parametrize("half", STAGES)
 def test_each_stage_is_told_from_beginning_to_end_and_never_falls(told: Told, half: str) -> None:
     reports: list[tuple[str, float]] = getattr(told, half)
-    assert list(dict.fromkeys(stage for stage, _ in reports)) == ["registering", "tiling"]
-    for stage in ("registering", "tiling"):
+    assert list(dict.fromkeys(stage for stage, _ in reports)) == STAGES[half]
+    for stage in STAGES[half]:
         shares = [share for name, share in reports if name == stage]
         assert shares == sorted(shares)
         assert 0 <= shares[0] < 1
         assert shares[-1] == 1.0
+
+
+def test_a_survey_of_one_scan_has_nothing_to_refine(told: Told, files: list[ScanFile]) -> None:
+    stages: list[str] = []
+    locate_survey(
+        files[:1],
+        told.built.reference,
+        told.built.tiles,
+        settings=SETTINGS,
+        progress=lambda stage, share: stages.append(stage),
+    )
+    assert list(dict.fromkeys(stages)) == ["registering", "tiling"]
 
 
 def test_a_dismissal_stops_a_survey_within_one_iteration(told: Told, files: list[ScanFile]) -> None:
