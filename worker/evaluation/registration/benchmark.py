@@ -110,11 +110,12 @@ def run_scenario(given: Scenario, seed: int, progress: Progress) -> Run:
     clock = StageClock(progress, prefix=f"{given.kind}, seed {seed}: ")
     built = build_map(given.files, settings=PipelineSettings(), progress=clock)
     seconds = clock.seconds()
+    reference = None if built.report is None else built.report.reference
     return Run(
         scenario=given,
         seed=seed,
         built=built,
-        assessment=assess(built.outcomes, given.true),
+        assessment=assess(built.outcomes, given.true, reference=reference),
         seconds=seconds,
         processor_seconds=processor_seconds() - used,
     )

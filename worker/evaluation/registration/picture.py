@@ -125,20 +125,25 @@ def _errors(found: Assessment, title: str) -> Figure:
     figure = Figure(figsize=(max(6.0, 0.24 * len(rows) + 1.5), 5.0), dpi=120, layout="constrained")
     above, below = figure.subplots(2, 1, sharex=True)
     above.set_title(title, loc="left", fontsize=11, color=INK, weight="bold")
-    _bars(above, rows, "centimetres", "sigma_centimetres", "off the truth (cm)")
-    _bars(below, rows, "degrees", "sigma_degrees", "off the truth (degrees)")
+    _bars(above, rows, "centimetres", "off the truth (cm)")
+    _bars(below, rows, "degrees", "off the truth (degrees)")
     below.set_xticks(range(len(rows)), [row["name"].removeprefix("stop-") for row in rows], rotation=90)
     below.tick_params(labelsize=7)
     handles = [*above.get_legend_handles_labels()]
-    figure.legend(*handles, loc="outside lower center", ncols=2, fontsize=8, frameon=False)
+    figure.legend(*handles, loc="outside lower center", ncols=3, fontsize=8, frameon=False)
     return figure
 
 
-def _bars(axes: Axes, rows: list[dict[str, Any]], value: str, sigma: str, label: str) -> None:
+def _bars(axes: Axes, rows: list[dict[str, Any]], unit: str, label: str) -> None:
+    """What sigma speaks of, the error seen from the reference scan, and the error after the best fit of all."""
     places = np.arange(len(rows))
-    axes.bar(places, [row[value] for row in rows], color="#90a4ae", label="error")
-    twice = [np.nan if row[sigma] is None else 2 * row[sigma] for row in rows]
-    axes.plot(places, twice, "_", color=THROWN, markersize=7, label="twice the sigma that the map states")
+    seen, twice = (
+        [np.nan if row[name + unit] is None else row[name + unit] for row in rows]
+        for name in ("from_reference_", "sigma_")
+    )
+    axes.bar(places, seen, color="#b0bec5", label="error, seen from the reference scan")
+    axes.plot(places, 2 * np.array(twice), "_", color=THROWN, markersize=7, label="twice the sigma of that")
+    axes.plot(places, [row[unit] for row in rows], ".", color=INK, markersize=4, label="error, frames fitted")
     axes.set_ylabel(label, fontsize=8, color=QUIET)
     axes.tick_params(labelsize=7, colors=QUIET)
 

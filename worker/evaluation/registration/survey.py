@@ -44,14 +44,15 @@ def time_survey(
     write_pcd(path, seen.points)
     map_from_true = inverse(true_from_map)
     surface, start = reference.surface(), map_from_true @ seen.prior
-    reading, registering = [], []
+    reading, registering, processor = [], [], []
     for _ in range(REPEATS + 1):
-        begun = time.perf_counter()
+        begun, used = time.perf_counter(), time.process_time()
         scan = read_scan(path)
         read = time.perf_counter()
         found = register(prepare(scan, settings), surface, start=start, settings=settings)
         reading.append(read - begun)
         registering.append(time.perf_counter() - read)
+        processor.append(time.process_time() - used)
     metres, radians = difference(map_from_true @ seen.world_from_sensor, found.found.target_from_source)
     return {
         "points": len(scan.points),
@@ -60,6 +61,7 @@ def time_survey(
         "register_seconds": float(np.median(registering[1:])),
         "register_least": min(registering[1:]),
         "register_most": max(registering[1:]),
+        "processor_seconds": float(np.median(processor[1:])),
         "centimetres": 100 * metres,
         "degrees": float(np.degrees(radians)),
     }

@@ -115,6 +115,7 @@ def _survey(row: dict[str, Any]) -> Table:
     table = _titled(f"one scan of {row['points']:,} points on a warm map of {row['map_points']:,}")
     times = f"{row['register_seconds']:.2f} ({row['register_least']:.2f} to {row['register_most']:.2f})"
     table.add_row("seconds to register, median (least to most)", times)
+    table.add_row("seconds of processors, reading too", f"{row['processor_seconds']:.2f}")
     table.add_row("seconds to read the file", f"{row['read_seconds']:.2f}")
     table.add_row("off the truth", f"{row['centimetres']:.1f} cm, {row['degrees']:.2f} degrees")
     return table

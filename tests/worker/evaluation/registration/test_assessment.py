@@ -55,10 +55,11 @@ def test_calibration_compares_each_error_with_its_own_sigma() -> None:
         MAP_FROM_WORLD @ pose @ rigid(*(rng.normal(0, sigma, 3) * (1, 0, 0)).tolist())
         for pose, sigma in zip(walk, sigmas, strict=True)
     ]
+    poses[0] = MAP_FROM_WORLD @ walk[0]  # the reference
     outcomes = [
         outcome(str(at), pose, sigma) for at, (pose, sigma) in enumerate(zip(poses, sigmas, strict=True))
     ]
-    told = assess(outcomes, walk).document()["translation_sigma"]
+    told = assess(outcomes, walk, reference=0).document()["translation_sigma"]
     assert told["within_2_sigma"] == pytest.approx(0.954, abs=0.04)  # of a normal error on one axis
     assert told["median_error_over_sigma"] == pytest.approx(0.674, abs=0.1)
 
@@ -68,9 +69,22 @@ def test_a_scan_without_a_stated_sigma_has_no_say_in_calibration() -> None:
     poses[1] = poses[1] @ rigid(0.005)
     outcomes = [outcome(f"scan-{at}", pose) for at, pose in enumerate(poses)]
     bare = replace(outcomes[0], placement=replace(outcomes[0].placement, uncertainty=None))
-    told = assess([bare, *outcomes[1:]], WALK).document()
+    told = assess([bare, *outcomes[1:]], WALK, reference=4).document()
     assert told["scans"][0]["sigma_centimetres"] is None
     assert told["translation_sigma"]["within_2_sigma"] == 1.0
+
+
+def test_what_sigma_speaks_of_is_seen_from_the_reference_scan() -> None:
+    poses = [MAP_FROM_WORLD @ pose for pose in WALK]
+    poses[4] = poses[4] @ rigid(0.03)  # the reference itself is off, so all others are, seen from there
+    outcomes = [outcome(f"scan-{at}", pose) for at, pose in enumerate(poses)]
+    told = assess(outcomes, WALK, reference=4).document()
+    assert told["centimetres"]["median"] < 0.5
+    seen = [row["from_reference_centimetres"] for row in told["scans"]]
+    assert seen[4] is None
+    assert seen[:4] + seen[5:] == pytest.approx([3.0] * 8)
+    assert told["translation_sigma"] == pytest.approx({"within_2_sigma": 0.0, "median_error_over_sigma": 3.0})
+    assert assess(outcomes, WALK).document()["translation_sigma"] is None
 
 
 def test_strangers_and_missing_scans_are_named_and_bend_nothing() -> None:
