@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse
 import scipy.sparse.linalg
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 
 from worker.pipeline.map_settings import MapSettings
@@ -121,6 +122,15 @@ def adjoint(pose: Matrix4) -> Floats:
     return result
 
 
+def _loose(scans: Sequence[int], terms: Sequence[Term], fixed: int) -> list[int]:
+    """Scans that no chain of terms ties to the fixed one: they are held where they are, and are unsure."""
+    row_of = {scan: row for row, scan in enumerate(scans)}
+    ends = ([row_of[term.target] for term in terms], [row_of[term.source] for term in terms])
+    graph = scipy.sparse.csr_array((np.ones(len(terms)), ends), shape=(len(scans), len(scans)))
+    _, labels = connected_components(graph, directed=False)
+    return [scan for scan in scans if labels[row_of[scan]] != labels[row_of[fixed]]]
+
+
 def _system(scans: Sequence[int], terms: Sequence[Term], fixed: int) -> tuple[scipy.sparse.coo_array, Floats]:
     row_of = {scan: row for row, scan in enumerate(scan for scan in scans if scan != fixed)}
     right = np.zeros(6 * len(row_of))
@@ -136,6 +146,10 @@ def _system(scans: Sequence[int], terms: Sequence[Term], fixed: int) -> tuple[sc
                     rows.append(a)
                     columns.append(b)
                     blocks.append(sign * other * term.information)
+    for scan in _loose(scans, terms, fixed):
+        rows.append(row_of[scan])
+        columns.append(row_of[scan])
+        blocks.append(np.eye(6))
     inner = np.arange(6)
     row = (6 * np.array(rows)[:, None, None] + inner[None, :, None]) + np.zeros((1, 1, 6), int)
     column = (6 * np.array(columns)[:, None, None] + inner[None, None, :]) + np.zeros((1, 6, 1), int)

@@ -104,7 +104,8 @@ class _Build:
         pairs, solution = self._connected(sound)
         self.progress("registering", 1.0)
         self.progress("refining", 0.0)
-        refined = self._refined(solution, solution.poses, sound, first=True)
+        tied = [(edge.target, edge.source) for edge in solution.kept]
+        refined = self._refined(solution, solution.poses, sound, also=tied, first=True)
         rescued: dict[int, Rescued] = {}
         while missing := sorted(set(sound) - set(refined.poses)):
             tried = rescue(missing, refined.poses, solution.reference, sound, self.work)
@@ -113,7 +114,8 @@ class _Build:
             if not found:
                 break
             before = len(refined.poses)
-            refined = self._refined(solution, refined.poses | found, sound, first=False)
+            tied += [(rescued[number].beside, number) for number in found]
+            refined = self._refined(solution, refined.poses | found, sound, also=tied, first=False)
             if len(refined.poses) <= before:  # who was found is contradicted by the others
                 break
         self.progress("refining", 1.0)
@@ -172,7 +174,13 @@ class _Build:
         return lambda share: self.progress("registering", begin + span * share)
 
     def _refined(
-        self, solution: Solution, poses: Mapping[int, Matrix4], sound: Mapping[int, Sound], *, first: bool
+        self,
+        solution: Solution,
+        poses: Mapping[int, Matrix4],
+        sound: Mapping[int, Sound],
+        *,
+        also: Sequence[tuple[int, int]],
+        first: bool,
     ) -> Refined:
         """Refine jointly; leave out, worst first, whom the free space of the others contradicts, and refine again."""
         current = dict(poses)
@@ -181,7 +189,7 @@ class _Build:
                 current,
                 {number: sound[number].points for number in current},
                 fixed=solution.reference,
-                also=[(edge.target, edge.source) for edge in solution.kept],
+                also=also,
                 folder=self.work.folder,
                 processes=self.work.processes,
                 settings=self.mapping,
