@@ -45,10 +45,10 @@ def test_directions_in_which_nothing_came_back_prove_nothing(image: RangeImage) 
 
 
 def test_beside_an_edge_the_nearer_range_counts() -> None:
-    """A pillar two metres ahead on the left, a wall at five metres behind: one cell past the pillar is unsure."""
+    """A pillar two metres ahead on the left, a wall at five metres behind: the cell next to the pillar's is unsure."""
     points = np.concatenate([wall(2.0, y=(0.0, 1.0)), wall(5.0, y=(-3.0, 0.0))])
     image = RangeImage.of(points, np.zeros(3))
-    beside, clear = np.array([[3.0, -0.05, 0.0]]), np.array([[3.0, -0.5, 0.0]])
+    beside, clear = np.array([[3.0, -0.12, 0.0]]), np.array([[3.0, -0.5, 0.0]])
     assert image.seen_through(beside).tolist() == [False]
     assert image.seen_through(clear).tolist() == [True]
 

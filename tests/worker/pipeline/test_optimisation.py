@@ -112,6 +112,22 @@ def test_covariances_are_those_against_the_fixed_scan() -> None:
     assert [found[number][0, 0] for number in (0, 1)] == pytest.approx([2.0, 1.0])
 
 
+def test_scans_that_nothing_ties_to_the_fixed_one_stay_and_are_unsure() -> None:
+    """Scan 3 hangs on scan 2 alone, scan 4 on nothing."""
+    pull = np.array([0, 0, 0, 10.0, 0, 0])
+    terms = [
+        Term(target=a, source=b, information=1000.0 * np.eye(6), gradient=pull) for a, b in ((0, 1), (2, 3))
+    ]
+    steps = solve(range(5), terms, fixed=0)
+    assert steps[1] == pytest.approx(-pull / 1000)
+    assert steps[2] + steps[3] == pytest.approx(np.zeros(6), abs=1e-9)
+    assert steps[3] - steps[2] == pytest.approx(-pull / 1000, rel=0.01)
+    assert steps[4].tolist() == [0] * 6
+    found = covariances(range(5), terms, fixed=0, variance=1.0)
+    assert found[1][3, 3] == pytest.approx(0.001)
+    assert min(found[number][3, 3] for number in (2, 3, 4)) > 0.4
+
+
 @pytest.mark.parametrize(
     ("error", "expected"),
     [

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -39,6 +40,7 @@ def refined(
     *,
     fixed: int = 0,
     rounds: int = 3,
+    also: Sequence[tuple[int, int]] = (),
     told: list[float] | None = None,
 ) -> Refined:
     folder, points = scans
@@ -46,7 +48,7 @@ def refined(
         poses,
         {number: points[number] for number in poses},
         fixed=fixed,
-        also=[],
+        also=also,
         folder=folder,
         processes=Processes(None),
         settings=SETTINGS.model_copy(update={"refinement_rounds": rounds}),
@@ -116,6 +118,30 @@ def test_a_scan_alone_stays_with_the_least_uncertainty_there_is(
     assert found.poses[1].tolist() == truth[1].tolist()
     assert found.uncertainties == {1: FLOOR}
     assert found.seen_through == {1: 0.0}
+
+
+def test_a_scan_beside_nobody_stays_is_unsure_and_spoils_no_other(
+    truth: dict[int, Matrix4], scans: tuple[Folder, dict[int, Points]]
+) -> None:
+    far = shifted(80.0) @ truth[3]
+    found = refined(perturbed(truth) | {3: far}, scans)
+    assert found.poses[3].tolist() == far.tolist()
+    assert found.uncertainties[3].translation > 0.1
+    three = {number: truth[number] for number in range(3)}
+    assert spread({number: found.poses[number] for number in three}, three) < 0.012
+    assert max(found.uncertainties[number].translation for number in three) < 0.02
+
+
+def test_pairs_that_are_named_are_refined_though_their_boxes_share_nothing(
+    truth: dict[int, Matrix4], scans: tuple[Folder, dict[int, Points]]
+) -> None:
+    folder, points = scans
+    apart = {0: points[0], 1: points[1] + np.array([60.0, 0, 0])}  # extents only: the scans stay as they are
+    start = perturbed({number: truth[number] for number in (0, 1)})
+    alone = refined(start, (folder, apart))
+    assert alone.poses[1].tolist() == start[1].tolist()
+    tied = refined(start, (folder, apart), also=[(1, 0), (7, 1)])
+    assert spread(tied.poses, {number: truth[number] for number in (0, 1)}) < 0.012
 
 
 def test_a_scan_a_metre_and_a_half_off_is_seen_through_and_those_beside_it_less(
