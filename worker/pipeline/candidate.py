@@ -18,6 +18,7 @@ from worker.pipeline.values import Matrix4
 
 _PLANS = 12  # places that the plans name
 _BEST_PLANS = 4  # of those that get a full ICP
+_WORTH = 0.3  # rough score of a candidate from features that does; right ones have 0.5 and more
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -64,7 +65,10 @@ def _anywhere(
     for rough in best_rough(source, target, starts)[:_BEST_PLANS]:
         yield rough.target_from_source
     seeds = settings.search_seeds if prior is None else 1
-    yield from candidate_poses(source, target, resolutions=settings.search_resolutions, seeds=seeds)
+    for pose in candidate_poses(source, target, resolutions=settings.search_resolutions, seeds=seeds):
+        rough = rough_pose(source, target, pose)
+        if rough.score >= _WORTH:
+            yield rough.target_from_source
 
 
 def turned(

@@ -20,6 +20,7 @@ from worker.pipeline.registration import placement_of, register
 from worker.pipeline.registration_settings import RegistrationSettings
 from worker.pipeline.values import Matrix4
 
+_FEW = 4  # placed scans up to which the whole search is worth its time
 _NEAR = 6.0  # metres between sensors, within which one scan can speak of another
 
 
@@ -68,11 +69,18 @@ def rescue(
             start=frame @ priors[number] if number in priors else None,
             map_path=path,
             poses=tuple(poses.items()),
-            settings=work.registration,
+            settings=_hurried(work.registration) if len(poses) > _FEW else work.registration,
         )
         for number in missing
     ]
     return {each.number: each for each in work.processes.each(_look, tasks)}
+
+
+def _hurried(settings: RegistrationSettings) -> RegistrationSettings:
+    """One draw of features: these scans have been looked for in every placed scan already."""
+    return settings.model_copy(
+        update={"search_resolutions": settings.search_resolutions[:1], "search_seeds": 1}
+    )
 
 
 @functools.lru_cache(maxsize=1)
