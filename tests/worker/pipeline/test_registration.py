@@ -199,7 +199,7 @@ def test_real_scans_of_different_places_are_rejected(shared_data: Path, current:
 
 
 def test_asking_for_more_agreement_is_heeded_with_and_without_a_prior(room: Room) -> None:
-    strict = ONE_DRAW.model_copy(update={"min_agreement": 1.0})
+    strict = SETTINGS.model_copy(update={"min_agreement": 1.0, "search_resolutions": ()})
     for start in (None, room.after[0].world_from_sensor):
         with pytest.raises(ScanRejected, match="at least 1"):
             register(_ready(room.scan()), room.target, start=start, settings=strict)

@@ -111,6 +111,20 @@ def test_few_right_edges_win_over_more_wrong_ones_of_lower_confidence() -> None:
     assert worst(found, truth) < 0.03
 
 
+def test_two_sure_edges_win_over_eight_doubtful_ones_that_agree_and_outweigh_them() -> None:
+    """Each of the eight is believed by a third; what the surest tree rules out is not heard at first."""
+    truth = line(10)
+    halves = [*along({n: truth[n] for n in range(5)}), *along({n: truth[n] for n in range(5, 10)})]
+    right = [edge(truth, 4, 5), edge(truth, 3, 5)]
+    slid = truth | {number: shifted(2.0) @ truth[number] for number in range(5, 10)}
+    across = ((2, 6), (1, 6), (4, 8), (3, 7), (2, 7), (1, 5), (4, 7), (3, 8))
+    wrong = [edge(slid, a, b, agreement=0.89) for a, b in across]
+    assert sum(each.confidence for each in wrong) > sum(each.confidence for each in right)
+    found = solve_graph(range(10), [*halves, *right, *wrong], SETTINGS)
+    assert pairs_of(found.contradicted) == pairs_of(wrong)
+    assert worst(found, truth) < 0.03
+
+
 def test_of_two_registrations_of_one_scan_that_contradict_each_other_the_surer_one_stays() -> None:
     """Scan 12 hangs on one scan at either side of the ring."""
     truth = ring(12) | {12: shifted(8.0, 0, 0.35)}
