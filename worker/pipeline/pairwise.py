@@ -66,7 +66,7 @@ class PairResult:
 
     @classmethod
     def of_document(cls, document: dict[str, Any]) -> Self:
-        """What `document` gave; raises KeyError or ValueError on anything else."""
+        """What `document` gave; raises KeyError, TypeError or ValueError on anything else."""
         values = dict(document)
         rmse = values.pop("inlier_rmse")
         return cls(
