@@ -22,7 +22,7 @@ from worker.pipeline.values import Floats, Matrix4, Points
 KEPT, THROWN, MISSING, INK, QUIET = "#2e7d32", "#c62828", "#ef6c00", "#1a1a1a", "#666666"
 _PIXEL = 0.05  # metres
 _BODY = (0.15, 2.0)  # metres above the floor: what is drawn of the map
-_WIDEST, _HIGHEST = 10.0, 9.0  # inches
+_WIDEST, _HIGHEST, _NARROWEST = 10.0, 9.0, 6.5  # inches
 
 
 def draw_run(folder: Path, scenario: Scenario, seed: int, built: BuiltMap, found: Assessment) -> None:
@@ -38,7 +38,7 @@ def _map(scenario: Scenario, built: BuiltMap, found: Assessment, title: str) -> 
     width, height = extent[1] - extent[0], extent[3] - extent[2]
     scale = min(_WIDEST / width, _HIGHEST / height)
     figure = Figure(
-        figsize=(max(width * scale, 5.5) + 0.8, height * scale + 1.4), dpi=120, layout="constrained"
+        figsize=(max(width * scale, _NARROWEST) + 0.8, height * scale + 1.4), dpi=120, layout="constrained"
     )
     axes = figure.add_subplot()
     axes.imshow(picture, cmap="gray", vmin=0, vmax=1, origin="lower", extent=extent, zorder=0)
@@ -50,7 +50,7 @@ def _map(scenario: Scenario, built: BuiltMap, found: Assessment, title: str) -> 
     axes.set_ylabel("y of the map (m)", fontsize=8, color=QUIET)
     axes.tick_params(labelsize=7, colors=QUIET)
     axes.set_aspect("equal")
-    figure.legend(handles=_legend(), loc="outside lower center", ncols=4, fontsize=8, frameon=False)
+    figure.legend(handles=_legend(), loc="outside lower center", ncols=3, fontsize=8, frameon=False)
     return figure
 
 
@@ -110,10 +110,11 @@ def _draw_stops(axes: Axes, scenario: Scenario, built: BuiltMap, places: dict[in
 def _legend() -> Sequence[Line2D]:
     lines = [Line2D([], [], color=KEPT, label="pair that was kept")]
     lines.append(Line2D([], [], color=THROWN, label="thrown out as a wrong loop"))
-    marks: list[tuple[str, str, str]] = [
+    marks = (
         ("o", INK, "stop"),
         ("x", MISSING, "left out, drawn where it truly was"),
-    ]
+        ("x", THROWN, "of another building, and yet placed"),
+    )
     return lines + [
         Line2D([], [], marker=marker, color=color, linestyle="", markersize=5, label=label)
         for marker, color, label in marks
