@@ -239,6 +239,24 @@ def test_a_scan_that_fits_only_to_another_that_comes_later_is_placed(room: Room,
     assert set(poses) == {0, 1, 2}
 
 
+def test_a_scan_that_no_pair_led_to_is_found_in_the_map_of_the_others(
+    room: Room, drifted: tuple[ScanFile, ...], folder: Path
+) -> None:
+    """Its prior is 40 cm too high, which here keeps it from being paired with anybody."""
+    scan = room.before[3]
+    high = written(folder / "high.pcd", scan, pose=shifted(z=0.4) @ scan.world_from_sensor)
+    found = place([*drifted[:3], high], placing(PRIORS_ONLY.registration, max_height_difference=0.2))
+    assert spread(poses_of(found), truth_of(room)) < 0.012
+    late = placement(found.outcomes[3])
+    assert all(3 not in (edge.target, edge.source) for edge in found.kept)
+    assert late.path[-1] == 3
+    assert late.path[:-1] == placement(found.outcomes[late.path[-2]]).path
+    assert late.fitness is not None
+    assert late.uncertainty is not None
+    assert late.uncertainty.translation < 0.02
+    assert found.report.accepted == 4
+
+
 # what has no place
 
 
