@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from graphs import shifted
 from rooms import Room
-from visits import MANY, QUICK, hanging, off, placement, placing, spread, written
+from visits import MANY, QUICK, hanging, never_falls, off, placement, placing, spread, written
 
 from worker.errors import Cancelled, MapFailed, ScanError, ScanTooLarge
 from worker.evaluation.scenes import random_room
@@ -245,7 +245,10 @@ def test_a_scan_that_no_pair_led_to_is_found_in_the_map_of_the_others(
     """Its prior is 40 cm too high, which here keeps it from being paired with anybody."""
     scan = room.before[3]
     high = written(folder / "high.pcd", scan, pose=shifted(z=0.4) @ scan.world_from_sensor)
-    found = place([*drifted[:3], high], placing(PRIORS_ONLY.registration, max_height_difference=0.2))
+    settings = placing(PRIORS_ONLY.registration, max_height_difference=0.2)
+    told: list[tuple[str, float]] = []
+    found = place([*drifted[:3], high], settings, progress=lambda *at: told.append(at))
+    assert never_falls(told)  # though all are refined once more with the scan that was found
     assert spread(poses_of(found), truth_of(room)) < 0.012
     late = placement(found.outcomes[3])
     assert all(3 not in (edge.target, edge.source) for edge in found.kept)
@@ -301,7 +304,9 @@ def test_a_scan_with_a_board_where_its_neighbours_saw_nothing_is_left_out(
     """The board is two in a hundred of its points: pair by pair that may pass, against all neighbours it does not."""
     scan = room.before[3]
     board = written(folder / "board.pcd", scan, pose=drifted[3].pose, more=hanging(scan, size=1.0))
-    found = place([*drifted[:3], board])
+    told: list[tuple[str, float]] = []
+    found = place([*drifted[:3], board], progress=lambda *at: told.append(at))
+    assert never_falls(told)  # though the others are refined once more without it
     assert set(poses_of(found)) == {0, 1, 2}
     assert found.outcomes[3].reason is not None
     assert found.outcomes[3].reason.startswith("scan board.pcd: ")

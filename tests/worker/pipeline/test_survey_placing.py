@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from graphs import shifted
 from rooms import Room
-from visits import QUICK, corridor_points, hanging, off, placement, placing, written
+from visits import QUICK, corridor_points, hanging, never_falls, off, placement, placing, written
 
 from worker.errors import Cancelled, ScanError, ScanTooLarge
 from worker.evaluation.scenes import random_room
@@ -128,7 +128,9 @@ def test_a_scan_that_sees_a_board_where_the_others_saw_nothing_is_left_out_and_n
     odd = written(folder / "odd.pcd", scan, pose=scan.world_from_sensor, more=hanging(scan, size=1.8))
     alone = place([odd], room.target)
     assert alone[0].placement is not None  # the map alone would have it
-    outcomes = place([files[0], odd, files[2]], room.target)
+    told: list[tuple[str, float]] = []
+    outcomes = place([files[0], odd, files[2]], room.target, progress=lambda *at: told.append(at))
+    assert never_falls(told)
     assert [outcome.placement is not None for outcome in outcomes] == [True, False, True]
     assert outcomes[1].reason is not None
     assert outcomes[1].reason.startswith("scan odd.pcd: it disagrees with the other scans")
@@ -208,7 +210,9 @@ def test_a_scan_that_touches_only_another_new_one_is_placed_where_the_map_is_to_
     ]
     survey = place(files, west)
     assert [outcome.placement is not None for outcome in survey] == [False, True]
-    grown = place(files, west, growing=True)
+    told: list[tuple[str, float]] = []
+    grown = place(files, west, growing=True, progress=lambda *at: told.append(at))
+    assert never_falls(told)
     for outcome, scan in zip(grown, (east, whole), strict=True):
         assert off(placement(outcome).map_from_scan, scan.world_from_sensor) < 0.03
 

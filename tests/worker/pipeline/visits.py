@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -111,3 +111,11 @@ def off(pose: Matrix4, truth: Matrix4) -> float:
 def spread(poses: Mapping[int, Matrix4], truth: Mapping[int, Matrix4]) -> float:
     """Metres that two scans are off each other at most."""
     return max(off(inverse(poses[a]) @ poses[b], inverse(truth[a]) @ truth[b]) for a in poses for b in poses)
+
+
+def never_falls(told: Sequence[tuple[str, float]]) -> bool:
+    """Whether each stage's shares only rise."""
+    shares: dict[str, list[float]] = {}
+    for stage, share in told:
+        shares.setdefault(stage, []).append(share)
+    return all(each == sorted(each) and each[-1] <= 1 for each in shares.values())
