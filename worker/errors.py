@@ -6,6 +6,7 @@ PipelineError
 │   └── ScanUnits            scan_units             an extent that says millimetres
 ├── RegistrationFailed       registration_failed    no scan could be placed
 ├── MapFailed                map_failed             nothing to tile, no point left
+├── ProcessLost              process_lost           a process that shared the work ended without a word
 ├── DetectorUnavailable      detector_unavailable   no such model, or its files do not match its card
 └── Cancelled                cancelled              somebody dismissed the job
 """
@@ -47,6 +48,12 @@ class MapFailed(PipelineError):
     """The scans do not make a map that can be tiled."""
 
     code = "map_failed"
+
+
+class ProcessLost(PipelineError):
+    """A process that shared the work ended without a word; most often the machine had no memory left."""
+
+    code = "process_lost"
 
 
 class DetectorUnavailable(PipelineError):

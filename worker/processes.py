@@ -15,17 +15,11 @@ from contextlib import contextmanager
 from multiprocessing import connection
 from typing import TypeVar
 
-from worker.errors import PipelineError
+from worker.errors import ProcessLost
 from worker.threads import one_thread, wait_passively
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
-
-
-class ProcessLost(PipelineError):
-    """A process ended without a word; most often the machine had no memory left."""
-
-    code = "process_lost"
 
 
 class Processes:

@@ -116,3 +116,11 @@ def test_each_build_has_its_own(blobs: Blobs, clock: Clock) -> None:
     other.save([pair(0, 1)])
     assert loaded(blobs) == {}
     assert len(loaded(blobs, "job-11")) == 1
+
+
+def test_what_another_release_wrote_is_left_aside(blobs: Blobs, clock: Clock) -> None:
+    memory = KeptPairs(blobs, JOB, clock=clock)
+    memory.save([pair(0, 1)])
+    memory.flush()
+    blobs.put_bytes(keys.map_pairs(JOB, "old"), b'[{"target": 0, "source": 2}]')
+    assert list(loaded(blobs)) == [(0, 1)]

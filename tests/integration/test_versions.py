@@ -13,7 +13,8 @@ from service.catalog.records import JobRecord, ScanOutcome, ScanRecord, VersionR
 from tests.integration.house import MAP, House, run
 from worker.jobs import versions
 from worker.pipeline import archive
-from worker.pipeline.flow import NoScanAccepted, without
+from worker.pipeline.flow import NoScanAccepted
+from worker.pipeline.map_versions import without
 from worker.pipeline.placement import RegisteredScan
 from worker.pipeline.poses import difference
 from worker.pipeline.scan import read_scan

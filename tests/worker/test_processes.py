@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from worker.errors import PipelineError
-from worker.processes import ProcessLost, default_processes, open_processes
+from worker.errors import PipelineError, ProcessLost
+from worker.processes import default_processes, open_processes
 
 WHO = "__import__('os').getpid()"
 

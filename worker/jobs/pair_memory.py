@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import time
 from collections.abc import Callable, Iterable, Iterator
 from uuid import uuid4
@@ -12,6 +13,9 @@ from service.catalog.blobs import Blobs
 from worker.pipeline.pairwise import PairResult
 
 _INTERVAL_S = 2.0  #: between two writes, and so about the most work that is lost
+
+
+log = logging.getLogger(__name__)
 
 
 class KeptPairs:
@@ -27,9 +31,14 @@ class KeptPairs:
         self._written = clock()
 
     def load(self) -> Iterator[PairResult]:
-        """Every pair that earlier attempts registered."""
+        """Every pair that earlier attempts registered; what another release wrote otherwise is done again."""
         for key in self._blobs.under(keys.map_work(self._job_id)):
-            yield from map(PairResult.of_document, json.loads(self._blobs.get_bytes(key)))
+            try:
+                results = [PairResult.of_document(each) for each in json.loads(self._blobs.get_bytes(key))]
+            except (KeyError, TypeError, ValueError) as error:
+                log.warning("pairs in %s cannot be read and are registered again: %s", key, error)
+                continue
+            yield from results
 
     def save(self, results: Iterable[PairResult]) -> None:
         """Remember more pairs; they are written at once where the last write was two seconds ago, else with later ones."""

@@ -16,17 +16,8 @@ from worker.jobs.pair_memory import KeptPairs
 from worker.jobs.scans import kept_scan, save_scans, scan_files, scan_outcomes
 from worker.jobs.step import Context, put
 from worker.pipeline import archive
-from worker.pipeline.flow import (
-    BuiltMap,
-    KeptMap,
-    NoScanAccepted,
-    NothingToTile,
-    PipelineSettings,
-    build_map,
-    extend_map,
-    renew_map,
-    without,
-)
+from worker.pipeline.flow import BuiltMap, NoScanAccepted, NothingToTile, PipelineSettings, build_map
+from worker.pipeline.map_versions import KeptMap, extend_map, renew_map, without
 from worker.pipeline.values import Indices
 
 

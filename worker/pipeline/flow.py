@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -30,10 +29,9 @@ from worker.pipeline.tiling import (
     cut,
     grid_over,
     grown,
-    inside_tiles,
     pair_tiles,
 )
-from worker.pipeline.values import Arrays, Indices
+from worker.pipeline.values import Arrays
 from worker.pipeline.voxels import Voxels
 from worker.progress import Progress, silent
 
@@ -80,15 +78,6 @@ class BuiltMap:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class KeptMap:
-    """A map as an earlier build left it; its scans are loaded one at a time."""
-
-    reference: ReferenceMap
-    grid: TileGrid
-    scans: Sequence[Callable[[], RegisteredScan]]
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
 class LocatedSurvey:
     """A survey in the map's frame, cut along the map's tiles."""
 
@@ -132,8 +121,8 @@ def build_map(
     placing = place_together(
         files, settings=settings.placing, memory=pairs, processes=processes, progress=progress
     )
-    fused = _fused(_accepted(files, placing.outcomes, settings), len(files), settings, progress)
-    reference, tiles = _tiled(fused, None, placing.outcomes, settings, progress)
+    fused = fused_scans(accepted_scans(files, placing.outcomes, settings), len(files), settings, progress)
+    reference, tiles = tiled_map(fused, None, placing.outcomes, settings, progress)
     return BuiltMap(
         reference=reference,
         tiles=tiles,
@@ -142,54 +131,6 @@ def build_map(
         kept=placing.kept,
         contradicted=placing.contradicted,
     )
-
-
-def extend_map(
-    base: KeptMap, files: Sequence[ScanFile], *, settings: PipelineSettings, progress: Progress = silent
-) -> BuiltMap:
-    """A new version: further scans placed on the map and fused with what it was made of; tiles keep their ids.
-
-    The outcomes are those of the new files. Raises ScanError where no file can be read, NoScanAccepted where none
-    finds a place, and NothingToTile.
-    """
-    outcomes = place_on_map(
-        files, base.reference.surface(), settings=settings.placing, growing=True, progress=progress
-    )
-    if not any(outcome.placement for outcome in outcomes):
-        raise NoScanAccepted(outcomes)
-    scans = itertools.chain((load() for load in base.scans), _accepted(files, outcomes, settings))
-    fused = _fused(scans, len(base.scans) + len(files), settings, progress)
-    reference, tiles = _tiled(fused, base.grid, outcomes, settings, progress)
-    return BuiltMap(
-        reference=reference, tiles=tiles, outcomes=outcomes, report=MapReport.of_outcomes(outcomes)
-    )
-
-
-def renew_map(
-    base: KeptMap,
-    seen: Sequence[Callable[[], RegisteredScan]],
-    *,
-    replaced: Indices,
-    settings: PipelineSettings,
-    progress: Progress = silent,
-) -> BuiltMap:
-    """A new version: a survey that was accepted as the new state of things; tiles keep their ids.
-
-    In the tiles `replaced` (T, 3) the survey's points take the place of the older ones, elsewhere they join them.
-    Raises NothingToTile.
-    """
-    older = (without(load(), base.grid, replaced) for load in base.scans)
-    scans = itertools.chain(older, (load() for load in seen))
-    fused = _fused(scans, len(base.scans) + len(seen), settings, progress)
-    reference, tiles = _tiled(fused, base.grid, (), settings, progress)
-    return BuiltMap(reference=reference, tiles=tiles, outcomes=(), report=None)
-
-
-def without(scan: RegisteredScan, grid: TileGrid, tiles: Indices) -> RegisteredScan:
-    """The scan less its points in these tiles (T, 3)."""
-    stays = ~inside_tiles(scan.points, grid, tiles)
-    colors = None if scan.colors is None else scan.colors[stays]
-    return replace(scan, points=scan.points[stays], colors=colors)
 
 
 def locate_survey(
@@ -208,7 +149,7 @@ def locate_survey(
     if not any(outcome.placement for outcome in outcomes):
         raise NoScanAccepted(outcomes)
     progress("tiling", 0.0)
-    accepted = _accepted(files, outcomes, settings)
+    accepted = accepted_scans(files, outcomes, settings)
     current = current_map(accepted, voxel_size=reference.voxel_size)
     pairs = pair_tiles(tiles, current.points, settings=settings.tiling)
     progress("tiling", 1.0)
@@ -228,7 +169,7 @@ def detect(
     return decide(pairs, scores, threshold=detector.card.threshold if threshold is None else threshold)
 
 
-def _accepted(
+def accepted_scans(
     files: Sequence[ScanFile], outcomes: Sequence[Outcome], settings: PipelineSettings
 ) -> Iterator[RegisteredScan]:
     """The points of each accepted scan, read again: no two scans are held at once."""
@@ -237,7 +178,7 @@ def _accepted(
             yield placed(file, outcome.placement, max_points=settings.max_scan_points)
 
 
-def _fused(
+def fused_scans(
     scans: Iterable[RegisteredScan], count: int, settings: PipelineSettings, progress: Progress
 ) -> Voxels:
     def told() -> Iterator[RegisteredScan]:
@@ -249,7 +190,7 @@ def _fused(
     return fuse(told(), voxel_size=settings.registration.voxel_size)
 
 
-def _tiled(
+def tiled_map(
     fused: Voxels,
     grid: TileGrid | None,
     outcomes: Sequence[Outcome],

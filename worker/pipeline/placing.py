@@ -6,26 +6,22 @@ then what was left out is looked for in the map that now exists.
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-import numpy as np
-
-from worker.errors import MapFailed, ScanError
+from worker.errors import MapFailed
 from worker.pipeline.frame import map_from_reference
-from worker.pipeline.map_report import MapReport
 from worker.pipeline.map_settings import MapSettings
 from worker.pipeline.pair_memory import Forgetful, PairMemory
 from worker.pipeline.pair_work import Folder, Read, Reading, forget_loaded, read_and_prepare
 from worker.pipeline.pairing import PairWork, Sound, plan_pairs, register_planned
 from worker.pipeline.pairwise import PairResult
-from worker.pipeline.placement import Outcome, Placement, ScanFile
+from worker.pipeline.placement import ScanFile
+from worker.pipeline.placing_result import Placed, Result
 from worker.pipeline.placing_settings import PlacingSettings
 from worker.pipeline.pose_graph import components
-from worker.pipeline.poses import transformed
 from worker.pipeline.refinement import Refined, refine_jointly
 from worker.pipeline.registration_settings import RegistrationSettings
 from worker.pipeline.rescue import Rescued, rescue
@@ -35,16 +31,6 @@ from worker.processes import default_processes, open_processes
 from worker.progress import Progress, rising, silent
 
 _FEW = 4  # scans up to which processes cost more than they bring
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Placed:
-    """Every scan's outcome, in the order of the files, and how it came about."""
-
-    outcomes: tuple[Outcome, ...]
-    report: MapReport
-    kept: tuple[PairResult, ...]  #: the registrations that the map rests on
-    contradicted: tuple[PairResult, ...]  #: accepted ones that were thrown out
 
 
 def place_together(
@@ -119,7 +105,16 @@ class _Build:
             if len(refined.poses) <= before:  # who was found is contradicted by the others
                 break
         self.progress("refining", 1.0)
-        return self._placed(read, sound, pairs, solution, refined, rescued)
+        priors = {number: scan.prior for number, scan in sound.items() if scan.prior is not None}
+        result = Result(
+            read=read,
+            pairs=pairs,
+            solution=solution,
+            refined=refined,
+            rescued=rescued,
+            frame=map_from_reference(refined.poses, priors, solution.reference),
+        )
+        return result.placed(self.files, self.work.folder)
 
     def _read(self) -> dict[int, Read]:
         tasks = [
@@ -202,105 +197,3 @@ class _Build:
             ):
                 return refined
             current = {number: pose for number, pose in refined.poses.items() if number != worst}
-
-    def _placed(
-        self,
-        read: Mapping[int, Read],
-        sound: Mapping[int, Sound],
-        pairs: Sequence[PairResult],
-        solution: Solution,
-        refined: Refined,
-        rescued: Mapping[int, Rescued],
-    ) -> Placed:
-        priors = {number: scan.prior for number, scan in sound.items() if scan.prior is not None}
-        frame = map_from_reference(refined.poses, priors, solution.reference)
-        kept = tuple(
-            edge for edge in solution.kept if edge.target in refined.poses and edge.source in refined.poses
-        )
-        numbers = _numbers(kept)
-        outcomes = []
-        for index, file in enumerate(self.files):
-            if index not in refined.poses:
-                outcomes.append(_left_out(file, read[index], rescued.get(index)))
-                continue
-            placement = self._placement(index, frame, solution, refined, rescued, numbers.get(index, []))
-            outcomes.append(
-                Outcome(
-                    name=file.name,
-                    placement=placement,
-                    fitness=placement.fitness,
-                    inlier_rmse=placement.inlier_rmse,
-                )
-            )
-        report = MapReport.of(
-            scans=len(self.files),
-            accepted=len(refined.poses),
-            pairs=pairs,
-            kept=kept,
-            reference=solution.reference,
-        )
-        return Placed(outcomes=tuple(outcomes), report=report, kept=kept, contradicted=solution.contradicted)
-
-    def _placement(
-        self,
-        index: int,
-        frame: Matrix4,
-        solution: Solution,
-        refined: Refined,
-        rescued: Mapping[int, Rescued],
-        edges: Sequence[PairResult],
-    ) -> Placement:
-        pose = frame @ refined.poses[index]
-        origin = self.work.folder.load(index).origin
-        late = rescued.get(index)
-        if late is not None and late.placement is not None:
-            placement, path = late.placement, (*solution.paths.get(late.beside, ()), index)
-        else:
-            placement, path = _of_edges(edges), solution.paths[index]
-        return replace(
-            placement,
-            map_from_scan=pose,
-            sensor_origin=None if origin is None else transformed(origin[None], pose)[0],
-            uncertainty=refined.uncertainties[index] if len(refined.poses) > 1 else None,
-            path=path,
-        )
-
-
-def _of_edges(edges: Sequence[PairResult]) -> Placement:
-    """The numbers of a scan: means over its registrations, and the best cover."""
-    best = max(edges, key=lambda edge: edge.score, default=None)
-    return Placement(
-        map_from_scan=np.eye(4),
-        sensor_origin=None,
-        fitness=float(np.mean([edge.fitness for edge in edges])) if edges else None,
-        inlier_rmse=float(np.mean([edge.inlier_rmse for edge in edges])) if edges else None,
-        overlap=1.0 if best is None else best.overlap,
-        agreement=1.0 if best is None else best.agreement,
-        searched=best is not None and not best.vouched,
-        uncertainty=None,
-    )
-
-
-def _numbers(edges: Sequence[PairResult]) -> dict[int, list[PairResult]]:
-    by_scan = defaultdict(list)
-    for edge in edges:
-        by_scan[edge.target].append(edge)
-        by_scan[edge.source].append(edge)
-    return by_scan
-
-
-def _left_out(file: ScanFile, read: Read, rescued: Rescued | None) -> Outcome:
-    if rescued is not None:
-        reason, fitness, rmse = rescued.reason, rescued.fitness, rescued.inlier_rmse
-        if reason is None:
-            reason = (
-                f"scan {file.name}: it contradicts what its neighbours saw as free space; scan there again"
-            )
-        return Outcome(name=file.name, placement=None, reason=reason, fitness=fitness, inlier_rmse=rmse)
-    error: ScanError | str | None = read.error or read.reason
-    reason = (
-        f"scan {file.name}: it contradicts what its neighbours saw as free space; scan there again"
-        if error is None
-        else str(error)
-    )
-    return Outcome(name=file.name, placement=None, reason=reason)

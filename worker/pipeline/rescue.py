@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
 from worker.pipeline.frame import map_from_reference
-from worker.pipeline.icp import Surface
 from worker.pipeline.pair_work import Folder, assembled
 from worker.pipeline.pairing import PairWork, Sound
 from worker.pipeline.placement import Placement
@@ -40,9 +37,9 @@ class Rescued:
 @dataclass(frozen=True, kw_only=True, slots=True)
 class _Looking:
     folder: Folder
+    map_number: int  #: of what the scan is looked for in
     number: int
     start: Matrix4 | None
-    map_path: Path
     poses: tuple[tuple[int, Matrix4], ...]
     settings: RegistrationSettings
 
@@ -58,16 +55,20 @@ def rescue(
     if not missing:
         return {}
     surface = assembled(work.folder, list(poses.items()), voxel_size=work.registration.voxel_size)
-    path = work.folder.root / "map.npz"
-    PreparedScan(name="map", surface=surface, image=None, sensor_pose=np.eye(4)).save(path)
+    map_number = -len(
+        poses
+    )  # below every scan's, and new whenever the map has grown: processes keep what they load
+    PreparedScan(name="map", surface=surface, image=None, sensor_pose=np.eye(4)).save(
+        work.folder.path(map_number)
+    )
     priors = {number: scan.prior for number, scan in scans.items() if scan.prior is not None}
     frame = inverse(map_from_reference(poses, priors, reference))
     tasks = [
         _Looking(
             folder=work.folder,
+            map_number=map_number,
             number=number,
             start=frame @ priors[number] if number in priors else None,
-            map_path=path,
             poses=tuple(poses.items()),
             settings=_hurried(work.registration) if len(poses) > _FEW else work.registration,
         )
@@ -83,15 +84,10 @@ def _hurried(settings: RegistrationSettings) -> RegistrationSettings:
     )
 
 
-@functools.lru_cache(maxsize=1)
-def _map(path: Path) -> Surface:
-    return PreparedScan.load(path).surface
-
-
 def _look(task: _Looking) -> Rescued:
-    scan = task.folder.load(task.number)
+    scan, target = task.folder.load(task.number), task.folder.load(task.map_number).surface
     try:
-        best = register(scan, _map(task.map_path), start=task.start, settings=task.settings)
+        best = register(scan, target, start=task.start, settings=task.settings)
     except ScanRejected as error:
         return Rescued(
             number=task.number, reason=str(error), fitness=error.fitness, inlier_rmse=error.inlier_rmse

@@ -13,16 +13,8 @@ from visits import MANY, QUICK, placement, written
 
 from worker.evaluation.scenes import random_room
 from worker.evaluation.visits import visit
-from worker.pipeline.flow import (
-    BuiltMap,
-    KeptMap,
-    NoScanAccepted,
-    PipelineSettings,
-    build_map,
-    extend_map,
-    renew_map,
-    without,
-)
+from worker.pipeline.flow import BuiltMap, NoScanAccepted, PipelineSettings, build_map
+from worker.pipeline.map_versions import KeptMap, extend_map, renew_map, without
 from worker.pipeline.mapping import fuse, reference_map
 from worker.pipeline.placement import Outcome, RegisteredScan, ScanFile, placed
 from worker.pipeline.poses import difference
