@@ -66,13 +66,13 @@ def test_the_base_install_is_what_the_service_imports() -> None:
     assert set(requirements()) - LOADED_BY_NAME == imported("service")
 
 
-def test_the_worker_extra_adds_what_only_the_worker_imports() -> None:
-    assert set(requirements("worker")) - set(requirements()) == imported("worker") - set(requirements())
+def test_the_worker_and_evaluate_extras_add_what_only_the_worker_imports() -> None:
+    assert set(requirements("worker", "evaluate")) - set(requirements()) == imported("worker") - set(requirements())
 
 
 def test_every_requirement_is_pinned_to_a_version_that_it_admits() -> None:
     pinned = pins()
-    wanted = requirements("worker", "dev")
+    wanted = requirements("worker", "evaluate", "dev")
     assert {name for name, each in wanted.items() if not each.specifier.contains(pinned[name])} == set()
 
 
