@@ -17,6 +17,7 @@ class MapSettings(BaseModel):
     max_height_difference: float = Field(1.5, gt=0, description="metres between the centroids, along z")
     partners: int = Field(4, ge=1, description="pairs that a scan proposes, the likeliest first")
     searched_partners: int = Field(6, ge=1, description="the same where a pair had to be searched")
+    partners_across: int = Field(3, ge=1, description="the same between parts that are not joined yet")
     pairing_rounds: int = Field(
         3, ge=1, description="of registering pairs, as long as they leave the scans in several parts"
     )
@@ -25,4 +26,10 @@ class MapSettings(BaseModel):
         0.1, gt=0, description="metres a registration may be off those of the others around a loop"
     )
     loop_angle: float = Field(0.026, gt=0, description="radians, likewise (1.5 degrees)")
+    max_contradiction: float = Field(
+        0.01,
+        gt=0,
+        le=1,
+        description="share of a scan in another's free space that puts the edges between in doubt",
+    )
     refinement_rounds: int = Field(3, ge=0, description="of the joint refinement of all scans")

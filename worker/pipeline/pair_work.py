@@ -228,6 +228,25 @@ def linearised_pair(
     )
 
 
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Glancing:
+    """One target and the sources near it, at poses map_from_scan: does free space contradict them?"""
+
+    folder: Folder
+    target: tuple[int, Matrix4]
+    sources: tuple[tuple[int, Matrix4], ...]
+
+
+def glance(task: Glancing) -> list[tuple[int, int, float]]:
+    """Target, source, and the share of points that stand where the other saw free space, 0..1."""
+    number, target_pose = task.target
+    target = task.folder.load(number)
+    return [
+        (number, other, seen_through(task.folder.load(other), target, inverse(target_pose) @ pose))
+        for other, pose in task.sources
+    ]
+
+
 def thin(points: Floats) -> Points:
     """(N, 3) metres: one a coarse voxel, enough to judge an extent."""
     return Voxels.of(points, size=_EXTENT_VOXEL).points

@@ -76,7 +76,7 @@ class PairPlan:
             open_[np.ix_(rows, rows)] = False
         for a, b in tried:
             open_[at[a], at[b]] = open_[at[b], at[a]] = False
-        return best_pairs(self.numbers, np.where(open_, self.rank, 0.0), mapping.searched_partners)
+        return best_pairs(self.numbers, np.where(open_, self.rank, 0.0), mapping.partners_across)
 
 
 def plan_pairs(scans: Mapping[int, Sound], work: PairWork, *, progress: Share) -> PairPlan:

@@ -7,12 +7,13 @@ then what was left out is looked for in the map that now exists.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from worker.errors import MapFailed
 from worker.pipeline.frame import map_from_reference
+from worker.pipeline.free_space_vote import contradictions, most_accused
 from worker.pipeline.map_settings import MapSettings
 from worker.pipeline.pair_memory import Forgetful, PairMemory
 from worker.pipeline.pair_work import Folder, Read, Reading, forget_loaded, read_and_prepare
@@ -157,12 +158,34 @@ class _Build:
         for round_ in range(self.mapping.pairing_rounds):
             begin = half + span * round_
             pairs += register_planned(wanted, plan, sound, self.work, progress=self._part(begin, span))
-            solution = solve_graph(plan.numbers, pairs, self.mapping)
+            solution = self._solved(plan.numbers, pairs, sound)
             parts = components(plan.numbers, [*solution.kept, *solution.elsewhere])
             wanted = plan.across(parts, {(pair.target, pair.source) for pair in pairs}, self.mapping)
             if not wanted:
                 break
         return pairs, solution
+
+    def _solved(
+        self, numbers: Sequence[int], pairs: Sequence[PairResult], sound: Mapping[int, Sound]
+    ) -> Solution:
+        """The graph solved without the edges that free space accuses, one after the other."""
+        points = {number: sound[number].points for number in numbers}
+        accused: list[PairResult] = []
+        while True:
+            heard = [pair for pair in pairs if not any(pair is each for each in accused)]
+            solution = solve_graph(numbers, heard, self.mapping)
+            found = contradictions(
+                solution.poses,
+                points,
+                self.work.folder,
+                self.work.processes,
+                limit=self.mapping.max_contradiction,
+                settings=self.mapping,
+            )
+            worst = most_accused(list(solution.poses), solution.kept, found, self.mapping)
+            if worst is None:
+                return replace(solution, contradicted=(*solution.contradicted, *accused))
+            accused.append(worst)
 
     def _part(self, begin: float, span: float) -> Callable[[float], None]:
         """Progress of a part of the registration."""
