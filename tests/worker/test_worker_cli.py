@@ -14,11 +14,12 @@ import pytest
 from tests.acceptance.conftest import make_untrained
 from worker.cli import detect, main
 from worker.evaluation.scenes import rigid
+from worker.evaluation.training_curves import draw_curves
 from worker.pipeline.pcd import write_pcd
 from worker.pipeline.scan import read_scan
 from worker.progress import Progress
 from worker.training.dataset import TileSet, load_tiles, save_tiles
-from worker.training.trainer import TrainSettings
+from worker.training.trainer import PAPER, TrainSettings
 
 
 @pytest.fixture(scope="module")
@@ -175,7 +176,10 @@ def trainings(monkeypatch: pytest.MonkeyPatch) -> list[tuple[TrainSettings, Path
     """What was to be trained, instead of training."""
     asked: list[tuple[TrainSettings, Path, Path]] = []
 
-    def remember(settings: TrainSettings, dataset: Path, out: Path, progress: Progress) -> Path:
+    def remember(
+        settings: TrainSettings, dataset: Path, out: Path, progress: Progress, *, on_epoch: object
+    ) -> Path:
+        assert on_epoch is draw_curves
         asked.append((settings, dataset, out))
         return out / "best.pt"
 
@@ -205,6 +209,15 @@ def test_train_keeps_defaults_but_for_what_was_given(
     wanted = replace(default, minutes=7, batch=8, pairs=replace(default.pairs, density=(0.05, 0.3)))
     assert trainings == [(wanted, tmp_path / "tiles.npz", tmp_path / "run")]
     assert "best.pt" in capsys.readouterr().out
+
+
+def test_train_paper_is_the_papers_preset(
+    tmp_path: Path, trainings: list[tuple[TrainSettings, Path, Path]]
+) -> None:
+    _save_small_set(tmp_path / "tiles.npz")
+    words = ["--paper", "--epochs", "3", "--device", "cpu"]
+    assert run("train", str(tmp_path), *words) == 0
+    assert [settings for settings, _, _ in trainings] == [replace(PAPER, epochs=3)]
 
 
 def test_train_refuses_to_simulate_over_a_set_that_is_there(

@@ -19,6 +19,9 @@ def register(commands: typer.Typer) -> None:
 
 def train(
     folder: Annotated[Path, typer.Argument(help="Checkpoints and log; a stopped training goes on there.")],
+    paper: Annotated[
+        bool, typer.Option("--paper", help="The paper's own pairs and start, where ours depart from them.")
+    ] = False,
     tiles: Annotated[
         Path | None,
         typer.Option(help="Training set; left out: FOLDER/tiles.npz. Simulated where it is not there yet."),
@@ -56,16 +59,19 @@ def train(
     import torch  # noqa: PLC0415
 
     from worker.detectors.store import resolve_device  # noqa: PLC0415
-    from worker.training.pairs import PairSettings  # noqa: PLC0415
-    from worker.training.trainer import TrainSettings  # noqa: PLC0415
+    from worker.evaluation.training_curves import draw_curves  # noqa: PLC0415
+    from worker.training.trainer import PAPER, TrainSettings  # noqa: PLC0415
     from worker.training.trainer import train as run  # noqa: PLC0415
 
     if threads is not None:
         torch.set_num_threads(threads)
     where = resolve_device(device).type
+    default = PAPER if paper else TrainSettings()
     settings = replace(
-        TrainSettings(device=where, coarse_search=where == "cpu"),
-        pairs=replace(PairSettings(), **_given(revisit_share=revisit_share, density=density)),
+        default,
+        device=where,
+        coarse_search=where == "cpu",
+        pairs=replace(default.pairs, **_given(revisit_share=revisit_share, density=density)),
         **_given(
             epochs=epochs,
             minutes=minutes,
@@ -80,7 +86,7 @@ def train(
     buildings = _given(offices=offices, corridors=corridors, rooms=rooms)
     with terminal.progress_bar() as progress:
         _make_tiles(tiles, buildings, progress)
-        best = run(settings, tiles, folder, progress)
+        best = run(settings, tiles, folder, progress, on_epoch=draw_curves)
     terminal.output().print(
         f"{best}\n`python -m worker.evaluation.publish {best} {tiles}` makes a model of it", highlight=False
     )

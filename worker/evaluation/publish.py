@@ -10,6 +10,7 @@ import hashlib
 import json
 import platform
 import sys
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -40,14 +41,12 @@ VOXEL_SIZE, MIN_POINTS = 0.05, 512  #: paper, Table 3; the training tiles are ma
 #: Of the pair settings, what says which synthetic changes there are.
 KEPT = ("magnitude", "density", "min_shown", "shown_distance")
 
+#: From the paper, whatever the settings.
 DEVIATIONS = (
     "encoder and T-Nets with batch normalisation as in PointNet, which the paper does not mention",
     "patches enter as their distinct points, in training too; augmentation is applied before repetition",
-    "revisit_share of the pairs are two independent simulated visits, not one tile sampled twice",
-    "a changed pair comes with an unchanged one of the same tile; changes that hardly show are drawn again",
-    "pairs are turned by the square's symmetries; change density is the range given in settings",
-    "the head's first layers are initialised from data, so that the Chamfer statistics are heard from the start",
 )
+PAPER_DENSITY = (0.075, 0.075)
 
 
 def publish(
@@ -60,11 +59,14 @@ def publish(
     summary: str,
     command: str = "",
     name: str = "spicd-net",
+    about: Mapping[str, Any] | None = None,
+    beside: Mapping[str, SpicdNet] | None = None,
 ) -> Path:
     """Write `model_store/<name>/<version>/`, its threshold chosen on the validation tiles; returns the folder.
 
     `unseen` is a training set of other buildings, on which the card's evaluation is measured; without one
-    the validation tiles serve for that too, and the card says so.
+    the validation tiles serve for that too, and the card says so. `about` adds to what the card says of the
+    training; `beside` are other detectors by name, measured on the validation pairs at their own thresholds.
     """
     state = torch.load(checkpoint, map_location="cpu", weights_only=True)
     settings, training_set = state["settings"], load_tiles(tiles)
@@ -83,7 +85,7 @@ def publish(
             seed=settings["seed"],
         ),
         weights=WEIGHTS,
-        training=_training(state, training_set, command),
+        training={**_training(state, training_set, command), **(about or {})},
         licence="MIT",
         sources=("method: AI 2026, 7(4), 141, https://doi.org/10.3390/ai7040141",),
     )
@@ -93,11 +95,13 @@ def publish(
     scores = change_scores(detector, pairs)
     chosen = best_threshold(scores, pairs)
     evaluation: dict[str, Any] = {"validation": _measured(chosen.threshold, scores, pairs)}
+    for other_name, other_one in (beside or {}).items():
+        evaluation[other_name] = _measured(other_one.card.threshold, change_scores(other_one, pairs), pairs)
     if unseen is not None:
         other = survey_pairs(load_tiles(unseen), pair_settings, seed=settings["seed"])
         evaluation["unseen buildings"] = _measured(chosen.threshold, change_scores(detector, other), other)
     evaluation["pairs"] = (
-        "two independent simulated visits, the second with a synthetic change or none (paper, Section 3.5.1), "
+        "two independent visits, the second with a synthetic change or none (paper, Section 3.5.1), "
         f"no augmentation; precision and F1 for {PREVALENCE:.0%} changed tiles; threshold of the highest F1 on the validation tiles"
     )
     return _write(
@@ -135,10 +139,29 @@ def _training(state: dict[str, Any], tiles: TileSet, command: str) -> dict[str, 
         "validation_pairs": state["measured"],
         "tiles": len(tiles),
         "tile_source": tiles.source,
-        "deviations": list(DEVIATIONS),
+        "deviations": deviations(state["settings"]),
         "torch": torch.__version__,
         "machine": platform.machine(),
     }
+
+
+def deviations(settings: dict[str, Any]) -> list[str]:
+    """Where a training with these settings departs from the paper, in words. An older checkpoint has ours."""
+    pairs = settings["pairs"]
+    ours = {
+        "revisit_share of the pairs are two independent visits, not one tile sampled twice": pairs[
+            "revisit_share"
+        ]
+        > 0,
+        "a changed pair comes with an unchanged one of the same tile": pairs.get("twins", True),
+        "changes that hardly show are drawn again": pairs["min_shown"] > 0,
+        "pairs are turned by the square's symmetries": pairs["symmetries"],
+        "change density is the range given in settings": tuple(pairs["density"]) != PAPER_DENSITY,
+        "the head's first layers are initialised from data, so that the Chamfer statistics are heard from the start": (
+            settings.get("settle_head", True)
+        ),
+    }
+    return [*DEVIATIONS, *(words for words, true in ours.items() if true)]
 
 
 def _pair_settings(settings: dict[str, Any]) -> PairSettings:

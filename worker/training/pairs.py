@@ -37,8 +37,13 @@ class PairSettings:
     shown_distance: float = 0.075  #: metres; with `min_shown` what the simulator's truth calls a change
     min_separation: float = 3.0  #: metres between different tiles of one building
     symmetries: bool = True  #: ours: both patches under one of the square's eight symmetries
+    twins: bool = True  #: ours: a changed pair comes with an unchanged one of the same tile and looks
     augmentation: Augmentation = field(default_factory=Augmentation)
     nuisance: Nuisance = field(default_factory=Nuisance)
+
+
+#: Section 3.5 to the letter; docs/decisions/0006 says why it is not the default.
+PAPER_PAIRS = PairSettings(revisit_share=0.0, min_shown=0, symmetries=False, twins=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,11 +85,11 @@ class PairMaker:
     def batches(self, count: int, size: int, rng: np.random.Generator) -> Iterator[Batch]:
         """`count` pairs in the classes' exact shares, `size` at a time; a last few are left out.
 
-        Each changed pair comes with an unchanged one of the same tile and looks, so that nothing but the change
-        tells them apart.
+        With `twins` each changed pair comes with an unchanged one of the same tile and looks, so that nothing but
+        the change tells them apart.
         """
         ready: list[Pair] = []
-        groups = composition(count, self._settings.shares)
+        groups = composition(count, self._settings.shares, twins=self._settings.twins)
         for place in rng.permutation(len(groups)):
             looks = self._two_looks(rng)
             ready += [self.pair(label, rng, looks) for label in groups[place]]
@@ -123,15 +128,23 @@ class PairMaker:
         return self._sampled(first, changed(second, settings, self._half, rng), intensity, rng)
 
     def _different(self, rng: np.random.Generator) -> tuple[Points, Points]:
-        """Tiles of two buildings, or at least `min_separation` apart in one (any other tile if none is)."""
+        """Tiles of two buildings, or at least `min_separation` apart in one. Raises ValueError where no two are."""
+        points = self._tiles.points_a
+        i = int(rng.integers(len(points)))
+        others = self._apart(i)
+        if len(others) == 0:  # in the middle of a small place; others of its tiles may be apart
+            usable = [other for other in range(len(points)) if len(self._apart(other))]
+            if not usable:
+                raise ValueError(f"no two tiles are {self._settings.min_separation} m apart")
+            i = int(rng.choice(usable))
+            others = self._apart(i)
+        return self._patch(points[i], rng), self._patch(points[int(rng.choice(others))], rng)
+
+    def _apart(self, i: int) -> NDArray[np.intp]:
+        """The tiles that are no part of tile i's surroundings."""
         tiles = self._tiles
-        i = int(rng.integers(len(tiles)))
         away = np.linalg.norm(tiles.centres - tiles.centres[i], axis=1) >= self._settings.min_separation
-        others = np.flatnonzero(away | (tiles.buildings != tiles.buildings[i]))
-        if len(others) == 0:
-            raise ValueError(f"no tile is {self._settings.min_separation} m from tile {i}")
-        j = int(rng.choice(others))
-        return self._patch(tiles.points_a[i], rng), self._patch(tiles.points_a[j], rng)
+        return np.flatnonzero(away | (tiles.buildings != tiles.buildings[i]))
 
     def _two_looks(self, rng: np.random.Generator) -> Looks:
         """Two dense looks at a random tile, and whether they are of two visits (in either order)."""
@@ -178,11 +191,13 @@ def altered(
     return result.points
 
 
-def composition(count: int, shares: tuple[float, float, float]) -> list[tuple[int, ...]]:
+def composition(
+    count: int, shares: tuple[float, float, float], *, twins: bool = True
+) -> list[tuple[int, ...]]:
     """`count` labels in exact shares, as groups of one tile each; what rounding leaves is unchanged."""
     changed_count, different = (round(count * share) for share in shares[1:])
     unchanged = count - changed_count - different
-    both = min(unchanged, changed_count)
+    both = min(unchanged, changed_count) if twins else 0
     return [
         *[(UNCHANGED, CHANGED)] * both,
         *[(UNCHANGED,)] * (unchanged - both),

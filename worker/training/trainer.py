@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import csv
 import time
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from worker.progress import Progress, silent
 from worker.training.dataset import TileSet, load_tiles, split_tiles
 from worker.training.losses import total_loss
 from worker.training.metrics import Measured, measured
-from worker.training.pairs import Batch, PairMaker, PairSettings
+from worker.training.pairs import PAPER_PAIRS, Batch, PairMaker, PairSettings
 from worker.training.prefetch import prefetched
 from worker.training.schedule import Schedule
 
@@ -42,7 +43,10 @@ class TrainSettings:
     weight_decay: float = 1e-4
     held_out: float = 0.1  #: share of the tiles
     seed: int = 42
-    start_from: str | None = None  #: checkpoint whose network is trained on, with a fresh optimiser
+    start_from: str | None = (
+        None  #: what network is trained on, with a fresh optimiser: a checkpoint, or as said with `start`
+    )
+    settle_head: bool = True  #: ours: the head's first layers start as if their inputs were standardised
     device: str = "cpu"
     coarse_search: bool = (
         True  #: bfloat16 where max-pooling looks for its winners; a third less time on the CPU
@@ -59,6 +63,10 @@ class TrainSettings:
         )
 
 
+#: Sections 3.5 to 3.8 to the letter.
+PAPER = TrainSettings(pairs=PAPER_PAIRS, settle_head=False)
+
+
 @dataclass(frozen=True, kw_only=True, slots=True)
 class EpochRow:
     """One line of the log."""
@@ -67,8 +75,9 @@ class EpochRow:
     seconds: float  #: since the run began, stops left out
     learning_rate: float  #: at the epoch's end
     train_loss: float
+    train_accuracy: float  #: of the network as it was at each step, dropout included
     validation_loss: float
-    accuracy: float
+    accuracy: float  #: on the validation pairs
     precision_unchanged: float
     precision_changed: float
     precision_different: float
@@ -77,18 +86,30 @@ class EpochRow:
     recall_different: float
 
 
-def train(settings: TrainSettings, dataset: Path, out: Path, progress: Progress = silent) -> Path:
+def train(
+    settings: TrainSettings,
+    dataset: Path,
+    out: Path,
+    progress: Progress = silent,
+    *,
+    start: Mapping[str, Tensor] | None = None,
+    on_epoch: Callable[[Path], None] | None = None,
+) -> Path:
     """Train on the tiles of `dataset`, keeping everything in the folder `out`; returns the best checkpoint.
 
     A folder that already holds a checkpoint of the same settings and data is taken up where it stopped.
-    Raises ValueError for a checkpoint of others, FloatingPointError when the loss is no longer a number.
+    `start` is the network that `start_from` names, where that is no checkpoint. `on_epoch` is called with the
+    folder once an epoch's files are complete. Raises ValueError for a checkpoint of others, FloatingPointError when
+    the loss is no longer a number.
     """
     out.mkdir(parents=True, exist_ok=True)
     training, validation = split_tiles(load_tiles(dataset), share=settings.held_out)
-    run = Run(settings, training, validation, out)
+    run = Run(settings, training, validation, out, start=start)
     run.resume()
     while not run.finished:
         run.epoch(progress)
+        if on_epoch is not None:
+            on_epoch(out)
     progress("train", 1.0)
     return out / BEST
 
@@ -96,7 +117,15 @@ def train(settings: TrainSettings, dataset: Path, out: Path, progress: Progress 
 class Run:
     """The state of one training."""
 
-    def __init__(self, settings: TrainSettings, training: TileSet, validation: TileSet, out: Path) -> None:
+    def __init__(
+        self,
+        settings: TrainSettings,
+        training: TileSet,
+        validation: TileSet,
+        out: Path,
+        *,
+        start: Mapping[str, Tensor] | None = None,
+    ) -> None:
         torch.manual_seed(settings.seed)
         self._settings = settings
         self._out = out
@@ -112,11 +141,12 @@ class Run:
             fused=True,
         )
         self._makers = PairMaker(training, settings.pairs), PairMaker(validation, settings.pairs)
-        if settings.start_from is None:
+        if start is None and settings.start_from is not None:
+            start = torch.load(settings.start_from, map_location=self._device, weights_only=True)["network"]
+        if start is not None:
+            self._network.load_state_dict(start)
+        elif settings.settle_head:
             self._settle()
-        else:
-            start = torch.load(settings.start_from, map_location=self._device, weights_only=True)
-            self._network.load_state_dict(start["network"])
         self._epochs = 0
         self._seconds = 0.0
         self._best = (-1.0, -1.0)
@@ -131,17 +161,18 @@ class Run:
     def epoch(self, progress: Progress) -> EpochRow:
         """Train on one epoch's pairs, validate, and keep both checkpoints and the log."""
         began = time.monotonic() - self._seconds
-        loss, rate = self._train_pass(began, progress)
-        found = self._validate()
+        trained = self._train_pass(began, progress)
+        found = self._validate(began, progress)
         self._epochs += 1
         self._seconds = time.monotonic() - began
         if found.rank > self._best:
             self._best, self._best_epoch = found.rank, self._epochs
             self._save(BEST, {"measured": asdict(found)})
+        row = self._log(trained, found)
         self._save(
             CHECKPOINT, {"optimizer": self._optimizer.state_dict(), "torch_rng": torch.get_rng_state()}
         )
-        return self._log(loss, rate, found)
+        return row
 
     def resume(self) -> None:
         """Take up the last checkpoint, if the folder has one."""
@@ -149,37 +180,43 @@ class Run:
         if not path.exists():
             return
         state = torch.load(path, map_location=self._device, weights_only=True)
-        if state["settings"] != asdict(self._settings):
+        if _whole(state["settings"]) != asdict(self._settings):
             raise ValueError(f"{path} was made with other settings; use them, or another folder")
         self._network.load_state_dict(state["network"])
         self._optimizer.load_state_dict(state["optimizer"])
         torch.set_rng_state(state["torch_rng"].cpu())
         self._epochs, self._seconds = state["epochs"], state["seconds"]
         self._best, self._best_epoch = tuple(state["best"]), state["best_epoch"]
+        self._cut_log()
 
-    def _train_pass(self, began: float, progress: Progress) -> tuple[float, float]:
-        """Mean loss over the epoch's steps, and the last learning rate. Ends early when the time is up."""
+    def _train_pass(self, began: float, progress: Progress) -> _Trained:
+        """One epoch's steps. Ends early when the time is up."""
         settings, schedule = self._settings, self._settings.schedule
         steps = max(settings.train_pairs // settings.batch, 1)
         # Each epoch has its own stream, so that a resumed run sees the pairs that an unbroken one sees.
         rng = np.random.default_rng((settings.seed, 1, self._epochs))
         batches = self._makers[0].batches(settings.train_pairs, settings.batch, rng)
         self._network.train()
-        losses, rate = [], schedule.start
+        losses, hits, rate = [], [], schedule.start
         for step, batch in enumerate(prefetched(batches)):
             done = schedule.done(self._epochs + step / steps, time.monotonic() - began)
             if done >= 1.0:
                 break
             progress("train", done)
             rate = schedule.rate(done)
-            losses.append(self._step(batch, rate))
-        return float(np.mean(losses)) if losses else float("nan"), rate
+            loss, right = self._step(batch, rate)
+            losses.append(loss)
+            hits.append(right)
+        if not losses:
+            return _Trained(loss=float("nan"), accuracy=float("nan"), rate=rate)
+        return _Trained(loss=float(np.mean(losses)), accuracy=float(np.mean(hits)), rate=rate)
 
-    def _step(self, batch: Batch, rate: float) -> float:
+    def _step(self, batch: Batch, rate: float) -> tuple[float, float]:
+        """The loss before the step, and the share of pairs that the network had right."""
         for group in self._optimizer.param_groups:
             group["lr"] = rate
-        output = self._forward(batch)
-        loss = total_loss(output.logits, torch.from_numpy(batch.labels).to(self._device), output.transforms)
+        output, labels = self._forward(batch), torch.from_numpy(batch.labels).to(self._device)
+        loss = total_loss(output.logits, labels, output.transforms)
         value = loss.item()
         if not np.isfinite(value):
             raise FloatingPointError(
@@ -188,10 +225,10 @@ class Run:
         self._optimizer.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]
         self._optimizer.step()
-        return value
+        return value, float((output.logits.detach().argmax(dim=1) == labels).float().mean())
 
     @torch.no_grad()
-    def _validate(self) -> Measured:
+    def _validate(self, began: float, progress: Progress) -> Measured:
         """On the same pairs after every epoch."""
         settings = self._settings
         rng = np.random.default_rng((settings.seed, 2))
@@ -199,6 +236,7 @@ class Run:
         self._network.eval()
         logits, labels = [], []
         for batch in batches:
+            progress("train", settings.schedule.done(self._epochs + 1, time.monotonic() - began))
             logits.append(self._forward(batch).logits.cpu())
             labels.append(torch.from_numpy(batch.labels))
         answers, truth = torch.cat(logits), torch.cat(labels)
@@ -241,12 +279,13 @@ class Run:
         torch.save(state, partial)
         partial.replace(self._out / name)
 
-    def _log(self, loss: float, rate: float, found: Measured) -> EpochRow:
+    def _log(self, trained: _Trained, found: Measured) -> EpochRow:
         row = EpochRow(
             epoch=self._epochs,
             seconds=round(self._seconds, 1),
-            learning_rate=rate,
-            train_loss=loss,
+            learning_rate=trained.rate,
+            train_loss=trained.loss,
+            train_accuracy=trained.accuracy,
             validation_loss=found.loss,
             accuracy=found.accuracy,
             **_by_class("precision", found.precision),
@@ -260,6 +299,35 @@ class Run:
                 writer.writeheader()
             writer.writerow(asdict(row))
         return row
+
+    def _cut_log(self) -> None:
+        """Without what was written of an epoch whose checkpoint was not; in today's columns."""
+        path = self._out / LOG
+        if not path.exists():
+            return
+        with path.open(newline="") as file:
+            kept = [row for row in csv.DictReader(file) if int(row["epoch"]) <= self._epochs]
+        partial = path.with_name(f"{LOG}.partial")
+        with partial.open("w", newline="") as file:
+            writer = csv.DictWriter(file, [field.name for field in fields(EpochRow)], extrasaction="ignore")
+            writer.writeheader()
+            writer.writerows(kept)
+        partial.replace(path)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class _Trained:
+    """What the steps of an epoch say."""
+
+    loss: float  #: mean; NaN where the time was up before the first step
+    accuracy: float
+    rate: float  #: the last one
+
+
+def _whole(settings: dict[str, Any]) -> dict[str, Any]:
+    """The settings of a checkpoint; what they do not know yet has its default."""
+    default = asdict(TrainSettings())
+    return {**default, **settings, "pairs": {**default["pairs"], **settings["pairs"]}}
 
 
 def _by_class(name: str, values: tuple[float, float, float]) -> dict[str, float]:

@@ -18,7 +18,7 @@ from worker.training.augmentation import (
     turned_alike,
 )
 from worker.training.dataset import TileSet, load_tiles, save_tiles, split_tiles
-from worker.training.pairs import PairMaker, PairSettings, altered, composition
+from worker.training.pairs import PAPER_PAIRS, PairMaker, PairSettings, altered, composition
 
 STILL = Augmentation(jitter=0, dropout=0, shift=0, yaw=0)
 SAME_LOOK = Nuisance(yaw=0, shift=0, dropout=(0, 0), magnitude=(-0.02, -0.02))  # 0.001 + 0.05 m is 0
@@ -39,6 +39,64 @@ def test_the_classes_have_their_exact_shares():
 def test_every_changed_pair_has_an_unchanged_one_of_its_tile_while_there_are_any():
     assert composition(20, (0.50, 0.35, 0.15)) == [(0, 1)] * 7 + [(0,)] * 3 + [(2,)] * 3
     assert composition(10, (0.2, 0.6, 0.2)) == [(0, 1)] * 2 + [(1,)] * 4 + [(2,)] * 2
+
+
+def test_the_papers_pairs_are_drawn_one_by_one():
+    assert composition(20, (0.50, 0.35, 0.15), twins=False) == [(0,)] * 10 + [(1,)] * 7 + [(2,)] * 3
+
+
+def test_the_papers_preset_is_section_3_5():
+    preset = PAPER_PAIRS
+    assert (preset.shares, preset.rerun_share) == ((0.50, 0.35, 0.15), 0.7)
+    assert (preset.magnitude, preset.density) == ((0.10, 0.50), (0.075, 0.075))
+    assert (preset.changed_intensity, preset.min_separation) == (0.5, 3.0)
+    assert preset.nuisance.dropout == (0.10, 0.50)
+    # and nothing of ours
+    assert (preset.revisit_share, preset.min_shown, preset.symmetries, preset.twins) == (0.0, 0, False, False)
+
+
+def test_the_papers_pairs_are_of_one_dense_tile_seven_in_ten_sampled_anew(tiles):
+    preset = replace(PAPER_PAIRS, patch_points=512, augmentation=STILL)
+    owner = {len(points): i for i, points in enumerate(tiles.points_a)}
+    assert len(owner) < len(tiles)  # tiles are told apart below by their points, not by their number
+    maker, anew = PairMaker(tiles, preset), 0
+    for seed in range(200):
+        pair = maker.pair(0, np.random.default_rng(seed))
+        if len(pair.current) < len(pair.reference):  # the second look lost a tenth of its points and more
+            anew += 1
+        else:
+            assert np.abs(pair.current - pair.reference).max() < 6 * 0.0001
+    assert 0.6 < anew / 200 < 0.8
+
+
+def test_the_papers_changed_pairs_lose_half_as_much(tiles):
+    preset = replace(
+        PAPER_PAIRS, patch_points=512, augmentation=STILL, magnitude=(0.0, 0.0), density=(0.0, 0.0)
+    )
+    preset = replace(preset, nuisance=replace(preset.nuisance, dropout=(0.4, 0.4)))
+    maker = PairMaker(tiles, preset)
+    for seed in range(10):
+        pair = maker.pair(1, np.random.default_rng(seed))
+        lost = 1 - len(pair.current) / len(pair.reference)
+        assert lost == pytest.approx(0.2, abs=0.01)  # a point come or gone is the smallest change
+
+
+def test_in_a_small_place_only_tiles_that_have_another_3_m_away_are_different_ones(tiles):
+    row = np.array([0.0, 1.5, 3.0])
+    small = replace(
+        tiles.subset(np.arange(40) < 3), centres=np.c_[row, 0 * row, 0 * row], buildings=np.zeros(3, np.int32)
+    )
+    maker = PairMaker(small, PLAIN)
+    ends = {frozenset(rows(small.points_a[i])) for i in (0, 2)}
+    for seed in range(20):
+        pair = maker.pair(2, np.random.default_rng(seed))
+        assert {frozenset(rows(pair.reference)), frozenset(rows(pair.current))} == ends
+
+
+def test_where_no_two_tiles_are_3_m_apart_there_is_no_different_pair(tiles):
+    near = replace(tiles.subset(np.arange(40) < 2), buildings=np.zeros(2, np.int32))
+    with pytest.raises(ValueError, match=r"no two tiles are 3\.0 m apart"):
+        PairMaker(near, PLAIN).pair(2, np.random.default_rng(0))
 
 
 def test_a_changed_pair_and_its_unchanged_one_look_at_the_same_tile(tiles):

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 
 import pytest
 import torch
 
-from worker.detectors.store import open_detector
+from worker.detectors.store import open_detector, read_card
 from worker.errors import DetectorUnavailable
-from worker.evaluation.publish import change_scores, publish
+from worker.evaluation.publish import DEVIATIONS, change_scores, deviations, publish
 from worker.training.calibration import best_threshold, survey_pairs
 from worker.training.dataset import save_tiles, split_tiles
 from worker.training.pairs import PairSettings
-from worker.training.trainer import TrainSettings, train
+from worker.training.trainer import PAPER, TrainSettings, train
 
 SHORT = TrainSettings(
     epochs=1, batch=8, train_pairs=8, validation_pairs=8, held_out=0.2, pairs=PairSettings(patch_points=256)
@@ -59,6 +60,25 @@ def test_a_published_model_holds_the_checkpoints_weights(store):
     opened = open_detector(store, "spicd-net/3", device="cpu")
     for name, tensor in opened._network.state_dict().items():
         assert torch.equal(tensor, state[name])
+
+
+def test_a_card_names_the_deviations_of_its_own_training():
+    assert deviations(asdict(PAPER)) == list(DEVIATIONS)
+    ours = asdict(TrainSettings())
+    assert len(deviations(ours)) == len(DEVIATIONS) + 5  # the density is the paper's
+    ours["pairs"]["density"] = (0.05, 0.3)
+    assert "change density is the range given in settings" in deviations(ours)
+
+
+def test_other_detectors_are_measured_on_the_same_pairs(store, tmp_path):
+    other = open_detector(store, "spicd-net/3", device="cpu")
+    run = store.parent / "run" / "best.pt"
+    folder = publish(
+        run, store.parent / "tiles.npz", tmp_path, summary="", about={"map": "lobby"}, beside={"base": other}
+    )
+    card = read_card(folder)
+    assert card.training["map"] == "lobby"
+    assert card.evaluation["base"] == card.evaluation["validation"]  # the same weights and threshold
 
 
 def test_another_cards_weights_are_refused(store):

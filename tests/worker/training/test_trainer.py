@@ -15,7 +15,7 @@ from worker.training.metrics import measured
 from worker.training.pairs import PairSettings
 from worker.training.prefetch import prefetched
 from worker.training.schedule import Schedule
-from worker.training.trainer import BEST, CHECKPOINT, LOG, TrainSettings, train
+from worker.training.trainer import BEST, CHECKPOINT, LOG, PAPER, TrainSettings, train
 
 TINY = TrainSettings(
     epochs=2, batch=8, train_pairs=48, validation_pairs=16, held_out=0.2, pairs=PairSettings(patch_points=256)
@@ -67,6 +67,42 @@ def test_a_stopped_training_goes_on_where_it_was(dataset, tmp_path):
     assert [row["epoch"] for row in log_of(tmp_path)] == [1, 2]
 
 
+def test_an_epoch_whose_checkpoint_was_lost_is_logged_once(dataset, tmp_path):
+    train(replace(TINY, epochs=2, train_pairs=8, validation_pairs=8), dataset, tmp_path)
+    state = torch.load(tmp_path / CHECKPOINT, weights_only=True)
+    torch.save({**state, "epochs": 1}, tmp_path / CHECKPOINT)  # as if killed between log and checkpoint
+    train(replace(TINY, epochs=2, train_pairs=8, validation_pairs=8), dataset, tmp_path)
+    assert [row["epoch"] for row in log_of(tmp_path)] == [1, 2]
+
+
+def test_a_checkpoint_from_before_a_setting_was_there_is_taken_up(dataset, tmp_path):
+    quick = replace(TINY, epochs=1, train_pairs=8, validation_pairs=8)
+    train(quick, dataset, tmp_path)
+    state = torch.load(tmp_path / CHECKPOINT, weights_only=True)
+    del state["settings"]["settle_head"], state["settings"]["pairs"]["twins"]
+    torch.save(state, tmp_path / CHECKPOINT)
+    assert train(quick, dataset, tmp_path).name == BEST
+    with pytest.raises(ValueError, match="other settings"):
+        train(replace(quick, settle_head=False), dataset, tmp_path)
+
+
+def test_every_epoch_is_announced_once_its_files_are_there(dataset, tmp_path):
+    seen = []
+
+    def look(folder):
+        seen.append((len(log_of(folder)), torch.load(folder / CHECKPOINT, weights_only=True)["epochs"]))
+
+    train(replace(TINY, train_pairs=8, validation_pairs=8), dataset, tmp_path, on_epoch=look)
+    assert seen == [(1, 1), (2, 2)]
+
+
+def test_the_papers_preset_is_section_3_8():
+    assert (PAPER.epochs, PAPER.patience, PAPER.batch) == (1000, 100, 16)
+    assert (PAPER.train_pairs, PAPER.validation_pairs, PAPER.held_out, PAPER.seed) == (2000, 500, 0.1, 42)
+    assert (PAPER.learning_rate, PAPER.final_learning_rate, PAPER.weight_decay) == (1e-3, 1e-5, 1e-4)
+    assert (PAPER.settle_head, PAPER.pairs.twins) == (False, False)
+
+
 def test_other_settings_do_not_take_up_a_checkpoint(dataset, tmp_path):
     quick = replace(TINY, epochs=1, train_pairs=8, validation_pairs=8)
     train(quick, dataset, tmp_path)
@@ -86,8 +122,11 @@ def test_a_training_may_start_from_another_ones_network(trained, dataset, tmp_pa
         start_from=str(trained),
     )
     before = torch.load(trained, weights_only=True)["network"]
-    after = torch.load(train(still, dataset, tmp_path), weights_only=True)["network"]
+    after = torch.load(train(still, dataset, tmp_path / "path"), weights_only=True)["network"]
     assert torch.equal(after["head.classifier.0.weight"], before["head.classifier.0.weight"])
+    named = replace(still, start_from="a model")
+    given = torch.load(train(named, dataset, tmp_path / "given", start=before), weights_only=True)["network"]
+    assert torch.equal(given["head.classifier.0.weight"], before["head.classifier.0.weight"])
 
 
 def test_a_run_without_progress_in_accuracy_ends_early(dataset, tmp_path):
