@@ -167,6 +167,7 @@ class Linearising:
     sources: tuple[tuple[int, Matrix4], ...]
     within: float  #: metres, gate of the point pairs
     every: int  #: of the source's points
+    glancing: bool  #: whether free space is asked too
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -195,8 +196,10 @@ def linearise(task: Linearising) -> list[Linearised]:
             every=task.every,
             map_from_target=target_pose,
         )
-        through = seen_through(source, target, inverse(target_pose) @ pose)
-        results.append(replace(found, seen_through=through))
+        if task.glancing:
+            through = seen_through(source, target, inverse(target_pose) @ pose)
+            found = replace(found, seen_through=through)
+        results.append(found)
     return results
 
 

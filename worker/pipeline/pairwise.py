@@ -120,7 +120,7 @@ def judged(
     through = seen_through(source, target, pose)
     limit = settings.max_seen_through_vouched if best.vouched else settings.max_seen_through
     equations = normal_equations(
-        source.surface, target.surface, pose, within=settings.max_correspondence_distance
+        source.surface, target.surface, pose, within=settings.max_correspondence_distance, every=2
     )
     return PairResult(
         target=numbers[0],

@@ -22,7 +22,7 @@ from worker.pipeline.values import Floats, Matrix4, Points
 from worker.processes import Processes
 
 _GATES = (0.15, 0.1, 0.05)  # metres, of the rounds; the last one stays
-_EVERY = (4, 2, 2)  # points of each scan, likewise
+_EVERY = (4, 4, 2)  # points of each scan, likewise
 _NEIGHBOURS = 6  # that a scan is refined against
 
 #: Pairs of points are no independent witnesses: neighbours share a range error and a surface that is not quite plane.
@@ -59,7 +59,15 @@ def refine_jointly(
     for number in range(rounds + 1):
         level = min(number, len(_GATES) - 1)
         pairs = _pairs(current, points, also, settings)
-        terms = linearised(current, pairs, folder, processes, within=_GATES[level], every=_EVERY[level])
+        terms = linearised(
+            current,
+            pairs,
+            folder,
+            processes,
+            within=_GATES[level],
+            every=_EVERY[level],
+            glancing=number == rounds,
+        )
         progress((number + 1) / (rounds + 1))
         if number < rounds and len(current) > 1:
             steps = solve(list(current), _held(terms, current), fixed=fixed)
@@ -79,6 +87,7 @@ def linearised(
     *,
     within: float,
     every: int,
+    glancing: bool,
 ) -> list[Linearised]:
     """The terms of these pairs (target, source), in their order."""
     sources = defaultdict(list)
@@ -86,7 +95,12 @@ def linearised(
         sources[target].append((source, poses[source]))
     tasks = [
         Linearising(
-            folder=folder, target=(target, poses[target]), sources=tuple(near), within=within, every=every
+            folder=folder,
+            target=(target, poses[target]),
+            sources=tuple(near),
+            within=within,
+            every=every,
+            glancing=glancing,
         )
         for target, near in sources.items()
     ]
