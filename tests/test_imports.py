@@ -61,6 +61,8 @@ MAY_IMPORT = {
         "worker.detectors",
         "worker.errors",
         "worker.progress",
+        "worker.processes",
+        "worker.threads",
     ),
     # the demo is a client of the service like any other
     "worker.demo": (
