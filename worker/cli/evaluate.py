@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from worker.cli import evaluate_revisit, terminal
+from worker.cli import evaluate_paper, evaluate_revisit, terminal
 
 
 def register(commands: typer.Typer) -> None:
@@ -18,6 +18,7 @@ def register(commands: typer.Typer) -> None:
     )
     group.callback()(_group)
     group.command("registration")(registration)
+    evaluate_paper.register(group)
     evaluate_revisit.register(group)
     commands.add_typer(group)
 

@@ -29,8 +29,7 @@ class M3c2:
     """Signed distances along local normals, each with its level of detection.
 
     The score of a tile is the share of its core points that changed: those whose distance is significant at
-    95%, and those around which the other cloud has no point within the cylinder, for something is gone or
-    has come. Core points are every `every`th of the reference.
+    95%, and those with points of one cloud only in their cylinder, for something is gone. Core points are every `every`th of the reference.
     """
 
     every: int = 4
@@ -67,7 +66,8 @@ class M3c2:
             registration_error=self.registration_error,
         )
         distances, uncertainties = method.run()
-        changed: NDArray[np.bool_] = np.isnan(distances) | (np.abs(distances) > uncertainties["lodetection"])
+        one_sided = (uncertainties["num_samples1"] > 0) != (uncertainties["num_samples2"] > 0)
+        changed: NDArray[np.bool_] = one_sided | (np.abs(distances) > uncertainties["lodetection"])
         return changed
 
 

@@ -1,0 +1,37 @@
+"""The detector that is measured: a model of the store, or a checkpoint that has not become one yet."""
+
+from __future__ import annotations
+
+import pickle
+from pathlib import Path
+
+import torch
+
+from worker.detectors.detector import Detector
+from worker.detectors.spicd_net.detector import SpicdNet
+from worker.detectors.store import open_card, open_detector, resolve_device
+from worker.errors import DetectorUnavailable
+
+
+def open_measured(model_store: Path, model: str, weights: Path | None) -> Detector:
+    """The model, or with `weights` the network of a checkpoint of `worker.training`, under the model's card.
+
+    A checkpoint brings its own patch size and seed. Raises DetectorUnavailable.
+    """
+    if weights is None:
+        return open_detector(model_store, model)
+    card = open_card(model_store, model)
+    try:
+        state = torch.load(weights, map_location="cpu", weights_only=True)
+        own = {
+            "patch_points": state["settings"]["pairs"]["patch_points"],
+            "seed": state["settings"]["seed"],
+        }
+        card = card.model_copy(
+            update={"preprocessing": card.preprocessing.model_copy(update=own), "version": weights.stem}
+        )
+        return SpicdNet.load(card, state["network"], resolve_device("auto"))
+    except OSError as missing:
+        raise DetectorUnavailable(f"no checkpoint at {weights}: {missing.strerror}") from missing
+    except (KeyError, TypeError, RuntimeError, pickle.UnpicklingError) as unsound:
+        raise DetectorUnavailable(f"{weights} is no checkpoint of spicd-worker train: {unsound}") from unsound
