@@ -16,7 +16,6 @@ def register(commands: typer.Typer) -> None:
     group = typer.Typer(
         name="evaluate", no_args_is_help=True, help="How good it is, measured where the truth is known."
     )
-    group.callback()(_group)
     group.command("registration")(registration)
     evaluate_paper.register(group)
     evaluate_revisit.register(group)
@@ -70,10 +69,6 @@ def registration(
         terminal.print_json(result)
     else:
         terminal.output().print(tables(result), highlight=False)
-
-
-def _group() -> None:
-    """Keeps `registration` a command of its own while it is the only one."""
 
 
 def _numbers(words: str) -> tuple[int, ...]:
