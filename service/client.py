@@ -222,6 +222,24 @@ class Client:
         """The cards of the models."""
         return self._all("/models", "models")
 
+    def train_model(
+        self,
+        map_id: str,
+        *,
+        name: str | None = None,
+        base: str | None = None,
+        minutes: float | None = None,
+        epochs: int | None = None,
+    ) -> Document:
+        """Train a model on a map, from nothing or from `base`; returns `model` and `job_id`."""
+        body = {"name": name, "base": base, "minutes": minutes, "epochs": epochs}
+        return self._json("POST", f"/maps/{_quoted(map_id)}/models", json=_given(body))
+
+    def model(self, model: str) -> Document:
+        """The card of `name/version`."""
+        name, _, version = model.partition("/")
+        return self._json("GET", f"/models/{_quoted(name)}", params=_given({"version": version or None}))
+
     # files
 
     def download(self, path: str, to: Path) -> Path:

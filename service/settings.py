@@ -41,6 +41,14 @@ class Settings(BaseSettings):
     max_upload_bytes: int = Field(2 * 1024**3, gt=0, description="largest body of one request")
     max_scan_points: int = Field(50_000_000, gt=0, description="most points that one scan may declare")
     job_timeout_s: int = Field(3600, gt=0, description="longest time of one step of a job")
+    training_minutes: float = Field(
+        10.0, gt=0, description="of a model's training where a request names none"
+    )
+    max_training_minutes: float = Field(
+        40.0,
+        gt=0,
+        description="most that a request may name; never more than four fifths of `SPICD_JOB_TIMEOUT_S`",
+    )
     log_level: Literal["debug", "info", "warning", "error"] = Field("info", description="of every process")
 
     def resolved_database_url(self) -> str:
@@ -55,6 +63,10 @@ class Settings(BaseSettings):
     def resolved_blob_url(self) -> str:
         """The blob store that is used, embedded or not."""
         return self.blob_url or (self.data_dir / "blobs").absolute().as_uri()
+
+    def most_training_minutes(self) -> float:
+        """So long a training may be, and end well before its step is stopped."""
+        return min(self.max_training_minutes, 0.8 * self.job_timeout_s / 60)
 
     def scratch_dir(self) -> Path:
         """Where steps write aside: on the disk of embedded blobs, so that keeping a file is a rename."""

@@ -6,6 +6,7 @@ PipelineError
 │   └── ScanUnits            scan_units             an extent that says millimetres
 ├── RegistrationFailed       registration_failed    no scan could be placed
 ├── MapFailed                map_failed             nothing to tile, no point left
+├── TrainingFailed           training_failed        a map too small to train on, a loss that is no number
 ├── ProcessLost              process_lost           a process that shared the work ended without a word
 ├── DetectorUnavailable      detector_unavailable   no such model, or its files do not match its card
 └── Cancelled                cancelled              somebody dismissed the job
@@ -48,6 +49,12 @@ class MapFailed(PipelineError):
     """The scans do not make a map that can be tiled."""
 
     code = "map_failed"
+
+
+class TrainingFailed(PipelineError):
+    """The map cannot be trained on, or the training went astray."""
+
+    code = "training_failed"
 
 
 class ProcessLost(PipelineError):

@@ -78,7 +78,7 @@ class JobDocument(Document):
     """The status of a job (OGC API - Processes - Part 1, statusInfo), with what it works on."""
 
     jobID: str = Field(examples=["job-5f0c"])  # noqa: N815 - the standard's name
-    processID: Literal["map", "survey"]  # noqa: N815 - the standard's name
+    processID: Literal["map", "survey", "model"]  # noqa: N815 - the standard's name
     type: Literal["process"] = "process"
     status: JobStatus
     message: str = Field(description="the stage", examples=["registering"])
@@ -89,6 +89,7 @@ class JobDocument(Document):
     updated: datetime
     map_id: str
     survey_id: str | None
+    model: str | None = Field(description="that a training makes", examples=[None])
     problem: ProblemDocument | None
     links: list[Link]
 
@@ -131,8 +132,7 @@ def job_document(record: JobRecord, request: Request) -> JobDocument:
     """A job with its links: itself, and its result once there is one."""
     links = [link(request, f"/jobs/{record.job_id}", "self")]
     if record.status == "successful":
-        result = f"/maps/{record.map_id}" if record.survey_id is None else f"/surveys/{record.survey_id}"
-        links.append(link(request, result, RESULTS))
+        links.append(link(request, _result(record), RESULTS))
     return JobDocument(
         jobID=record.job_id,
         processID=record.kind,
@@ -140,6 +140,18 @@ def job_document(record: JobRecord, request: Request) -> JobDocument:
         links=links,
         **record.model_dump(exclude={"job_id", "kind", "problem"}),
     )
+
+
+def model_path(model: str) -> str:
+    """Where the card of `name/version` is."""
+    name, version = model.split("/")
+    return f"/models/{name}?version={version}"
+
+
+def _result(record: JobRecord) -> str:
+    if record.model is not None:
+        return model_path(record.model)
+    return f"/maps/{record.map_id}" if record.survey_id is None else f"/surveys/{record.survey_id}"
 
 
 def link(request: Request, path: str, rel: str, media_type: str = "application/json") -> Link:

@@ -1,16 +1,25 @@
-"""/models: what the model store holds."""
+"""/models: what the model store holds, and what the site trained; /maps/{id}/models: a training."""
 
 from __future__ import annotations
 
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Path, Query
+from fastapi import APIRouter, Path, Query, Response
+from fastapi import Request as HttpRequest
+from fastapi.concurrency import run_in_threadpool
 from pydantic import Field
 
-from service.api.documents import Document
+from service.api import bodies, site_models
+from service.api.documents import Document, Link, link, model_path
 from service.api.problems import documented
-from service.api.requests import Request
-from service.api.services import Provided
+from service.api.requests import Request, TrainingRequest, checked
+from service.api.schema import body_of
+from service.api.services import Provided, Services
+from service.api.submission import submit
+from service.api.values import Id
+from service.catalog.models import name_for
+from service.catalog.records import JobRecord, ModelRecord, ModelStatus
+from service.errors import BadRequest, Conflict
 
 router = APIRouter(tags=["models"])
 
@@ -30,15 +39,91 @@ class ModelRequest(Request):
     version: Annotated[Part | None, Field(description="left out: the newest")] = None
 
 
+class AcceptedModel(Document):
+    """A model that is going to be trained."""
+
+    model: str = Field(description="as surveys name it once the job is done", examples=["lobby-net/1"])
+    map_id: str = Field(examples=["lobby"])
+    map_version: int = Field(description="that it is trained on", examples=[1])
+    minutes: float = Field(description="of training, at most", examples=[10])
+    job_id: str = Field(examples=["job-5f0c"])
+    status: ModelStatus
+    links: list[Link]
+
+
+@router.post(
+    "/maps/{map_id}/models",
+    status_code=202,
+    summary="Train a model on a map",
+    responses=documented(
+        "incomplete_body",
+        "not_found",
+        "not_ready",
+        "conflict",
+        "too_large",
+        "wrong_media_type",
+        "bad_request",
+        "invalid_request",
+        "queue_unavailable",
+    ),
+    openapi_extra=body_of(json=TrainingRequest),
+)
+async def train_model(
+    request: HttpRequest, response: Response, services: Provided, map_id: Annotated[Id, Path()]
+) -> AcceptedModel:
+    """From nothing, or from a model that is there (`base`); the changes to learn from are made, no label is needed.
+
+    Its threshold is chosen on a part of the map that was kept out of training. Surveys then name the model.
+    """
+    async with bodies.received(request, services.settings, takes=(bodies.JSON,), files="") as body:
+        wanted = checked(TrainingRequest, body.fields)
+    record, job = await run_in_threadpool(_create, services, map_id, wanted)
+    monitor = link(request, f"/jobs/{job.job_id}", "monitor")
+    response.headers["Location"] = monitor.href
+    return AcceptedModel(
+        model=record.model,
+        map_id=map_id,
+        map_version=record.map_version,
+        minutes=record.minutes,
+        job_id=job.job_id,
+        status=record.status,
+        links=[link(request, model_path(record.model), "self"), monitor],
+    )
+
+
 @router.get("/models", summary="List models")
 def list_models(services: Provided) -> ModelList:
     """Every card: what a model is, how it was made and measured, and what it needs."""
-    return ModelList(models=services.cards.all(), default=services.settings.model)
+    return ModelList(models=site_models.all_cards(services), default=services.settings.model)
 
 
-@router.get("/models/{name}", summary="Look at a model", responses=documented("not_found", "invalid_request"))
+@router.get(
+    "/models/{name}",
+    summary="Look at a model",
+    responses=documented("not_found", "not_ready", "invalid_request"),
+)
 def get_model(
     services: Provided, name: Annotated[Part, Path()], asked: Annotated[ModelRequest, Query()]
 ) -> dict[str, Any]:
     """The card of a model."""
-    return services.cards.of(name, asked.version)
+    return site_models.card_of(services, name, asked.version)
+
+
+def _create(services: Services, map_id: str, wanted: TrainingRequest) -> tuple[ModelRecord, JobRecord]:
+    catalog, most = services.catalog, services.settings.most_training_minutes()
+    minutes = min(services.settings.training_minutes, most) if wanted.minutes is None else wanted.minutes
+    if minutes > most:
+        raise BadRequest(f"a training of {minutes:g} minutes is asked for, at most {most:g} are given")
+    catalog.maps.ready(map_id)
+    name = wanted.name or name_for(map_id)
+    if any(card.get("name") == name for card in services.cards.all()):
+        raise Conflict(f"the name {name!r} is that of a model in the model store; choose another")
+    record, job = catalog.models.create(
+        map_id,
+        name=name,
+        base=None if wanted.base is None else site_models.check(services, wanted.base),
+        minutes=minutes,
+        epochs=wanted.epochs,
+    )
+    submit(services, job, forget=lambda: catalog.models.take_back(job.job_id))
+    return record, job

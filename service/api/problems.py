@@ -40,6 +40,7 @@ PROBLEMS: dict[str, tuple[int | None, str]] = {
     "scan_units": (None, "The scan is not in metres"),
     "registration_failed": (None, "No scan could be registered"),
     "map_failed": (None, "The scans do not make a map"),
+    "training_failed": (None, "The model could not be trained"),
     "detector_unavailable": (None, "The model cannot be used"),
     "pipeline_error": (None, "The job failed"),
     "worker_died": (None, "A worker died"),

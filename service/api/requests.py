@@ -126,6 +126,26 @@ class SurveyRequest(Request):
     ] = None
 
 
+class TrainingRequest(Request):
+    """A model to train on a map, without any label."""
+
+    name: Annotated[
+        Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$")] | None,
+        Field(description="left out: the map's id and `-net`; versions are counted", examples=["lobby-net"]),
+    ] = None
+    base: Annotated[Model | None, Field(description="train this one further; left out: from nothing")] = None
+    minutes: Annotated[
+        float | None,
+        Field(
+            gt=0,
+            description="of training, at most; left out: `SPICD_TRAINING_MINUTES`; no more than `SPICD_MAX_TRAINING_MINUTES`",
+        ),
+    ] = None
+    epochs: Annotated[
+        int | None, Field(ge=1, le=1000, description="at most; left out: as many as the minutes allow")
+    ] = None
+
+
 def checked(kind: type[R], fields: dict[str, Any], *, place: str = "body") -> R:
     """The request in these fields. Raises RequestValidationError, which the API answers as FastAPI's own."""
     try:

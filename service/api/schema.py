@@ -17,11 +17,25 @@ from pydantic.json_schema import models_json_schema
 
 from service.api.features import TileCollection
 from service.api.problems import ProblemDocument
-from service.api.requests import AnchorRequest, MapRequest, ScanRequest, SurveyRequest, VersionRequest
+from service.api.requests import (
+    AnchorRequest,
+    MapRequest,
+    ScanRequest,
+    SurveyRequest,
+    TrainingRequest,
+    VersionRequest,
+)
 
 FILE = Path("openapi/openapi.json")
 _REF = "#/components/schemas/{model}"
-_SENT: tuple[type[BaseModel], ...] = (ScanRequest, MapRequest, VersionRequest, AnchorRequest, SurveyRequest)
+_SENT: tuple[type[BaseModel], ...] = (
+    ScanRequest,
+    MapRequest,
+    VersionRequest,
+    AnchorRequest,
+    SurveyRequest,
+    TrainingRequest,
+)
 _ANSWERED: tuple[type[BaseModel], ...] = (ProblemDocument, TileCollection)
 _MODES: tuple[tuple[tuple[type[BaseModel], ...], Literal["validation", "serialization"]], ...] = (
     (_SENT, "validation"),

@@ -7,7 +7,7 @@ from typing import Annotated
 from fastapi import APIRouter, Path, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
 
-from service.api import bodies, features, files
+from service.api import bodies, features, files, site_models
 from service.api.bodies import Body
 from service.api.documents import AcceptedSurvey, Document, Link, SurveyDocument, link, survey_document
 from service.api.features import FeatureResponse, feature_response
@@ -165,7 +165,7 @@ def _create(
     services: Services, reference: MapRecord, wanted: SurveyRequest, body: Body
 ) -> tuple[SurveyRecord, JobRecord]:
     catalog = services.catalog
-    model = services.cards.check(wanted.model or reference.model)
+    model = site_models.check(services, wanted.model or reference.model)
     with kept_scans(
         catalog,
         body.uploads,

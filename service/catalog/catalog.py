@@ -9,6 +9,7 @@ from service.catalog.changes import Changes
 from service.catalog.database import Database
 from service.catalog.jobs import Jobs
 from service.catalog.maps import Maps
+from service.catalog.models import Models
 from service.catalog.scans import Scans
 from service.catalog.surveys import Surveys
 from service.catalog.versions import Versions
@@ -25,6 +26,7 @@ class Catalog:
     maps: Maps
     versions: Versions
     surveys: Surveys
+    models: Models
     changes: Changes
     jobs: Jobs
 
@@ -49,6 +51,7 @@ def open_catalog(settings: Settings, *, migrate: bool = True) -> Catalog:
         maps=Maps(database, blobs),
         versions=Versions(database, blobs),
         surveys=Surveys(database, blobs),
+        models=Models(database),
         changes=Changes(database),
         jobs=Jobs(database),
     )

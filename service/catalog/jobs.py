@@ -93,11 +93,11 @@ class Jobs:
         return status is None or status == "dismissed"
 
     def succeed(self, job_id: str) -> bool:
-        """The job is done and its map's version or survey ready; False when it had ended or gone before."""
+        """The job is done and its map's version, survey or model ready; False when it had ended or gone before."""
         return self._end(job_id, "successful", message="done", progress=100)
 
     def fail(self, job_id: str, problem: Problem) -> bool:
-        """The job and its map's version or survey failed; False when it had ended or gone before."""
+        """The job and its map's version, survey or model failed; False when it had ended or gone before."""
         return self._end(job_id, "failed", message=problem.detail, problem=problem.model_dump())
 
     def dismiss(self, job_id: str) -> JobRecord:
@@ -121,25 +121,24 @@ class Jobs:
             ):
                 return False
             job = _row(session, job_id)
-            subject: tables.MapVersion | tables.Survey | None = (
-                session.get(tables.MapVersion, job_id)
-                if job.survey_id is None
-                else session.get(tables.Survey, job.survey_id)
-            )
+            subject = _subject(session, job)
             if subject is not None:
                 subject.status = "ready" if status == "successful" else "failed"
                 subject.updated = instant
             return True
 
 
-def new_job(kind: JobKind, map_id: str, survey_id: str | None = None) -> tables.Job:
-    """A job that waits; the caller records it in the transaction of its map or survey."""
+def new_job(
+    kind: JobKind, map_id: str, survey_id: str | None = None, *, model: str | None = None
+) -> tables.Job:
+    """A job that waits; the caller records it in the transaction of its map, survey or model."""
     instant = now()
     return tables.Job(
         id=new_id("job"),
         kind=kind,
         map_id=map_id,
         survey_id=survey_id,
+        model=model,
         status="accepted",
         message="waiting",
         progress=0,
@@ -160,6 +159,7 @@ def job_record(row: tables.Job) -> JobRecord:
         kind=row.kind,
         map_id=row.map_id,
         survey_id=row.survey_id,
+        model=row.model,
         status=row.status,
         message=row.message,
         progress=row.progress,
@@ -169,6 +169,15 @@ def job_record(row: tables.Job) -> JobRecord:
         finished=row.finished,
         updated=row.updated,
     )
+
+
+def _subject(session: Session, job: tables.Job) -> tables.MapVersion | tables.Survey | tables.Model | None:
+    """What the job is there for; None where it was deleted since."""
+    if job.survey_id is not None:
+        return session.get(tables.Survey, job.survey_id)
+    if job.kind == "model":
+        return session.get(tables.Model, job.id)
+    return session.get(tables.MapVersion, job.id)
 
 
 def _row(session: Session, job_id: str) -> tables.Job:

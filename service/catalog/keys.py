@@ -80,6 +80,36 @@ def map_pairs(job_id: str, token: str) -> str:
     return f"{map_work(job_id)}pairs-{token}.json"
 
 
+def model_folder(job_id: str) -> str:
+    """The prefix of everything kept for a site's own model; `job_id` is that of the job that trains it."""
+    return f"models/{job_id}/"
+
+
+def model_weights(job_id: str) -> str:
+    """The weights that the model's card vouches for."""
+    return model_folder(job_id) + "weights.safetensors"
+
+
+def model_log(job_id: str) -> str:
+    """The log of the training, CSV, a row an epoch."""
+    return model_folder(job_id) + "epochs.csv"
+
+
+def model_work(job_id: str) -> str:
+    """The prefix of what a training remembers of itself while it lasts."""
+    return model_folder(job_id) + "work/"
+
+
+def model_tiles(job_id: str) -> str:
+    """The training set."""
+    return model_work(job_id) + "tiles.npz"
+
+
+def model_checkpoint(job_id: str, name: str) -> str:
+    """One of the files that a training goes on from."""
+    return model_work(job_id) + name
+
+
 def survey_folder(survey_id: str) -> str:
     """The prefix of everything kept for a survey."""
     return f"surveys/{survey_id}/"

@@ -95,13 +95,15 @@ class Maps:
         return self.get(map_id)
 
     def delete(self, map_id: str) -> None:
-        """Forget a map with its versions, surveys, jobs and files; the scans stay. Raises NotFound."""
+        """Forget a map with its versions, surveys, models, jobs and files; the scans stay. Raises NotFound."""
         versions = select(tables.MapVersion.job_id).where(tables.MapVersion.map_id == map_id)
         surveys = select(tables.Survey.id).where(tables.Survey.map_id == map_id)
+        models = select(tables.Model.job_id).where(tables.Model.map_id == map_id)
         with self._database.write() as session:
             row = map_row(session, map_id, lock=True)
             folders = [keys.map_folder(job_id) for job_id in session.scalars(versions)]
             folders += [keys.survey_folder(survey_id) for survey_id in session.scalars(surveys)]
+            folders += [keys.model_folder(job_id) for job_id in session.scalars(models)]
             session.delete(row)
         for folder in folders:
             self._blobs.delete_prefix(folder)

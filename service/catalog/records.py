@@ -11,6 +11,7 @@ from service.catalog.steps import JobKind
 
 JobStatus = Literal["accepted", "running", "successful", "failed", "dismissed"]
 MapStatus = Literal["building", "ready", "failed"]
+ModelStatus = Literal["training", "ready", "failed"]
 SurveyStatus = Literal["running", "ready", "failed"]
 TileState = Literal["unchanged", "changed", "inconsistent", "unobserved"]
 ScanFormat = Literal["ply", "pcd"]
@@ -180,6 +181,28 @@ class SurveyRecord(Record):
     updated: Utc
 
 
+class ModelRecord(Record):
+    """A model that is trained on a map, and is the site's own."""
+
+    name: str
+    version: int  #: 1, 2, ... of the name
+    status: ModelStatus
+    map_id: str
+    map_version: int  #: what it is trained on
+    base: str | None  #: the model that it goes on from; None: from nothing
+    minutes: float  #: of the training, at most
+    epochs: int | None  #: likewise; None: as many as the minutes allow
+    card: dict[str, Any] | None  #: None until it is ready; `worker.detectors.card` says what is in it
+    job_id: str  #: of the job that trains it, and so of its files (`keys.model_folder`)
+    created: Utc
+    updated: Utc
+
+    @property
+    def model(self) -> str:
+        """As requests name it."""
+        return f"{self.name}/{self.version}"
+
+
 class JobRecord(Record):
     """A job as clients see it."""
 
@@ -187,6 +210,7 @@ class JobRecord(Record):
     kind: JobKind
     map_id: str
     survey_id: str | None
+    model: str | None  #: `name/version` of the model that it trains
     status: JobStatus
     message: str  #: the stage
     progress: int = Field(ge=0, le=100)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 Queue = Literal["geometry", "inference"]
-JobKind = Literal["map", "survey"]
+JobKind = Literal["map", "survey", "model"]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -31,6 +31,11 @@ STEPS: dict[JobKind, tuple[Step, ...]] = {
         Step(name="register", function="worker.jobs.register_survey", queue="geometry"),
         Step(name="score", function="worker.jobs.score_survey", queue="inference"),
         Step(name="export", function="worker.jobs.export_survey", queue="geometry"),
+    ),
+    "model": (
+        Step(name="pack", function="worker.jobs.pack_tiles", queue="geometry"),
+        Step(name="train", function="worker.jobs.train_model", queue="inference"),
+        Step(name="finish", function="worker.jobs.finish_model", queue="inference"),
     ),
 }
 

@@ -209,6 +209,27 @@ class SurveyTile(Base):
     __table_args__ = (Index(None, "survey_id", "state", "score"),)
 
 
+class Model(Base):
+    """A model that was trained on a map, known by the job that trains it."""
+
+    __tablename__ = "models"
+
+    job_id: Mapped[str] = mapped_column(primary_key=True)
+    map_id: Mapped[str] = mapped_column(ForeignKey("maps.id", ondelete="CASCADE"), index=True)
+    map_version: Mapped[int]
+    name: Mapped[str]
+    number: Mapped[int]
+    status: Mapped[str]
+    base: Mapped[str | None]
+    minutes: Mapped[float]
+    epochs: Mapped[int | None]
+    card: Mapped[dict[str, Any] | None]
+    created: Mapped[datetime]
+    updated: Mapped[datetime]
+
+    __table_args__ = (UniqueConstraint("name", "number"),)
+
+
 class Job(Base):
     """A job as clients see it; the queue's own record is never asked."""
 
@@ -218,6 +239,7 @@ class Job(Base):
     kind: Mapped[str]
     map_id: Mapped[str] = mapped_column(ForeignKey("maps.id", ondelete="CASCADE"), index=True)
     survey_id: Mapped[str | None] = mapped_column(ForeignKey("surveys.id", ondelete="CASCADE"), index=True)
+    model: Mapped[str | None]
     status: Mapped[str] = mapped_column(index=True)
     message: Mapped[str]
     progress: Mapped[int]

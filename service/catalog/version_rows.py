@@ -135,7 +135,7 @@ def kept_scans(base: tables.MapVersion) -> list[ScanOutcome]:
 
 
 def check_deletable(session: Session, row: tables.MapVersion) -> None:
-    """Raises Conflict for the version in use, one that builds, and one that a survey is being compared with."""
+    """Raises Conflict for the version in use, one that builds, and one that a survey or a model needs meanwhile."""
     name = f"version {row.number} of map {row.map_id!r}"
     if row.status == "building":
         raise Conflict(f"{name} is still building; dismiss job {row.job_id} first")
@@ -148,6 +148,13 @@ def check_deletable(session: Session, row: tables.MapVersion) -> None:
     )
     if session.scalar(select(compared)):
         raise Conflict(f"a survey is being compared with {name}; wait for it, or dismiss its job")
+    trained = exists().where(
+        tables.Model.map_id == row.map_id,
+        tables.Model.map_version == row.number,
+        tables.Model.status == "training",
+    )
+    if session.scalar(select(trained)):
+        raise Conflict(f"a model is being trained on {name}; wait for it, or dismiss its job")
 
 
 def forget(session: Session, row: tables.MapVersion) -> None:

@@ -1,4 +1,4 @@
-"""`spicd jobs` and `spicd models`."""
+"""`spicd jobs`."""
 
 from __future__ import annotations
 
@@ -17,9 +17,8 @@ _STYLES = {"successful": "green", "failed": "red", "dismissed": "yellow", "runni
 
 
 def register(commands: typer.Typer) -> None:
-    """Add `jobs` and `models` to the command line."""
+    """Add `jobs` to the command line."""
     commands.command("jobs")(jobs)
-    commands.command("models")(models)
 
 
 def jobs(
@@ -42,14 +41,6 @@ def jobs(
         else:
             job = terminal.wait(client, job_id) if wait else client.job(job_id)
     terminal.show(job, lambda: _whole(job))
-
-
-def models(ctx: typer.Context) -> None:
-    """The models that can score tiles."""
-    terminal: Terminal = ctx.obj
-    with terminal.client() as client:
-        found = client.models()
-    terminal.show(found, lambda: _model_table(found))
 
 
 def _table(found: list[Document]) -> Table:
@@ -82,13 +73,3 @@ def _whole(job: Document) -> Group:
     )
     problem = job.get("problem")
     return Group(about, Text(sentence(problem), style="red")) if problem else Group(about)
-
-
-def _model_table(cards: list[Document]) -> Table:
-    table = columns("model", "detector", "threshold", "summary")
-    for card in cards:
-        name = f"{card.get('name')}/{card.get('version')}"
-        table.add_row(
-            name, str(card.get("detector", "")), str(card.get("threshold", "")), str(card.get("summary", ""))
-        )
-    return table

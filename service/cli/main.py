@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from service.cli import jobs, maps, scans, surveys, up, versions
+from service.cli import jobs, maps, models, scans, surveys, up, versions
 from service.cli.terminal import Terminal
 from service.client import DEFAULT_URL, ClientError
 from service.embedded_redis import LaunchFailed
@@ -35,7 +35,7 @@ def _commands() -> typer.Typer:
         help="Says what changed in a building: LiDAR scans in, changed tiles out.",
     )
     commands.callback()(_options)
-    for part in (up, scans, maps, versions, surveys, jobs):
+    for part in (up, scans, maps, versions, surveys, jobs, models):
         part.register(commands)
     return commands
 

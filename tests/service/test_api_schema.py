@@ -59,6 +59,7 @@ def test_every_call_of_the_public_api_is_described(document):
         "DELETE /maps/{map_id}/versions/{number}",
         "GET /maps/{map_id}/versions/{number}/manifest",
         "GET /maps/{map_id}/versions/{number}/cloud.ply",
+        "POST /maps/{map_id}/models",
         "POST /maps/{map_id}/surveys",
         "GET /maps/{map_id}/surveys",
         "GET /maps/{map_id}/changes",

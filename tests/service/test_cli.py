@@ -364,6 +364,28 @@ def test_jobs_lists_and_models_lists(service: Service, capsys: pytest.CaptureFix
     assert "spicd-net/1" in capsys.readouterr().out
 
 
+def test_models_train_names_the_model_and_its_job(
+    service: Service, capsys: pytest.CaptureFixture[str]
+) -> None:
+    service.on("POST /maps/lobby/models", {"model": "lobby-net/1", "job_id": "job-1"}, status=202)
+    assert spicd("models", "train", "lobby", "--base", "spicd-net/1", "--minutes", "3") == 0
+    out = capsys.readouterr().out
+    assert "lobby-net/1" in out
+    assert "job-1" in out
+
+
+def test_models_train_with_wait_shows_what_was_measured(
+    service: Service, capsys: pytest.CaptureFixture[str]
+) -> None:
+    service.on("POST /maps/lobby/models", {"model": "lobby-net/1", "job_id": "job-1"}, status=202)
+    service.on("GET /jobs/job-1", job("successful", 100))
+    measured = {"area_under_roc": 0.91, "precision": 0.5, "recall": 0.6, "f1": 0.55}
+    card = {"name": "lobby-net", "version": "1", "threshold": 0.3, "evaluation": {"validation": measured}}
+    service.on("GET /models/lobby-net", card)
+    assert spicd("models", "train", "lobby", "--wait") == 0
+    assert "0.91" in capsys.readouterr().out
+
+
 def test_maps_delete_says_so(service: Service, capsys: pytest.CaptureFixture[str]) -> None:
     service.on("DELETE /maps/lobby", None, status=204)
     assert spicd("maps", "delete", "lobby") == 0

@@ -31,11 +31,17 @@ def open_detector(model_store: Path, name: str = "spicd-net/1", device: Device =
     the card, or the device is not there.
     """
     card = open_card(model_store, name)
+    return make_detector(card, _weights_file(_folder(model_store, name), card), device)
+
+
+def make_detector(card: Card, content: bytes | None, device: Device = "auto") -> Detector:
+    """The detector of a card and of the bytes of its weights file, None where it has none. Raises DetectorUnavailable."""
+    name = f"{card.name}/{card.version}"
     if card.detector not in DETECTORS:
         raise DetectorUnavailable(
             f"model {name}: no detector {card.detector!r}; there are {sorted(DETECTORS)}"
         )
-    weights = _read_weights(_folder(model_store, name), card)
+    weights = {} if content is None else _checked_weights(name, card, content)
     try:
         return DETECTORS[card.detector](card, weights, resolve_device(device))
     except (RuntimeError, ValueError) as unsound:
@@ -76,20 +82,23 @@ def _folder(model_store: Path, name: str) -> Path:
     return model_store / parts[0] / parts[1]
 
 
-def _read_weights(folder: Path, card: Card) -> Weights:
+def _weights_file(folder: Path, card: Card) -> bytes | None:
     """The weights named by the card, read once so that what is hashed is what is loaded."""
     if card.weights is None:
-        return {}
+        return None
     path = folder / card.weights
     try:
-        content = path.read_bytes()
+        return path.read_bytes()
     except OSError as missing:
         raise DetectorUnavailable(f"no weights at {path}: {missing.strerror}") from missing
+
+
+def _checked_weights(name: str, card: Card, content: bytes) -> Weights:
     found = hashlib.sha256(content).hexdigest()
     if found != card.sha256:
-        raise DetectorUnavailable(f"{path} has sha256 {found}, its card says {card.sha256}")
+        raise DetectorUnavailable(f"the weights of {name} have sha256 {found}, its card says {card.sha256}")
     try:
         weights: Weights = load(content)
     except SafetensorError as unsound:
-        raise DetectorUnavailable(f"{path} is no safetensors file: {unsound}") from unsound
+        raise DetectorUnavailable(f"the weights of {name} are no safetensors file: {unsound}") from unsound
     return weights

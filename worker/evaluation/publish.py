@@ -61,12 +61,13 @@ def publish(
     name: str = "spicd-net",
     about: Mapping[str, Any] | None = None,
     beside: Mapping[str, SpicdNet] | None = None,
+    preprocessing: Preprocessing | None = None,
 ) -> Path:
     """Write `model_store/<name>/<version>/`, its threshold chosen on the validation tiles; returns the folder.
 
     `unseen` is a training set of other buildings, on which the card's evaluation is measured; without one
     the validation tiles serve for that too, and the card says so. `about` adds to what the card says of the
-    training; `beside` are other detectors by name, measured on the validation pairs at their own thresholds.
+    training; `beside` are other detectors by name, measured on the validation pairs at their own thresholds. `preprocessing` is the paper's where it is left out.
     """
     state = torch.load(checkpoint, map_location="cpu", weights_only=True)
     settings, training_set = state["settings"], load_tiles(tiles)
@@ -77,7 +78,8 @@ def publish(
         detector="spicd-net",
         summary=summary,
         threshold=0.5,
-        preprocessing=Preprocessing(
+        preprocessing=preprocessing
+        or Preprocessing(
             voxel_size=VOXEL_SIZE,
             tile_size=training_set.tile_size,
             patch_points=settings["pairs"]["patch_points"],

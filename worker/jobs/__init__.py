@@ -6,5 +6,15 @@ an earlier run of itself left. A step of a job that has ended does nothing.
 
 from worker.jobs.maps import describe_map, register_map
 from worker.jobs.surveys import export_survey, register_survey, score_survey
+from worker.jobs.training import finish_model, pack_tiles, train_model
 
-__all__ = ["describe_map", "export_survey", "register_map", "register_survey", "score_survey"]
+__all__ = [
+    "describe_map",
+    "export_survey",
+    "finish_model",
+    "pack_tiles",
+    "register_map",
+    "register_survey",
+    "score_survey",
+    "train_model",
+]

@@ -7,8 +7,7 @@ import json
 from service.catalog import keys
 from service.catalog.records import Bounds
 from worker.detectors.card import Preprocessing
-from worker.detectors.store import open_card
-from worker.jobs.models import kept_detector, pipeline_settings
+from worker.jobs.models import card_of, kept_detector, pipeline_settings
 from worker.jobs.step import Context, put, step
 from worker.jobs.versions import make_version
 from worker.pipeline import archive
@@ -22,7 +21,7 @@ from worker.pipeline.values import Points
 def register_map(at: Context) -> None:
     """Scans to a fused, tiled map: the first version of it, or a later one."""
     version = at.catalog.versions.of_job(at.job.job_id)
-    card = open_card(at.settings.model_store, version.model)
+    card = card_of(at, version.model)
     made = make_version(at, version, pipeline_settings(at, version, card))
     _put_map(at, made.built, card.preprocessing)
     at.catalog.versions.save_result(
@@ -44,7 +43,7 @@ def register_map(at: Context) -> None:
 def describe_map(at: Context) -> None:
     """What the model can know of the reference alone; then the map is ready."""
     version = at.catalog.versions.of_job(at.job.job_id)
-    detector = kept_detector(at.settings, version.model)
+    detector = kept_detector(at, version.model)
     with at.catalog.blobs.local(keys.map_tiles(at.job.job_id)) as path:
         tiles = archive.load_tiles(path)
     description = detector.describe(tiles, progress=lambda _, share: at.report("describing", share))

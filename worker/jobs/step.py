@@ -12,6 +12,7 @@ from tempfile import TemporaryDirectory
 
 from service.catalog.catalog import Catalog, open_catalog
 from service.catalog.records import JobRecord, Problem
+from service.catalog.steps import JobKind
 from service.settings import Settings
 from worker.errors import Cancelled, PipelineError
 from worker.reporting import Reporter
@@ -35,6 +36,17 @@ SURVEY_STAGES = {
     "saving": (0.52, 0.55),
     "scoring": (0.55, 0.8),
     "exporting": (0.8, 1.0),
+}
+MODEL_STAGES = {
+    "packing": (0.0, 0.05),
+    "training": (0.05, 0.92),
+    "calibrating": (0.92, 0.96),
+    "describing": (0.96, 1.0),
+}
+STAGES: dict[JobKind, dict[str, tuple[float, float]]] = {
+    "map": MAP_STAGES,
+    "survey": SURVEY_STAGES,
+    "model": MODEL_STAGES,
 }
 
 
@@ -66,7 +78,7 @@ def step(run: Callable[[Context], None]) -> Callable[[str], None]:
             folder.mkdir(parents=True, exist_ok=True)
             scratch = Path(stack.enter_context(TemporaryDirectory(prefix="spicd-step-", dir=folder)))
             report = Reporter(
-                MAP_STAGES if job.kind == "map" else SURVEY_STAGES,
+                STAGES[job.kind],
                 lambda stage, share: catalog.jobs.report(job_id, message=stage, progress=share),
             )
             try:

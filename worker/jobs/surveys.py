@@ -8,8 +8,7 @@ from dataclasses import asdict
 
 from service.catalog import keys
 from service.catalog.records import Bounds, TileRecord
-from worker.detectors.store import open_card
-from worker.jobs.models import card_that_fits, kept_detector, pipeline_settings
+from worker.jobs.models import card_of, card_that_fits, kept_detector, pipeline_settings
 from worker.jobs.scans import save_scans, scan_files, scan_outcomes
 from worker.jobs.step import Context, put, step
 from worker.pipeline import archive
@@ -26,7 +25,7 @@ def register_survey(at: Context) -> None:
     survey_id = _survey_id(at)
     survey = at.catalog.surveys.get(survey_id)
     record = at.catalog.versions.get(survey.map_id, survey.map_version)
-    card = card_that_fits(at.settings, survey.model, record.model)
+    card = card_that_fits(at, survey.model, record.model)
     with ExitStack() as stack:
         blobs = at.catalog.blobs
         reference = archive.load_reference(
@@ -52,7 +51,7 @@ def score_survey(at: Context) -> None:
     """Paired tiles to class probabilities."""
     survey_id = _survey_id(at)
     survey = at.catalog.surveys.get(survey_id)
-    detector = kept_detector(at.settings, survey.model)
+    detector = kept_detector(at, survey.model)
     blobs = at.catalog.blobs
     with blobs.local(keys.survey_pairs(survey_id)) as path:
         pairs = archive.load_pairs(path)
@@ -81,7 +80,7 @@ def export_survey(at: Context) -> None:
         current = archive.load_current(local(keys.survey_current(survey_id)))
         built_by = at.catalog.versions.get(survey.map_id, survey.map_version).job_id
         reference = archive.load_reference(local(keys.map_reference(built_by)))
-    card = open_card(at.settings.model_store, survey.model)
+    card = card_of(at, survey.model)
     threshold = card.threshold if survey.threshold is None else survey.threshold
     changes = decide(pairs, scores, threshold=threshold)
     put(at, keys.survey_cloud(survey_id), lambda path: write_coloured_cloud(path, current, changes))

@@ -49,6 +49,10 @@ class SpicdNet:
         network.load_state_dict(weights)
         return cls(card, network, device)
 
+    def weights(self) -> dict[str, Tensor]:
+        """What `load` takes, to train further from."""
+        return dict(self._network.state_dict())
+
     def describe(self, tiles: Tiles, *, progress: Progress = silent) -> Arrays:
         """`descriptors` (T, 1024) float32 and `samples` (T, 128, 3) float32, metres, tile-centre frame."""
         indices = np.arange(len(tiles.points))

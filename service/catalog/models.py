@@ -1,0 +1,133 @@
+"""Models that a site trains on its own maps; those that come with a release lie in the model store."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from typing import Any
+
+from sqlalchemy import delete, func, select
+from sqlalchemy.exc import IntegrityError
+from sqlalchemy.orm import Session
+
+from service.catalog import tables
+from service.catalog.clock import now
+from service.catalog.database import Database
+from service.catalog.jobs import job_record, new_job
+from service.catalog.records import JobRecord, ModelRecord
+from service.catalog.version_rows import current_row, map_row
+from service.errors import Conflict, NotFound
+
+
+class Models:
+    """The models of the catalog, each by its name and number."""
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+
+    def create(
+        self,
+        map_id: str,
+        *,
+        minutes: float,
+        name: str | None = None,
+        base: str | None = None,
+        epochs: int | None = None,
+    ) -> tuple[ModelRecord, JobRecord]:
+        """Record a model of a map's version in use, and its job; the next number of its name.
+
+        Raises NotFound and NotReady (the map), and Conflict where the same name is taken at this moment.
+        """
+        name = name or name_for(map_id)
+        try:
+            with self._database.write() as session:
+                map_row(session, map_id, lock=True)  # nobody deletes the version meanwhile
+                version = current_row(session, map_id)
+                number = _next_number(session, name)
+                job = new_job("model", map_id, model=f"{name}/{number}")
+                row = tables.Model(
+                    job_id=job.id,
+                    map_id=map_id,
+                    map_version=version.number,
+                    name=name,
+                    number=number,
+                    status="training",
+                    base=base,
+                    minutes=minutes,
+                    epochs=epochs,
+                    created=job.created,
+                    updated=job.created,
+                )
+                session.add_all([row, job])
+                session.flush()
+                return _record(row), job_record(job)
+        except IntegrityError as error:
+            raise Conflict(f"another training took the name {name!r} just now; try again") from error
+
+    def find(self, name: str, version: int | None = None) -> ModelRecord | None:
+        """One model in whatever state, by default the newest that is ready, else the newest; None if there is none."""
+        query = select(tables.Model).where(tables.Model.name == name)
+        if version is not None:
+            query = query.where(tables.Model.number == version)
+        query = query.order_by(tables.Model.status != "ready", tables.Model.number.desc()).limit(1)
+        with self._database.read() as session:
+            row = session.scalar(query)
+            return None if row is None else _record(row)
+
+    def of_job(self, job_id: str) -> ModelRecord:
+        """The model that a job trains. Raises NotFound, also where it was deleted since."""
+        with self._database.read() as session:
+            return _record(_row(session, job_id))
+
+    def ready(self) -> tuple[ModelRecord, ...]:
+        """Every model that can score, by name, the newest of each first."""
+        query = select(tables.Model).where(tables.Model.status == "ready")
+        with self._database.read() as session:
+            rows = session.scalars(query.order_by(tables.Model.name, tables.Model.number.desc()))
+            return tuple(_record(row) for row in rows)
+
+    def save_card(self, job_id: str, card: Mapping[str, Any]) -> None:
+        """Record what was made, replacing an earlier run's card; `jobs.succeed` makes it ready. Raises NotFound."""
+        with self._database.write() as session:
+            row = _row(session, job_id)
+            row.card = dict(card)
+            row.updated = now()
+
+    def take_back(self, job_id: str) -> None:
+        """Forget a model whose job never reached the queue."""
+        with self._database.write() as session:
+            session.execute(delete(tables.Job).where(tables.Job.id == job_id))
+            session.delete(_row(session, job_id))
+
+
+def name_for(map_id: str) -> str:
+    """The name of a map's models where none was given: `lobby-net`."""
+    return f"{re.sub('^[^A-Za-z0-9]+', '', map_id)[:60] or 'site'}-net"
+
+
+def _next_number(session: Session, name: str) -> int:
+    return 1 + (session.scalar(select(func.max(tables.Model.number)).where(tables.Model.name == name)) or 0)
+
+
+def _row(session: Session, job_id: str) -> tables.Model:
+    row = session.get(tables.Model, job_id)
+    if row is None:
+        raise NotFound(f"job {job_id!r} trains no model, or it was deleted since")
+    return row
+
+
+def _record(row: tables.Model) -> ModelRecord:
+    return ModelRecord(
+        name=row.name,
+        version=row.number,
+        status=row.status,
+        map_id=row.map_id,
+        map_version=row.map_version,
+        base=row.base,
+        minutes=row.minutes,
+        epochs=row.epochs,
+        card=row.card,
+        job_id=row.job_id,
+        created=row.created,
+        updated=row.updated,
+    )

@@ -1,0 +1,164 @@
+"""Models: of the release, and the site's own, trained on a map."""
+
+from __future__ import annotations
+
+import pytest
+from samples import MODEL, add_map, add_scan, add_version
+
+from service.catalog import keys
+from service.catalog.records import Problem
+from service.errors import Conflict
+
+CARD = {"name": "lobby-net", "version": "1", "threshold": 0.3}
+
+
+def post(client, map_id="lobby", **body):
+    return client.post(f"/maps/{map_id}/models", json=body)
+
+
+def add_model(catalog, *, ready=True, name=None):
+    """A model of the map `lobby`, trained or not; its job's id."""
+    record, job = catalog.models.create("lobby", minutes=5, name=name)
+    if ready:
+        catalog.models.save_card(job.job_id, {**CARD, "name": record.name, "version": str(record.version)})
+        catalog.jobs.succeed(job.job_id)
+    return job.job_id
+
+
+def code(answer):
+    return answer.json()["type"].rsplit(":", 1)[1]
+
+
+def test_a_training_is_recorded_and_handed_to_the_queue(client, catalog, queue):
+    add_map(catalog)
+    answer = post(client, base=MODEL, minutes=3, epochs=7)
+    assert answer.status_code == 202
+    accepted = answer.json()
+    assert answer.headers["location"] == f"/jobs/{accepted['job_id']}"
+    assert queue.submitted == [(accepted["job_id"], "model")]
+    assert (accepted["model"], accepted["map_version"], accepted["status"]) == ("lobby-net/1", 1, "training")
+    job = client.get(f"/jobs/{accepted['job_id']}").json()
+    assert (job["processID"], job["map_id"], job["model"]) == ("model", "lobby", "lobby-net/1")
+    kept = catalog.models.of_job(accepted["job_id"])
+    assert (kept.base, kept.minutes, kept.epochs) == (MODEL, 3, 7)
+
+
+def test_versions_of_a_name_are_counted_and_names_may_be_given(client, catalog):
+    add_map(catalog)
+    models = [post(client, **body).json()["model"] for body in ({}, {}, {"name": "night"})]
+    assert models == ["lobby-net/1", "lobby-net/2", "night/1"]
+
+
+def test_what_is_left_out_is_from_nothing_and_takes_the_services_minutes(client, catalog, settings):
+    add_map(catalog)
+    kept = catalog.models.of_job(post(client).json()["job_id"])
+    assert (kept.base, kept.minutes, kept.epochs) == (None, settings.training_minutes, None)
+
+
+@pytest.mark.parametrize("timeout_s", [3600, 600])
+def test_a_training_ends_before_its_step_is_stopped(client, catalog, settings, timeout_s):
+    add_map(catalog)
+    given = settings.model_copy(update={"job_timeout_s": timeout_s})
+    most = {3600: 40, 600: 8}[timeout_s]
+    assert given.most_training_minutes() == most
+    assert most * 60 < timeout_s
+    answer = post(client, minutes=40.5)
+    assert (answer.status_code, code(answer)) == (422, "bad_request")
+    assert "at most 40" in answer.json()["detail"]
+
+
+@pytest.mark.parametrize(
+    ("body", "problem"),
+    [
+        ({"base": "spicd-net/9"}, "bad_request"),
+        ({"name": "spicd-net"}, "conflict"),
+        ({"name": "a/b"}, "invalid_request"),
+        ({"minutes": 0}, "invalid_request"),
+        ({"labels": []}, "invalid_request"),
+    ],
+)
+def test_a_request_that_cannot_be_met_leaves_nothing(client, catalog, queue, body, problem):
+    add_map(catalog)
+    assert code(post(client, **body)) == problem
+    assert queue.submitted == []
+    assert catalog.models.find("lobby-net") is None
+
+
+def test_a_map_that_is_not_there_or_not_ready_is_not_trained_on(client, catalog):
+    assert code(post(client)) == "not_found"
+    add_map(catalog, ready=False)
+    assert code(post(client)) == "not_ready"
+
+
+def test_without_a_queue_nothing_is_recorded(client, catalog, queue):
+    add_map(catalog)
+    queue.down = True
+    assert code(post(client)) == "queue_unavailable"
+    assert catalog.models.find("lobby-net") is None
+    assert [job.kind for job in catalog.jobs.page().items] == ["map"]
+
+
+def test_a_trained_model_stands_among_the_models_and_may_be_named_by_surveys_and_trainings(client, catalog):
+    add_map(catalog)
+    job_id = add_model(catalog)
+    assert [card["name"] for card in client.get("/models").json()["models"]] == ["spicd-net", "lobby-net"]
+    assert client.get("/models/lobby-net").json() == CARD
+    (_, result) = client.get(f"/jobs/{job_id}").json()["links"]
+    assert result["href"] == "/models/lobby-net?version=1"
+    assert client.get(result["href"]).json() == CARD
+    survey = {"scan_ids": [add_scan(catalog, "tuesday").scan_id], "model": "lobby-net/1"}
+    assert client.post("/maps/lobby/surveys", json=survey).status_code == 202
+    assert post(client, base="lobby-net/1").json()["model"] == "lobby-net/2"
+
+
+def test_a_model_in_training_or_one_that_failed_is_not_ready(client, catalog):
+    add_map(catalog)
+    job_id = add_model(catalog, ready=False)
+    survey = {"scan_ids": [add_scan(catalog, "tuesday").scan_id], "model": "lobby-net/1"}
+    for word in ("still in training", "was not made"):
+        for answer in (client.get("/models/lobby-net"), client.post("/maps/lobby/surveys", json=survey)):
+            assert (answer.status_code, code(answer)) == (409, "not_ready")
+            assert word in answer.json()["detail"]
+            assert job_id in answer.json()["detail"]
+        catalog.jobs.fail(job_id, Problem(code="training_failed", detail="the map has 2 tiles"))
+    assert [card["name"] for card in client.get("/models").json()["models"]] == ["spicd-net"]
+
+
+def test_the_newest_version_that_is_ready_is_shown_where_none_is_named(client, catalog):
+    add_map(catalog)
+    for _ in range(2):
+        add_model(catalog)
+    add_model(catalog, ready=False)
+    assert client.get("/models/lobby-net").json()["version"] == "2"
+    assert client.get("/models/lobby-net", params={"version": "1"}).json()["version"] == "1"
+    for version in ("4", "x", "0"):
+        assert code(client.get("/models/lobby-net", params={"version": version})) == "not_found"
+
+
+def test_maps_are_cut_for_models_of_the_release(client, catalog):
+    add_map(catalog)
+    add_model(catalog)
+    answer = client.post("/maps", json={"scan_ids": [add_scan(catalog).scan_id], "model": "lobby-net/1"})
+    assert code(answer) == "bad_request"
+
+
+def test_a_model_goes_with_its_map(client, catalog, queue):
+    add_map(catalog)
+    done = add_model(catalog)
+    running = add_model(catalog, ready=False)
+    catalog.blobs.put_bytes(keys.model_weights(done), b"weights")
+    assert client.delete("/maps/lobby").status_code == 204
+    assert (running, "model") in queue.dismissed
+    assert catalog.models.ready() == ()
+    assert not catalog.blobs.exists(keys.model_weights(done))
+
+
+def test_a_version_that_a_model_is_trained_on_stays(catalog):
+    add_map(catalog)
+    job_id = add_model(catalog, ready=False)
+    add_version(catalog)
+    with pytest.raises(Conflict, match="a model is being trained on version 1"):
+        catalog.versions.delete("lobby", 1)
+    catalog.jobs.dismiss(job_id)
+    catalog.versions.delete("lobby", 1)
+    assert [found.version for found in catalog.versions.page("lobby").items] == [2]
