@@ -33,5 +33,5 @@ def open_measured(model_store: Path, model: str, weights: Path | None) -> Detect
         return SpicdNet.load(card, state["network"], resolve_device("auto"))
     except OSError as missing:
         raise DetectorUnavailable(f"no checkpoint at {weights}: {missing.strerror}") from missing
-    except (KeyError, TypeError, RuntimeError, pickle.UnpicklingError) as unsound:
+    except (KeyError, TypeError, EOFError, RuntimeError, pickle.UnpicklingError) as unsound:
         raise DetectorUnavailable(f"{weights} is no checkpoint of spicd-worker train: {unsound}") from unsound

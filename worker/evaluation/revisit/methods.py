@@ -9,13 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from worker.detectors.detector import Detector
-from worker.detectors.spicd_net.detector import SpicdNet
-from worker.detectors.store import open_card, open_detector, resolve_device
-from worker.errors import DetectorUnavailable
+from worker.detectors.store import open_detector
+from worker.evaluation.paper.measured import open_measured
 from worker.evaluation.revisit.record import Revisit
 from worker.pipeline.tiling import TilePairs, Tiles
 from worker.pipeline.values import Arrays
@@ -78,16 +76,9 @@ def opened(model_store: Path, model: str) -> Method:
 def from_checkpoint(path: Path, model_store: Path, model: str) -> Method:
     """SPICD-Net with the weights of a checkpoint of `spicd-worker train`; what else it needs is on the model's card.
 
-    Raises DetectorUnavailable where the file is no such checkpoint, OSError where there is none.
+    Raises DetectorUnavailable where the file is no such checkpoint, or there is none.
     """
-    card = open_card(model_store, model)
-    try:
-        network = torch.load(path, map_location="cpu", weights_only=True)["network"]
-        detector = SpicdNet.load(card, network, resolve_device("auto"))
-    except OSError:
-        raise
-    except Exception as unsound:  # torch raises whatever the bytes lead it to
-        raise DetectorUnavailable(f"{path} is no checkpoint of SPICD-Net: {unsound}") from unsound
+    detector = open_measured(model_store, model, path)
     return Method(name="/".join(path.parts[-2:]), score=DetectorScore(detector=detector))
 
 

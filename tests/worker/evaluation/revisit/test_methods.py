@@ -28,7 +28,8 @@ def test_a_checkpoint_scores_with_its_own_weights_and_states_no_threshold(tmp_pa
     path = tmp_path / "run" / "best.pt"
     path.parent.mkdir()
     torch.manual_seed(1)
-    torch.save({"network": SpicdNetwork().state_dict(), "epochs": 3}, path)
+    settings = {"pairs": {"patch_points": 1024}, "seed": 7}
+    torch.save({"network": SpicdNetwork().state_dict(), "settings": settings}, path)
     method = from_checkpoint(path, MODEL_STORE, MODEL)
     assert (method.name, method.stated) == ("run/best.pt", None)
     pairs = walked["sparse"].pairs  # the one with the fewest tiles to score
@@ -64,13 +65,14 @@ def test_what_is_no_checkpoint_is_named(tmp_path: Path, content: bytes):
 
 
 def test_a_checkpoint_of_another_network_is_named(tmp_path: Path):
-    torch.save({"network": {"weight": torch.zeros(1)}}, tmp_path / "other.pt")
-    with pytest.raises(DetectorUnavailable, match="other"):
+    settings = {"pairs": {"patch_points": 1024}, "seed": 7}
+    torch.save({"network": {"weight": torch.zeros(1)}, "settings": settings}, tmp_path / "other.pt")
+    with pytest.raises(DetectorUnavailable, match="no checkpoint of spicd-worker train"):
         from_checkpoint(tmp_path / "other.pt", MODEL_STORE, MODEL)
 
 
-def test_a_missing_checkpoint_is_an_error_of_the_file(tmp_path: Path):
-    with pytest.raises(FileNotFoundError):
+def test_a_missing_checkpoint_is_named(tmp_path: Path):
+    with pytest.raises(DetectorUnavailable, match=r"no checkpoint at .*none\.pt"):
         from_checkpoint(tmp_path / "none.pt", MODEL_STORE, MODEL)
 
 
