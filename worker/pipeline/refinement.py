@@ -29,7 +29,7 @@ _NEIGHBOURS = 6  # that a scan is refined against
 #: So many count as one; set so that errors of simulated scans are of the size that is told.
 CORRELATED = 100.0
 #: What no number of points takes away: the range bias of a scan. One sigma, metres and radians.
-FLOOR = Uncertainty(translation=0.004, rotation=0.0005)
+FLOOR = Uncertainty(translation=0.008, rotation=0.0005)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
