@@ -16,7 +16,7 @@ from worker.pipeline.registration_settings import RegistrationSettings
 from worker.pipeline.rough import REACH, best_rough, rough_pose
 from worker.pipeline.values import Matrix4
 
-_ENOUGH = 10_000  # points for the last gate; more of them cost time and move a pose by less than a millimetre
+_ENOUGH = 10_000  # points for the last gate: candidates are told apart by so many
 _PLANS = 12  # places that the plans name
 _BEST_PLANS = 4  # of those that get a full ICP
 _WORTH = 0.3  # rough score of a candidate from features that does; right ones have 0.5 and more
