@@ -22,7 +22,7 @@ from worker.pipeline import archive
 from worker.pipeline.placement import RegisteredScan
 from worker.reporting import Reporter
 from worker.training.dataset import TileSet, load_tiles
-from worker.training.trainer import LOG
+from worker.training.log import LOG
 
 TINY = replace(training.SITE, batch=8, train_pairs=16, validation_pairs=8)
 

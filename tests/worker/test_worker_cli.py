@@ -19,7 +19,7 @@ from worker.pipeline.pcd import write_pcd
 from worker.pipeline.scan import read_scan
 from worker.progress import Progress
 from worker.training.dataset import TileSet, load_tiles, save_tiles
-from worker.training.trainer import PAPER, TrainSettings
+from worker.training.settings import PAPER, TrainSettings
 
 
 @pytest.fixture(scope="module")

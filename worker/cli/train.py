@@ -60,7 +60,7 @@ def train(
 
     from worker.detectors.store import resolve_device  # noqa: PLC0415
     from worker.evaluation.training_curves import draw_curves  # noqa: PLC0415
-    from worker.training.trainer import PAPER, TrainSettings  # noqa: PLC0415
+    from worker.training.settings import PAPER, TrainSettings  # noqa: PLC0415
     from worker.training.trainer import train as run  # noqa: PLC0415
 
     if threads is not None:

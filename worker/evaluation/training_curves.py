@@ -9,12 +9,12 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from worker.training.trainer import LOG
+from worker.training.log import LOG
 
 CURVES = "curves.png"
 TRAINING, VALIDATION = "#1565c0", "#ef6c00"
 
-Log = list[dict[str, float]]  #: a row an epoch, columns as in `worker.training.trainer.EpochRow`
+Log = list[dict[str, float]]  #: a row an epoch, columns as in `worker.training.log.EpochRow`
 
 
 def draw_curves(folder: Path) -> None:

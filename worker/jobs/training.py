@@ -25,8 +25,10 @@ from worker.jobs.tile_sets import halves, held_out_share, training_set
 from worker.pipeline import archive
 from worker.pipeline.placement import RegisteredScan
 from worker.training.dataset import load_tiles, save_tiles
+from worker.training.log import LOG
 from worker.training.pairs import PairSettings
-from worker.training.trainer import BEST, CHECKPOINT, LOG, TrainSettings, train
+from worker.training.settings import TrainSettings
+from worker.training.trainer import BEST, CHECKPOINT, train
 
 #: An epoch is short, for a training goes on from the last one that is complete. Changes as in the shipped model.
 SITE = TrainSettings(

@@ -13,7 +13,8 @@ from typing import Any
 
 import torch
 
-from worker.training.trainer import PAPER, TrainSettings, train
+from worker.training.settings import PAPER, TrainSettings
+from worker.training.trainer import train
 
 #: Options by the settings that they are fields of.
 RUN = ("epochs", "minutes", "train_pairs", "validation_pairs", "batch", "start_from", "learning_rate")

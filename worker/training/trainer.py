@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import csv
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,72 +17,15 @@ from worker.detectors.spicd_net.layers import PooledLinear
 from worker.detectors.spicd_net.network import PairOutput, SpicdNetwork
 from worker.progress import Progress, silent
 from worker.training.dataset import TileSet, load_tiles, split_tiles
+from worker.training.log import EpochRow, append_row, by_class, cut_log
 from worker.training.losses import total_loss
 from worker.training.metrics import Measured, measured
-from worker.training.pairs import PAPER_PAIRS, Batch, PairMaker, PairSettings
+from worker.training.pairs import Batch, PairMaker
 from worker.training.prefetch import prefetched
-from worker.training.schedule import Schedule
+from worker.training.settings import TrainSettings, whole
 
 SETTLING_PAIRS = 128  #: that the head is initialised by
-CHECKPOINT, BEST, LOG = "last.pt", "best.pt", "epochs.csv"
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class TrainSettings:
-    """The paper's values, but for `minutes`."""
-
-    epochs: int = 1000
-    minutes: float | None = None  #: wall clock of the whole run, resumed parts included; None: epochs alone
-    patience: int = 100  #: epochs without a better checkpoint
-    batch: int = 16  #: pairs
-    train_pairs: int = 2000  #: an epoch
-    validation_pairs: int = 500
-    learning_rate: float = 1e-3
-    final_learning_rate: float = 1e-5
-    weight_decay: float = 1e-4
-    held_out: float = 0.1  #: share of the tiles
-    seed: int = 42
-    start_from: str | None = (
-        None  #: what network is trained on, with a fresh optimiser: a checkpoint, or as said with `start`
-    )
-    settle_head: bool = True  #: ours: the head's first layers start as if their inputs were standardised
-    device: str = "cpu"
-    coarse_search: bool = (
-        True  #: bfloat16 where max-pooling looks for its winners; a third less time on the CPU
-    )
-    pairs: PairSettings = field(default_factory=PairSettings)
-
-    @property
-    def schedule(self) -> Schedule:
-        return Schedule(
-            epochs=self.epochs,
-            minutes=self.minutes,
-            start=self.learning_rate,
-            end=self.final_learning_rate,
-        )
-
-
-#: Sections 3.5 to 3.8 to the letter.
-PAPER = TrainSettings(pairs=PAPER_PAIRS, settle_head=False)
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class EpochRow:
-    """One line of the log."""
-
-    epoch: int
-    seconds: float  #: since the run began, stops left out
-    learning_rate: float  #: at the epoch's end
-    train_loss: float
-    train_accuracy: float  #: of the network as it was at each step, dropout included
-    validation_loss: float
-    accuracy: float  #: on the validation pairs
-    precision_unchanged: float
-    precision_changed: float
-    precision_different: float
-    recall_unchanged: float
-    recall_changed: float
-    recall_different: float
+CHECKPOINT, BEST = "last.pt", "best.pt"
 
 
 def train(
@@ -177,17 +119,19 @@ class Run:
     def resume(self) -> None:
         """Take up the last checkpoint, if the folder has one."""
         path = self._out / CHECKPOINT
-        if not path.exists():
-            return
+        if path.exists():
+            self._take_up(path)
+        cut_log(self._out, self._epochs)
+
+    def _take_up(self, path: Path) -> None:
         state = torch.load(path, map_location=self._device, weights_only=True)
-        if _whole(state["settings"]) != asdict(self._settings):
+        if whole(state["settings"]) != asdict(self._settings):
             raise ValueError(f"{path} was made with other settings; use them, or another folder")
         self._network.load_state_dict(state["network"])
         self._optimizer.load_state_dict(state["optimizer"])
         torch.set_rng_state(state["torch_rng"].cpu())
         self._epochs, self._seconds = state["epochs"], state["seconds"]
         self._best, self._best_epoch = tuple(state["best"]), state["best_epoch"]
-        self._cut_log()
 
     def _train_pass(self, began: float, progress: Progress) -> _Trained:
         """One epoch's steps. Ends early when the time is up."""
@@ -288,31 +232,11 @@ class Run:
             train_accuracy=trained.accuracy,
             validation_loss=found.loss,
             accuracy=found.accuracy,
-            **_by_class("precision", found.precision),
-            **_by_class("recall", found.recall),
+            **by_class("precision", found.precision),
+            **by_class("recall", found.recall),
         )
-        path = self._out / LOG
-        fresh = not path.exists()
-        with path.open("a", newline="") as file:
-            writer = csv.DictWriter(file, list(asdict(row)))
-            if fresh:
-                writer.writeheader()
-            writer.writerow(asdict(row))
+        append_row(self._out, row)
         return row
-
-    def _cut_log(self) -> None:
-        """Without what was written of an epoch whose checkpoint was not; in today's columns."""
-        path = self._out / LOG
-        if not path.exists():
-            return
-        with path.open(newline="") as file:
-            kept = [row for row in csv.DictReader(file) if int(row["epoch"]) <= self._epochs]
-        partial = path.with_name(f"{LOG}.partial")
-        with partial.open("w", newline="") as file:
-            writer = csv.DictWriter(file, [field.name for field in fields(EpochRow)], extrasaction="ignore")
-            writer.writeheader()
-            writer.writerows(kept)
-        partial.replace(path)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -322,14 +246,3 @@ class _Trained:
     loss: float  #: mean; NaN where the time was up before the first step
     accuracy: float
     rate: float  #: the last one
-
-
-def _whole(settings: dict[str, Any]) -> dict[str, Any]:
-    """The settings of a checkpoint; what they do not know yet has its default."""
-    default = asdict(TrainSettings())
-    return {**default, **settings, "pairs": {**default["pairs"], **settings["pairs"]}}
-
-
-def _by_class(name: str, values: tuple[float, float, float]) -> dict[str, float]:
-    classes = ("unchanged", "changed", "different")
-    return {f"{name}_{of}": value for of, value in zip(classes, values, strict=True)}

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from worker.evaluation.training_curves import CURVES, draw_curves, read_log
-from worker.training.trainer import LOG
+from worker.training.log import LOG
 
 
 def write_log(folder: Path, text: str) -> Path:

@@ -14,7 +14,8 @@ from worker.evaluation.publish import DEVIATIONS, change_scores, deviations, pub
 from worker.training.calibration import best_threshold, survey_pairs
 from worker.training.dataset import save_tiles, split_tiles
 from worker.training.pairs import PairSettings
-from worker.training.trainer import PAPER, TrainSettings, train
+from worker.training.settings import PAPER, TrainSettings
+from worker.training.trainer import train
 
 SHORT = TrainSettings(
     epochs=1, batch=8, train_pairs=8, validation_pairs=8, held_out=0.2, pairs=PairSettings(patch_points=256)

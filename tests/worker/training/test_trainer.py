@@ -11,11 +11,13 @@ import torch
 
 from worker.errors import Cancelled
 from worker.training.dataset import save_tiles
+from worker.training.log import LOG
 from worker.training.metrics import measured
 from worker.training.pairs import PairSettings
 from worker.training.prefetch import prefetched
 from worker.training.schedule import Schedule
-from worker.training.trainer import BEST, CHECKPOINT, LOG, PAPER, TrainSettings, train
+from worker.training.settings import PAPER, TrainSettings
+from worker.training.trainer import BEST, CHECKPOINT, train
 
 TINY = TrainSettings(
     epochs=2, batch=8, train_pairs=48, validation_pairs=16, held_out=0.2, pairs=PairSettings(patch_points=256)
@@ -72,6 +74,16 @@ def test_an_epoch_whose_checkpoint_was_lost_is_logged_once(dataset, tmp_path):
     state = torch.load(tmp_path / CHECKPOINT, weights_only=True)
     torch.save({**state, "epochs": 1}, tmp_path / CHECKPOINT)  # as if killed between log and checkpoint
     train(replace(TINY, epochs=2, train_pairs=8, validation_pairs=8), dataset, tmp_path)
+    assert [row["epoch"] for row in log_of(tmp_path)] == [1, 2]
+
+
+def test_half_a_row_and_a_first_epoch_without_a_checkpoint_are_forgotten(dataset, tmp_path):
+    quick = replace(TINY, epochs=2, train_pairs=8, validation_pairs=8)
+    train(replace(quick, epochs=1), dataset, tmp_path)
+    (tmp_path / CHECKPOINT).unlink()  # as if killed before it was written
+    with (tmp_path / LOG).open("a") as file:
+        file.write("1,0.5,")
+    train(quick, dataset, tmp_path)
     assert [row["epoch"] for row in log_of(tmp_path)] == [1, 2]
 
 
