@@ -19,12 +19,17 @@ from worker.evaluation.revisit.site import (
 )
 from worker.evaluation.scenes import Scene, random_edits
 from worker.evaluation.truth import TileTruth, changed_tiles
-from worker.evaluation.visits import drifted_within, visit
+from worker.evaluation.visits import drifted_within, stops, visit
 from worker.pipeline.flow import NoScanAccepted, locate_survey
 from worker.pipeline.placement import Outcome, ScanFile
 from worker.pipeline.tiling import TileGrid, TilePairs, Tiles, pair_tiles
 from worker.pipeline.values import Bools, Indices, Matrix4
 from worker.progress import Progress, silent
+
+DRAWS, ANOTHER = (
+    20,
+    100_000_000,
+)  #: of edits, and between the seeds of two draws: no seed of a visit is that high
 
 
 def walk_again(
@@ -33,13 +38,13 @@ def walk_again(
     """Simulate the second visit into the folder and pair its tiles with the map's.
 
     Its priors are off by as much as the first's, in the frame of the map. Where no scan finds its place, every tile
-    is unobserved. Raises ScanError where a file cannot be read.
+    is unobserved. Raises ScanError where a file cannot be read, ValueError where no edits leave a way.
     """
     progress(f"{plan.name}: simulating the second visit", 0.0)
-    after = edited(site.before, plan, settings)
+    after, poses = edited(site.before, plan, settings)
     seen = visit(
         after,
-        second_stops(plan, settings),
+        poses,
         seed=plan.seed,
         prior_error=settings.drift,
         drift=drifted_within,
@@ -65,11 +70,22 @@ def walk_again(
     )
 
 
-def edited(before: Scene, plan: VisitPlan, settings: RevisitSettings) -> Scene:
-    """As the second visit finds it."""
-    if plan.case == "unchanged":
-        return before
-    return random_edits(before, seed=plan.seed, kinds=edit_kinds(settings.edits[plan.site.kind]))[0]
+def edited(before: Scene, plan: VisitPlan, settings: RevisitSettings) -> tuple[Scene, tuple[Matrix4, ...]]:
+    """As the second visit finds it, and where it stops; edits that leave a robot no way are drawn again.
+
+    Raises ValueError where no draw leaves one.
+    """
+    count, blocked = second_stops(plan, settings), ValueError(plan.name)
+    for draw in range(DRAWS):
+        after = before
+        if plan.case != "unchanged":
+            kinds = edit_kinds(settings.edits[plan.site.kind])
+            after = random_edits(before, seed=plan.seed + draw * ANOTHER, kinds=kinds)[0]
+        try:
+            return after, stops(after, count, seed=plan.seed)
+        except ValueError as error:
+            blocked = error
+    raise blocked
 
 
 def second_stops(plan: VisitPlan, settings: RevisitSettings) -> int:

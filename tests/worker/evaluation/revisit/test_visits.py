@@ -5,7 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
 
+from worker.evaluation.revisit import second_visit
 from worker.evaluation.revisit.plan import RevisitSettings, SitePlan, VisitPlan, plan_visits
 from worker.evaluation.revisit.second_visit import edited, kept_tiles, second_stops, true_changes
 from worker.evaluation.revisit.site import moved_scene
@@ -67,12 +69,35 @@ def test_a_third_of_the_stops_and_no_edit_where_the_case_says_so():
     }
     assert stops == {"changed": 14, "sparse": 5}
     before = OFFICE.scene()
-    assert edited(before, VisitPlan(site=OFFICE, case="unchanged"), settings) is before
+    assert edited(before, VisitPlan(site=OFFICE, case="unchanged"), settings)[0] is before
     names = [
-        {item.name for item in edited(before, VisitPlan(site=OFFICE, case=case), settings).objects}
+        {item.name for item in edited(before, VisitPlan(site=OFFICE, case=case), settings)[0].objects}
         for case in ("changed", "sparse")
     ]
     assert names[0] != names[1]
+
+
+def test_edits_that_leave_the_robot_no_way_are_drawn_again(monkeypatch: pytest.MonkeyPatch):
+    drawn = []
+
+    def walled_up_at_first(scene, *, seed, kinds):
+        drawn.append(seed)
+        block = box(9.0, 9.0, 2.0).at(5.0, 4.0)
+        return scene.with_added("block", block) if len(drawn) == 1 else (scene, ())
+
+    monkeypatch.setattr(second_visit, "random_edits", walled_up_at_first)
+    before = OFFICE.scene()
+    after, poses = edited(before, VisitPlan(site=OFFICE, case="changed"), RevisitSettings())
+    assert after is before
+    assert len(poses) == 14
+    assert len(set(drawn)) == 2
+
+
+def test_a_building_without_any_way_is_an_error(monkeypatch: pytest.MonkeyPatch):
+    block = box(9.0, 9.0, 2.0).at(5.0, 4.0)
+    monkeypatch.setattr(second_visit, "random_edits", lambda scene, **_: scene.with_added("block", block))
+    with pytest.raises(ValueError, match="no free place"):
+        edited(OFFICE.scene(), VisitPlan(site=OFFICE, case="sparse"), RevisitSettings())
 
 
 def test_the_truth_follows_the_scene_into_the_frame_of_the_map(bare_room):
