@@ -67,7 +67,9 @@ def test_the_base_install_is_what_the_service_imports() -> None:
 
 
 def test_the_worker_and_evaluate_extras_add_what_only_the_worker_imports() -> None:
-    assert set(requirements("worker", "evaluate")) - set(requirements()) == imported("worker") - set(requirements())
+    assert set(requirements("worker", "evaluate")) - set(requirements()) == imported("worker") - set(
+        requirements()
+    )
 
 
 def test_every_requirement_is_pinned_to_a_version_that_it_admits() -> None:
