@@ -23,6 +23,7 @@ def test_a_job_that_waits_is_an_ogc_status_document(client, catalog):
         "finished": None,
         "map_id": "lobby",
         "survey_id": None,
+        "model": None,
         "problem": None,
         "links": [{"href": f"/jobs/{job_id}", "rel": "self", "type": "application/json"}],
     }
