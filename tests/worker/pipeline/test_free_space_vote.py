@@ -2,11 +2,20 @@
 
 from __future__ import annotations
 
-from graphs import along, edge, line, shifted
+from pathlib import Path
 
-from worker.pipeline.free_space_vote import Contradiction, most_accused
+import numpy as np
+import pytest
+from graphs import along, edge, line, shifted
+from rooms import Room
+from visits import QUICK, placing, prepared_folder, spread, written
+
+from worker.pipeline import placing as stage
+from worker.pipeline.free_space_vote import Contradiction, contradictions, most_accused
 from worker.pipeline.map_settings import MapSettings
 from worker.pipeline.pairwise import PairResult
+from worker.pipeline.poses import exponential
+from worker.processes import Processes
 
 SETTINGS = MapSettings()
 
@@ -46,3 +55,41 @@ def test_the_more_doubtful_of_two_edges_on_a_path_is_accused() -> None:
 def test_without_a_contradiction_nobody_is_accused() -> None:
     scans, edges, _ = two_lines()
     assert most_accused(scans, edges, [], SETTINGS) is None
+
+
+def test_a_scan_turned_about_in_its_room_contradicts_the_others_and_nobody_else_does(
+    room: Room, tmp_path: Path
+) -> None:
+    folder, points = prepared_folder(tmp_path, dict(enumerate(room.before)))
+    truth = {number: scan.world_from_sensor for number, scan in enumerate(room.before)}
+    half_turn = exponential(np.array([0.0, 0.0, np.pi / 2, 1.0, 0.5, 0.0]))
+    wrong = truth | {2: truth[2] @ half_turn}
+
+    def found(poses: dict[int, np.ndarray]) -> list[Contradiction]:
+        return contradictions(poses, points, folder, Processes(None), limit=0.01, settings=SETTINGS)
+
+    assert found(truth) == []
+    assert {2 in (each.target, each.source) for each in found(wrong)} == {True}
+
+
+def test_an_accused_registration_is_solved_without_and_told_as_contradicted(
+    room: Room, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    files = [
+        written(tmp_path / f"{number}.pcd", scan, pose=scan.world_from_sensor)
+        for number, scan in enumerate(room.before)
+    ]
+    accused: list[PairResult] = []
+
+    def once(scans: object, edges: tuple[PairResult, ...], *_: object) -> PairResult | None:
+        accused.extend(edges[:1] if not accused else [])
+        return accused[0] if edges[0] is accused[0] else None
+
+    monkeypatch.setattr(stage, "most_accused", once)
+    found = stage.place_together(files, settings=placing(QUICK), processes=1)
+    pair = (accused[0].target, accused[0].source)
+    assert pair in {(each.target, each.source) for each in found.contradicted}
+    assert pair not in {(each.target, each.source) for each in found.kept}
+    poses = {n: each.placement.map_from_scan for n, each in enumerate(found.outcomes) if each.placement}
+    assert len(poses) == len(files)
+    assert spread(poses, {n: scan.world_from_sensor for n, scan in enumerate(room.before)}) < 0.03
