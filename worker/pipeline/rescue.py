@@ -55,9 +55,8 @@ def rescue(
     if not missing:
         return {}
     surface = assembled(work.folder, list(poses.items()), voxel_size=work.registration.voxel_size)
-    map_number = -len(
-        poses
-    )  # below every scan's, and new whenever the map has grown: processes keep what they load
+    # Below every scan's, and a new one whenever the map has grown: processes keep what they loaded.
+    map_number = -len(poses)
     PreparedScan(name="map", surface=surface, image=None, sensor_pose=np.eye(4)).save(
         work.folder.path(map_number)
     )

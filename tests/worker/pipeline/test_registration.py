@@ -53,6 +53,15 @@ def test_register_finds_a_drifted_scan_to_a_centimetre(room: Room, number: int) 
     assert not found.searched
 
 
+def test_candidates_are_told_by_some_of_the_points_and_the_pose_by_all(
+    room: Room, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("worker.pipeline.candidate._ENOUGH", 1000)
+    scan = prepare(room.scan(), SETTINGS)
+    found = register(scan, room.target, start=room.after[0].world_from_sensor, settings=SETTINGS)
+    assert found.found.num_inliers > len(scan.surface.points) / 2
+
+
 def test_register_finds_a_scan_with_no_start_at_all(room: Room) -> None:
     found = register(_ready(room.scan()), room.target, settings=SETTINGS)
     centimetres, degrees = _off(found, room.after[0].world_from_sensor)

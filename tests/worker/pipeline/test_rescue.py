@@ -87,6 +87,17 @@ def test_it_stands_beside_the_placed_scan_that_is_nearest(room: Room, work: Pair
     assert found.beside == min(apart, key=lambda number: apart[number])
 
 
+def test_a_scan_is_looked_for_in_the_map_as_it_has_grown_meanwhile(room: Room, work: PairWork) -> None:
+    elsewhere = visit(random_room(11), 1, seed=5)[0]
+    prepare(as_scan(elsewhere.points), QUICK).save(work.folder.path(9))
+    scan = Sound(points=room.before[LEFT].points, prior=room.before[LEFT].world_from_sensor)
+    truth = {number: room.before[number].world_from_sensor for number in (0, 1, 2)}
+    scans = {LEFT: scan} | {n: Sound(points=room.before[n].points, prior=pose) for n, pose in truth.items()}
+    alone = rescue([LEFT], {9: truth[0]}, 9, {LEFT: scan, 9: scans[0]}, work)[LEFT]
+    assert alone.pose is None
+    assert rescue([LEFT], truth, 0, scans, work)[LEFT].pose is not None
+
+
 def test_a_foreign_scan_has_no_place_and_a_reason_with_numbers(room: Room, work: PairWork) -> None:
     foreign = prepare(as_scan(visit(random_room(11), 1, seed=5)[0].points, name="foreign.pcd"), QUICK)
     foreign.save(work.folder.path(LEFT))
