@@ -26,7 +26,7 @@ from worker.pipeline.values import Floats, Matrix4
 CELL = 0.3  #: metres, a pixel
 PAIR_SIZE = 80  #: pixels, 24 m: two scans of a sensor that sees 10 m
 YAWS = 90  #: turns tried, 4 degrees apart
-_BANDS = ((-np.inf, 0.8), (0.8, np.inf))  #: metres above the cloud's own zero: a picture each
+_SPLIT = 0.8  #: metres above the cloud's own zero: what is below and above has a picture each
 _SATURATED = 4  #: points, from which a pixel is full
 _WHITENING = 0.8  #: 0 correlates plainly, 1 takes the phases alone
 _STEEP, _FLAT = 0.4, 0.8  #: |z| of the normals of walls, of floors and ceilings
@@ -38,11 +38,11 @@ Complexes = NDArray[np.complex64]
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class PlanView:
-    """A cloud's walls as places (N, 2), directions (N,) and bands (N,), and its floors by height."""
+    """A cloud's walls as places (N, 2) and directions (N,), in two bands of height, and its floors by height."""
 
     places: Floats  #: (N, 2) metres, from `center`
     facing: Floats  #: (N,) radians
-    upper: NDArray[np.bool_]  #: (N,) which band
+    upper: NDArray[np.bool_]  #: (N,) above the split
     heights: Floats  #: (H,) floors less ceilings, by height
     center: Floats  #: (2,) metres, the frame of the cloud
 
@@ -59,7 +59,7 @@ class PlanView:
         return cls(
             places=places - center,
             facing=np.arctan2(normals[wall, 1], normals[wall, 0]),
-            upper=points[wall, 2] >= _BANDS[1][0],
+            upper=points[wall, 2] >= _SPLIT,
             heights=heights.astype(np.float64),
             center=center,
         )
