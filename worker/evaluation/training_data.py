@@ -1,21 +1,27 @@
-"""Training tiles from simulated buildings: two independent visits to each, nothing changed in between."""
+"""Training tiles from simulated buildings: two independent visits to each, and a third one after edits."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from worker.evaluation.scenes import Scene, corridor, random_room, rigid, small_office
+from worker.evaluation.scenes import Scene, corridor, random_edits, random_room, rigid, small_office
 from worker.evaluation.sensor import SimulatedScan
-from worker.evaluation.visits import visit
+from worker.evaluation.truth import KINDS, changed_tiles
+from worker.evaluation.visits import stops, visit
 from worker.pipeline.tiling import TilePairs, TilingSettings, cut, grid_over, pair_tiles
-from worker.pipeline.values import Matrix4, Points
+from worker.pipeline.values import Bools, Matrix4, Points
 from worker.pipeline.voxels import Voxels
 from worker.progress import Progress, silent
 from worker.training.dataset import TileSet
+
+Kind = Literal["office", "corridor", "room"]
+DRAWS, ANOTHER = 20, 100_000_000  #: of edits, and between the seeds of two draws
 
 
 class TrainingSetSettings(BaseModel):
@@ -23,14 +29,18 @@ class TrainingSetSettings(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    offices: int = Field(6, ge=0, description="four rooms and a corridor each")
-    corridors: int = Field(5, ge=0, description="L-shaped, about 170 tiles each")
-    rooms: int = Field(16, ge=0, description="single furnished rooms")
-    stops: dict[str, int] = Field(
+    offices: int = Field(10, ge=0, description="four rooms and a corridor each")
+    corridors: int = Field(8, ge=0, description="L-shaped, about 170 tiles each")
+    rooms: int = Field(30, ge=0, description="single furnished rooms")
+    stops: dict[Kind, int] = Field(
         {"office": 14, "corridor": 24, "room": 5}, description="scans of the first visit"
     )
+    edits: dict[Kind, int] = Field(
+        {"office": 12, "corridor": 12, "room": 4},
+        description="pieces added, removed, moved, in turn, before the third visit",
+    )
     second_share: tuple[float, float] = Field(
-        (0.5, 1.0), description="stops of the second visit as a share of the first's, drawn for each building"
+        (0.35, 1.0), description="stops of a further visit as a share of the first's, drawn for each"
     )
     pose_error: tuple[float, float] = Field(
         (0.01, 0.15), description="sigma of each registered scan's shift in metres and yaw in degrees"
@@ -40,46 +50,82 @@ class TrainingSetSettings(BaseModel):
     seed: int = Field(1000, description="of the first building; keep test buildings apart from it")
 
 
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class Walks:
+    """The three visits to one building, cut into the tiles of the first. T tiles."""
+
+    unchanged: TilePairs  #: the first visit and the second
+    edited: TilePairs  #: the first visit and the third
+    changed: Bools  #: (T,) where the third could see a change
+
+    @property
+    def kept(self) -> Bools:
+        """(T,) tiles that the second visit saw well."""
+        return self.unchanged.observed
+
+
 def build_training_set(settings: TrainingSetSettings, progress: Progress = silent) -> TileSet:
-    """Walk every building twice and keep the tiles that both visits saw well.
+    """Walk every building three times, the third time edited, and keep the tiles that the first two visits saw well.
 
     A building stands at a random yaw in its map, as it does when the first scan sets the frame.
     """
     buildings = list(_buildings(settings))
-    parts: list[tuple[TilePairs, NDArray[np.bool_]]] = []
+    parts = []
     for number, (kind, make) in enumerate(buildings):
         progress("build training set", number / len(buildings))
-        pairs = _two_visits(make(settings.seed + number), settings, kind, settings.seed + number)
-        parts.append((pairs, pairs.observed))
+        parts.append(_walks(make(settings.seed + number), settings, kind, settings.seed + number))
     progress("build training set", 1.0)
     return _gathered(parts, settings)
 
 
-def _buildings(settings: TrainingSetSettings) -> Iterator[tuple[str, Callable[[int], Scene]]]:
-    makers: dict[str, Callable[[int], Scene]] = {
+def _buildings(settings: TrainingSetSettings) -> Iterator[tuple[Kind, Callable[[int], Scene]]]:
+    makers: dict[Kind, Callable[[int], Scene]] = {
         "office": small_office,
         "corridor": corridor,
         "room": random_room,
     }
     counts = {"office": settings.offices, "corridor": settings.corridors, "room": settings.rooms}
-    for kind, count in counts.items():
-        for _ in range(count):
-            yield kind, makers[kind]
+    for kind, make in makers.items():
+        for _ in range(counts[kind]):
+            yield kind, make
 
 
-def _two_visits(scene: Scene, settings: TrainingSetSettings, kind: str, seed: int) -> TilePairs:
+def _walks(scene: Scene, settings: TrainingSetSettings, kind: Kind, seed: int) -> Walks:
     rng = np.random.default_rng((seed, 7))
     map_from_world = rigid(yaw=float(rng.uniform(0, 360)))
     first = settings.stops[kind]
-    second = max(1, round(first * rng.uniform(*settings.second_share)))
+    second, third = (max(1, round(first * rng.uniform(*settings.second_share))) for _ in range(2))
+    after = _edited(scene, settings.edits[kind], seed)
     seen = [
-        visit(scene, count, seed=10 * seed + number, prior_error=settings.pose_error)
-        for number, count in enumerate((first, second))
+        visit(there, count, seed=10 * seed + number, prior_error=settings.pose_error)
+        for number, (there, count) in enumerate(((scene, first), (scene, second), (after, third)))
     ]
-    a, b = (fused(scans, map_from_world, voxel_size=settings.voxel_size) for scans in seen)
+    a, b, c = (fused(scans, map_from_world, voxel_size=settings.voxel_size) for scans in seen)
     grid = grid_over(a, tile_size=settings.tiling.tile_size, voxel_size=settings.voxel_size)
     tiles = cut(a, grid, min_points=settings.tiling.min_points)
-    return pair_tiles(tiles, b, settings=settings.tiling)
+    truth = changed_tiles(
+        scene.placed(map_from_world),
+        after.placed(map_from_world),
+        grid,
+        sensors_before=[map_from_world @ scan.world_from_sensor for scan in seen[0]],
+        sensors_after=[map_from_world @ scan.world_from_sensor for scan in seen[2]],
+    )
+    return Walks(
+        unchanged=pair_tiles(tiles, b, settings=settings.tiling),
+        edited=pair_tiles(tiles, c, settings=settings.tiling),
+        changed=truth.of(tiles.indices),
+    )
+
+
+def _edited(scene: Scene, edits: int, seed: int) -> Scene:
+    """The building with whole things added, removed and moved; a robot still has a way through it."""
+    for draw in range(DRAWS):
+        kinds = [KINDS[number % len(KINDS)] for number in range(edits)]
+        after = random_edits(scene, seed=10 * seed + draw * ANOTHER, kinds=kinds)[0]
+        with suppress(ValueError):
+            stops(after, 1, seed=seed)
+            return after
+    return scene
 
 
 def fused(scans: tuple[SimulatedScan, ...], map_from_world: Matrix4, *, voxel_size: float) -> Points:
@@ -95,18 +141,25 @@ def fused(scans: tuple[SimulatedScan, ...], map_from_world: Matrix4, *, voxel_si
     return voxels.points
 
 
-def _gathered(parts: list[tuple[TilePairs, NDArray[np.bool_]]], settings: TrainingSetSettings) -> TileSet:
-    points_a, points_b, centres, buildings = [], [], [], []
-    for building, (pairs, kept) in enumerate(parts):
-        middle = pairs.reference.grid.centers(pairs.reference.indices)
-        for tile in np.flatnonzero(kept).tolist():
-            points_a.append((pairs.reference.points[tile] - middle[tile]).astype(np.float32))
-            points_b.append((pairs.current[tile] - middle[tile]).astype(np.float32))
+def _gathered(parts: list[Walks], settings: TrainingSetSettings) -> TileSet:
+    points: tuple[list[Points], ...] = ([], [], [])
+    centres, buildings = [], []
+    for building, walks in enumerate(parts):
+        tiles = walks.unchanged.reference
+        middle = tiles.grid.centers(tiles.indices)
+        shown = walks.changed & walks.edited.observed
+        for tile in np.flatnonzero(walks.kept).tolist():
+            third = walks.edited.current[tile] if shown[tile] else np.empty((0, 3), np.float32)
+            for look, seen in zip(
+                points, (tiles.points[tile], walks.unchanged.current[tile], third), strict=True
+            ):
+                look.append((seen - middle[tile]).astype(np.float32))
             centres.append(middle[tile])
             buildings.append(building)
     return TileSet(
-        points_a=tuple(points_a),
-        points_b=tuple(points_b),
+        points_a=tuple(points[0]),
+        points_b=tuple(points[1]),
+        points_c=tuple(points[2]),
         centres=np.array(centres).reshape(-1, 3),
         buildings=np.array(buildings, dtype=np.int32),
         tile_size=settings.tiling.tile_size,

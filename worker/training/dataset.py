@@ -1,4 +1,4 @@
-"""The training set: dense tiles, each seen on two independent visits, in one .npz file."""
+"""The training set: dense tiles, each seen on up to three visits, in one .npz file."""
 
 from __future__ import annotations
 
@@ -10,18 +10,22 @@ from numpy.typing import NDArray
 
 from worker.pipeline.values import Points
 
-FORMAT = 1
+FORMAT = 2
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class TileSet:
     """T dense tiles before any sampling, fused at 5 cm.
 
-    Nothing changed between the visits: `points_a` and `points_b` differ as two honest surveys do.
+    Nothing changed between the first two visits: `points_a` and `points_b` differ as two honest surveys do. Before
+    the third, whole things were added, removed and moved.
     """
 
     points_a: tuple[Points, ...]  #: T arrays (n, 3) float32, metres, relative to the tile's centre
     points_b: tuple[Points, ...]  #: the same tiles on a second visit; (0, 3) where there was none
+    points_c: tuple[
+        Points, ...
+    ]  #: the same tiles on the third visit where it found them changed; (0, 3) elsewhere
     centres: NDArray[np.float64]  #: (T, 3) metres, frame of the tile's own building
     buildings: NDArray[np.int32]  #: (T,) which building the tile is of
     tile_size: tuple[float, float, float]  #: metres
@@ -36,6 +40,7 @@ class TileSet:
         return TileSet(
             points_a=tuple(self.points_a[i] for i in kept),
             points_b=tuple(self.points_b[i] for i in kept),
+            points_c=tuple(self.points_c[i] for i in kept),
             centres=self.centres[chosen],
             buildings=self.buildings[chosen],
             tile_size=self.tile_size,
@@ -52,6 +57,7 @@ def save_tiles(tiles: TileSet, path: Path) -> None:
     with path.open("wb") as file:
         points_a, offsets_a = _packed(tiles.points_a)
         points_b, offsets_b = _packed(tiles.points_b)
+        points_c, offsets_c = _packed(tiles.points_c)
         np.savez(
             file,
             format=FORMAT,
@@ -63,6 +69,8 @@ def save_tiles(tiles: TileSet, path: Path) -> None:
             offsets_a=offsets_a,
             points_b=points_b,
             offsets_b=offsets_b,
+            points_c=points_c,
+            offsets_c=offsets_c,
         )
 
 
@@ -75,6 +83,7 @@ def load_tiles(path: Path) -> TileSet:
         return TileSet(
             points_a=_unpacked(file["points_a"], file["offsets_a"]),
             points_b=_unpacked(file["points_b"], file["offsets_b"]),
+            points_c=_unpacked(file["points_c"], file["offsets_c"]),
             centres=file["centres"].astype(np.float64),
             buildings=file["buildings"].astype(np.int32),
             tile_size=(size[0], size[1], size[2]),

@@ -33,6 +33,14 @@ def seen(kind: int, rng: np.random.Generator) -> np.ndarray:
     return np.clip(points, -HALF, HALF).astype(np.float32)
 
 
+def edited(kind: int, rng: np.random.Generator) -> np.ndarray:
+    """Every other place with a second box in it; (0, 3) for the rest."""
+    if kind % 2:
+        return np.empty((0, 3), np.float32)
+    box = np.array([-0.3, 0.3, -0.2]) + rng.uniform(-0.15, 0.15, (60, 3))
+    return np.concatenate([seen(kind, rng), box.astype(np.float32)])
+
+
 @pytest.fixture(scope="session")
 def tiles() -> TileSet:
     """Two buildings of 4 x 5 tiles each."""
@@ -42,6 +50,7 @@ def tiles() -> TileSet:
     return TileSet(
         points_a=tuple(seen(kind, rng) for kind in range(count)),
         points_b=tuple(seen(kind, rng) for kind in range(count)),
+        points_c=tuple(edited(kind, rng) for kind in range(count)),
         centres=np.c_[1.5 * (place % 5), 1.5 * (place // 5), np.full(count, 0.5)],
         buildings=(np.arange(count) // 20).astype(np.int32),
         tile_size=(1.5, 1.5, 1.0),

@@ -12,7 +12,6 @@ from worker.evaluation.revisit.record import Revisit
 from worker.evaluation.revisit.site import (
     Site,
     errors_of,
-    moved_scene,
     placed_scans,
     prefixed,
     written,
@@ -103,7 +102,7 @@ def true_changes(
     second: list[Matrix4],
 ) -> tuple[TileTruth, TileTruth]:
     """What exists in one visit only, and of that what a sensor could see; the grid and the sensors in the map frame."""
-    old, new = (moved_scene(scene, map_from_world) for scene in (before, after))
+    old, new = (scene.placed(map_from_world) for scene in (before, after))
     exists = changed_tiles(old, new, grid)
     if not exists.cells.any():
         return exists, exists

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -105,12 +105,6 @@ def errors_of(scans: tuple[PlacedScan, ...], taken: int) -> ScanErrors:
         metres=np.array([difference(scan.placement.map_from_scan, scan.true)[0] for scan in scans]),
         sigmas=np.array([np.nan if sigma is None else sigma.translation for sigma in sigmas]),
     )
-
-
-def moved_scene(scene: Scene, target_from_world: Matrix4) -> Scene:
-    """The same solids in another frame; rooms and route, which know no turn, are left out."""
-    objects = tuple(replace(item, mesh=item.mesh.placed(target_from_world)) for item in scene.objects)
-    return replace(scene, objects=objects, rooms=(), route=())
 
 
 def prefixed(progress: Progress, words: str) -> Progress:

@@ -83,6 +83,11 @@ class Scene:
         vertices = np.concatenate([item.mesh.vertices for item in self.objects])
         return Caster(vertices, np.concatenate(triangles).astype(np.int32), np.concatenate(owners))
 
+    def placed(self, target_from_world: Matrix4) -> Scene:
+        """The same solids in another frame; rooms and route, which know no turn, are left out."""
+        objects = tuple(replace(item, mesh=item.mesh.placed(target_from_world)) for item in self.objects)
+        return replace(self, objects=objects, rooms=(), route=())
+
     def is_free(self, bounds: Floats, *, ignoring: str | None = None) -> bool:
         """No object's box overlaps this box (2, 3); touching is allowed."""
         for item in self.objects:

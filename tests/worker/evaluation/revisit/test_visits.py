@@ -10,7 +10,6 @@ import pytest
 from worker.evaluation.revisit import second_visit
 from worker.evaluation.revisit.plan import RevisitSettings, SitePlan, VisitPlan, plan_visits
 from worker.evaluation.revisit.second_visit import edited, kept_tiles, second_stops, true_changes
-from worker.evaluation.revisit.site import moved_scene
 from worker.evaluation.revisit.visits import make_visits
 from worker.evaluation.scenes import rigid
 from worker.evaluation.scenes.mesh import box
@@ -121,8 +120,8 @@ def test_a_change_behind_a_screen_exists_and_is_in_nobodys_sight(bare_room):
     assert not visible.changed.any()
 
 
-def test_a_moved_scene_keeps_names_and_ids_of_its_things(bare_room):
-    moved = moved_scene(bare_room, rigid(1.0))
+def test_a_scene_in_another_frame_keeps_names_and_ids_of_its_things(bare_room):
+    moved = bare_room.placed(rigid(1.0))
     assert [(item.name, item.object_id) for item in moved.objects] == [
         (item.name, item.object_id) for item in bare_room.objects
     ]
