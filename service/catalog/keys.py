@@ -55,9 +55,13 @@ def map_tiles(job_id: str) -> str:
     return map_folder(job_id) + "tiles.npz"
 
 
-def map_description(job_id: str, model: str) -> str:
-    """What one model computed of the reference alone; `model` is `name/version`."""
-    return f"{map_folder(job_id)}description-{safe_name(model.replace('/', '-'))}.npz"
+def map_description(job_id: str, model: str, sha256: str | None) -> str:
+    """What one model computed of the reference alone; `model` is `name/version`, the digest that of its weights.
+
+    Other weights under the same name find no description, rather than one that is not theirs.
+    """
+    made_by = f"{model.replace('/', '-')}-{(sha256 or 'none')[:12]}"
+    return f"{map_folder(job_id)}description-{safe_name(made_by)}.npz"
 
 
 def map_manifest(job_id: str) -> str:

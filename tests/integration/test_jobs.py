@@ -16,6 +16,7 @@ from service.catalog.records import JobRecord, ScanRecord
 from service.catalog.steps import STEPS, JobKind
 from service.settings import Settings
 from tests.integration.house import MAP, MODEL, OTHER_CUT, SAME_CUT, SEEN_TO, House, Material, run
+from worker.detectors.store import open_card
 from worker.errors import DetectorUnavailable, MapFailed, ScanError
 from worker.jobs.surveys import scoring
 from worker.pipeline.flow import NoScanAccepted
@@ -43,6 +44,12 @@ def run_until_killed(job: JobRecord, name: str) -> None:
             run(job, name)
 
 
+def description_key(house: House, model: str) -> str:
+    """Of what this model's weights said of the map."""
+    card = open_card(house.material.model_store, model)
+    return keys.map_description(house.catalog.maps.get(MAP).job_id, model, card.sha256)
+
+
 def failed(house: House, job: JobRecord, code: str) -> str:
     """The sentence of a job that failed with this code."""
     found = house.catalog.jobs.get(job.job_id)
@@ -67,7 +74,7 @@ def test_a_map_is_ready_with_its_counts_scans_and_files(house: House) -> None:
     assert listing["n_valid_patches"] == found.counts["tiles"]
     assert found.bounds is not None
     assert found.bounds.max == pytest.approx(listing["map_bounds"]["max"])
-    assert house.catalog.blobs.exists(keys.map_description(house.catalog.maps.get(MAP).job_id, MODEL))
+    assert house.catalog.blobs.exists(description_key(house, MODEL))
 
 
 def test_a_survey_is_ready_with_a_state_for_every_tile_of_the_map(house: House) -> None:
@@ -108,7 +115,7 @@ def test_a_threshold_of_0_finds_every_observed_tile_changed(house: House) -> Non
 def test_a_model_that_cuts_alike_scores_a_map_that_was_described_for_another(house: House) -> None:
     ours, theirs = (house.tiles(house.survey(job).survey_id) for job in house.done)
     assert house.survey(house.done[1]).model == SAME_CUT
-    assert not house.catalog.blobs.exists(keys.map_description(house.catalog.maps.get(MAP).job_id, SAME_CUT))
+    assert not house.catalog.blobs.exists(description_key(house, SAME_CUT))
     assert len(ours) == len(theirs)
     for one, two in zip(ours, theirs, strict=True):  # the same weights under another name
         assert one["score"] == pytest.approx(two["score"], abs=1e-4)

@@ -144,5 +144,7 @@ def test_a_file_name_becomes_one_harmless_part_of_a_key(given, kept):
 
 
 def test_a_description_belongs_to_one_model():
-    assert keys.map_description("lobby", "spicd-net/1") == "maps/lobby/description-spicd-net-1.npz"
-    assert keys.map_description("lobby", "spicd-net/1") != keys.map_description("lobby", "spicd-net/2")
+    key = keys.map_description("lobby", "spicd-net/1", "0123456789abcdef")
+    assert key == "maps/lobby/description-spicd-net-1-0123456789ab.npz"
+    assert key != keys.map_description("lobby", "spicd-net/2", "0123456789abcdef")
+    assert key != keys.map_description("lobby", "spicd-net/1", "fedcba9876543210")

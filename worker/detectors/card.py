@@ -20,6 +20,11 @@ class Preprocessing(BaseModel):
     tile_size: tuple[float, float, float] = Field(description="metres")
     patch_points: int = Field(gt=0, description="points of a patch after FPS and repetition")
     min_points: int = Field(gt=0, description="tiles with fewer points are not scored")
+    chamfer_points: int | None = Field(
+        default=128,
+        gt=0,
+        description="of each patch, that are compared; null: all, where the paper takes 128",
+    )
     seed: int = Field(description="of FPS and of the Chamfer sample")
 
 

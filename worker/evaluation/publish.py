@@ -83,6 +83,7 @@ def publish(
             voxel_size=VOXEL_SIZE,
             tile_size=training_set.tile_size,
             patch_points=settings["pairs"]["patch_points"],
+            chamfer_points=settings["pairs"]["chamfer_points"],
             min_points=MIN_POINTS,
             seed=settings["seed"],
         ),

@@ -47,7 +47,7 @@ def describe_map(at: Context) -> None:
     with at.catalog.blobs.local(keys.map_tiles(at.job.job_id)) as path:
         tiles = archive.load_tiles(path)
     description = detector.describe(tiles, progress=lambda _, share: at.report("describing", share))
-    key = keys.map_description(at.job.job_id, version.model)
+    key = keys.map_description(at.job.job_id, version.model, detector.card.sha256)
     put(at, key, lambda path: archive.save_arrays(path, description))
     at.catalog.jobs.succeed(at.job.job_id)
 

@@ -57,7 +57,7 @@ def score_survey(at: Context) -> None:
         pairs = archive.load_pairs(path)
     description = None
     built_by = at.catalog.versions.get(survey.map_id, survey.map_version).job_id
-    key = keys.map_description(built_by, survey.model)
+    key = keys.map_description(built_by, survey.model, detector.card.sha256)
     if blobs.exists(key):
         with blobs.local(key) as path:
             description = archive.load_arrays(path)

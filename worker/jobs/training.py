@@ -141,7 +141,7 @@ def _describe(at: Context, detector: Detector, model: ModelRecord, version: Vers
     with at.catalog.blobs.local(keys.map_tiles(version.job_id)) as path:
         tiles = archive.load_tiles(path)
     description = detector.describe(tiles, progress=lambda _, share: at.report("describing", share))
-    key = keys.map_description(version.job_id, model.model)
+    key = keys.map_description(version.job_id, model.model, detector.card.sha256)
     put(at, key, lambda path: archive.save_arrays(path, description))
 
 

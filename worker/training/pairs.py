@@ -15,7 +15,7 @@ from worker.training.augmentation import Augmentation, Nuisance, augmented, seco
 from worker.training.dataset import TileSet
 
 UNCHANGED, CHANGED, DIFFERENT = 0, 1, 2
-SAMPLE_POINTS = 128  #: of the Chamfer branch (paper, Section 3.6.3)
+SAMPLE_POINTS = 128  #: of the Chamfer branch in the paper (Section 3.6.3)
 STORED_JITTER = 0.0001  #: metres, where the stored reference patch itself comes back
 
 
@@ -24,11 +24,20 @@ class PairSettings:
     """How pairs are made; the defaults are the paper's but for those that say so."""
 
     patch_points: int = 4096  #: points of a padded patch
+    chamfer_points: int | None = (
+        None  #: ours: the Chamfer branch compares all points of both patches; the paper's is 128 of each
+    )
     shares: tuple[float, float, float] = (0.50, 0.35, 0.15)  #: of the three classes
     rerun_share: float = (
         0.7  #: of unchanged pairs of one observation: sampled anew, the rest are stored patches
     )
-    revisit_share: float = 0.9  #: ours: pairs of both visits, where there are two; 0 is the paper's protocol
+    stored_still: bool = (
+        True  #: ours: a stored patch that comes back is not augmented either, nor a change of one
+    )
+    edited_share: float = (
+        0.6  #: ours: of changed pairs, those of whole things added, removed or moved, where there are any
+    )
+    revisit_share: float = 0.7  #: ours: pairs of both visits, where there are two; 0 is the paper's protocol
     revisit_intensity: float = 0.0  #: ours: of the nuisance on such pairs, which have an honest one
     changed_intensity: float = 0.5  #: of the nuisance on changed pairs
     magnitude: tuple[float, float] = (0.10, 0.50)  #: metres
@@ -43,7 +52,15 @@ class PairSettings:
 
 
 #: Section 3.5 to the letter; docs/decisions/0006 says why it is not the default.
-PAPER_PAIRS = PairSettings(revisit_share=0.0, min_shown=0, symmetries=False, twins=False)
+PAPER_PAIRS = PairSettings(
+    chamfer_points=SAMPLE_POINTS,
+    stored_still=False,
+    edited_share=0.0,
+    revisit_share=0.0,
+    min_shown=0,
+    symmetries=False,
+    twins=False,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,8 +69,6 @@ class Pair:
 
     reference: Points  #: (n, 3) float32, metres, tile-centre frame: a patch's distinct points
     current: Points  #: (m, 3)
-    reference_sample: Points  #: (128, 3), for the Chamfer branch
-    current_sample: Points  #: (128, 3)
     label: int  #: 0 unchanged, 1 changed, 2 different place
 
 
@@ -63,13 +78,21 @@ class Batch:
 
     points: Points  #: (P, 3) float32: 2 B clouds end to end, references first, each with its centroid at 0
     sizes: list[int]  #: of the clouds
-    reference_sample: Points  #: (B, 128, 3)
-    current_sample: Points  #: (B, 128, 3)
+    chamfer_points: Points  #: (Q, 3) in the same order, tile-centre frame: what the Chamfer branch compares
+    chamfer_sizes: list[int]
     labels: NDArray[np.int64]  #: (B,)
 
 
-#: A tile's dense points seen first and second, and whether that was on two visits.
-Looks = tuple[Points, Points, bool]
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Looks:
+    """Dense looks at one tile, (n, 3) each, between which nothing changed, and at what changed where it did."""
+
+    unchanged: tuple[Points, Points]
+    changed: tuple[Points, Points] | None = (
+        None  #: whole things came, went or moved; None: a synthetic change is due
+    )
+    revisit: bool  #: of two visits, not one tile twice
+    still: bool = False  #: the stored patch itself comes back
 
 
 class PairMaker:
@@ -81,6 +104,7 @@ class PairMaker:
         self._tiles = tiles
         self._settings = settings
         self._half = (np.asarray(tiles.tile_size) / 2).astype(np.float32)
+        self._edited = np.flatnonzero([len(points) > 0 for points in tiles.points_c])
 
     def batches(self, count: int, size: int, rng: np.random.Generator) -> Iterator[Batch]:
         """`count` pairs in the classes' exact shares, `size` at a time; a last few are left out.
@@ -91,15 +115,15 @@ class PairMaker:
         ready: list[Pair] = []
         groups = composition(count, self._settings.shares, twins=self._settings.twins)
         for place in rng.permutation(len(groups)):
-            looks = self._two_looks(rng)
+            looks = self._looks(rng, changed=CHANGED in groups[place])
             ready += [self.pair(label, rng, looks) for label in groups[place]]
             if len(ready) >= size:
-                yield batched(ready[:size])
+                yield self._batched(ready[:size], rng)
                 ready = ready[size:]
 
     def pair(self, label: int, rng: np.random.Generator, looks: Looks | None = None) -> Pair:
         """One example of a class, of the given looks where the class is of one tile."""
-        looks = looks or self._two_looks(rng)
+        looks = looks or self._looks(rng, changed=label == CHANGED)
         settings = self._settings
         if label == DIFFERENT:
             reference, current = self._different(rng)
@@ -109,22 +133,26 @@ class PairMaker:
             reference, current = self._unchanged(looks, rng)
         if settings.symmetries:
             reference, current = turned_alike(reference, current, rng)
-        reference = augmented(reference, settings.augmentation, rng)
-        current = augmented(current, settings.augmentation, rng)
-        return Pair(reference, current, self._sample(reference, rng), self._sample(current, rng), label)
+        if label == DIFFERENT or not (looks.still and settings.stored_still):
+            reference = augmented(reference, settings.augmentation, rng)
+            current = augmented(current, settings.augmentation, rng)
+        return Pair(reference, current, label)
 
     def _unchanged(self, looks: Looks, rng: np.random.Generator) -> tuple[Points, Points]:
-        first, second, revisit = looks
-        if not revisit and rng.random() >= self._settings.rerun_share:
-            stored = self._patch(first, rng)
+        if looks.still:
+            stored = self._patch(looks.unchanged[0], rng)
             return stored, (stored + rng.normal(scale=STORED_JITTER, size=stored.shape)).astype(np.float32)
-        intensity = self._settings.revisit_intensity if revisit else 1.0
-        return self._sampled(first, second, intensity, rng)
+        intensity = self._settings.revisit_intensity if looks.revisit else 1.0
+        return self._sampled(*looks.unchanged, intensity, rng)
 
     def _changed(self, looks: Looks, rng: np.random.Generator) -> tuple[Points, Points]:
         settings = self._settings
-        first, second, revisit = looks
-        intensity = settings.revisit_intensity if revisit else settings.changed_intensity
+        intensity = settings.revisit_intensity if looks.revisit else settings.changed_intensity
+        if looks.changed is not None:
+            return self._sampled(*looks.changed, intensity, rng)
+        first, second = looks.unchanged
+        if looks.still and settings.stored_still:
+            intensity = 0.0
         return self._sampled(first, changed(second, settings, self._half, rng), intensity, rng)
 
     def _different(self, rng: np.random.Generator) -> tuple[Points, Points]:
@@ -146,13 +174,21 @@ class PairMaker:
         away = np.linalg.norm(tiles.centres - tiles.centres[i], axis=1) >= self._settings.min_separation
         return np.flatnonzero(away | (tiles.buildings != tiles.buildings[i]))
 
-    def _two_looks(self, rng: np.random.Generator) -> Looks:
-        """Two dense looks at a random tile, and whether they are of two visits (in either order)."""
-        i = int(rng.integers(len(self._tiles)))
-        a, b = self._tiles.points_a[i], self._tiles.points_b[i]
-        if len(b) == 0 or rng.random() >= self._settings.revisit_share:
-            return a, a, False
-        return (a, b, True) if rng.random() < 0.5 else (b, a, True)
+    def _looks(self, rng: np.random.Generator, *, changed: bool) -> Looks:
+        """At a random tile; where a change is wanted, often at one that has a real one. In either order of visits."""
+        tiles, settings = self._tiles, self._settings
+        if changed and len(self._edited) and rng.random() < settings.edited_share:
+            i = int(rng.choice(self._edited))
+            a, b, c = tiles.points_a[i], tiles.points_b[i], tiles.points_c[i]
+            forth = rng.random() < 0.5
+            return Looks(
+                unchanged=(a, b) if forth else (b, a), changed=(a, c) if forth else (c, a), revisit=True
+            )
+        i = int(rng.integers(len(tiles)))
+        a, b = tiles.points_a[i], tiles.points_b[i]
+        if len(b) == 0 or rng.random() >= settings.revisit_share:
+            return Looks(unchanged=(a, a), revisit=False, still=rng.random() >= settings.rerun_share)
+        return Looks(unchanged=(a, b) if rng.random() < 0.5 else (b, a), revisit=True)
 
     def _sampled(
         self, first: Points, second: Points, intensity: float, rng: np.random.Generator
@@ -164,10 +200,24 @@ class PairMaker:
         """The distinct points of a patch: what repeats would add, a max-pool does not see."""
         return patch(points, size=self._settings.patch_points, seed=int(rng.integers(2**31))).distinct
 
-    def _sample(self, distinct: Points, rng: np.random.Generator) -> Points:
-        """(128, 3) of the padded patch without replacement, drawn anew each time (paper, Section 3.6.3)."""
-        places = rng.choice(self._settings.patch_points, SAMPLE_POINTS, replace=False)
-        return distinct[places % len(distinct)]
+    def _batched(self, pairs: list[Pair], rng: np.random.Generator) -> Batch:
+        """References before currents, every cloud about its centroid."""
+        clouds = [pair.reference for pair in pairs] + [pair.current for pair in pairs]
+        compared = [self._compared(cloud, rng) for cloud in clouds]
+        return Batch(
+            np.concatenate([cloud - cloud.mean(axis=0) for cloud in clouds]),
+            [len(cloud) for cloud in clouds],
+            np.concatenate(compared),
+            [len(cloud) for cloud in compared],
+            np.array([pair.label for pair in pairs], dtype=np.int64),
+        )
+
+    def _compared(self, distinct: Points, rng: np.random.Generator) -> Points:
+        """All points, or so many of the padded patch without replacement, drawn anew each time (paper, Section 3.6.3)."""
+        count = self._settings.chamfer_points
+        if count is None:
+            return distinct
+        return distinct[rng.choice(self._settings.patch_points, count, replace=False) % len(distinct)]
 
 
 def changed(points: Points, settings: PairSettings, half: Half, rng: np.random.Generator) -> Points:
@@ -204,15 +254,3 @@ def composition(
         *[(CHANGED,)] * (changed_count - both),
         *[(DIFFERENT,)] * different,
     ]
-
-
-def batched(pairs: list[Pair]) -> Batch:
-    """References before currents, every cloud about its centroid."""
-    clouds = [pair.reference for pair in pairs] + [pair.current for pair in pairs]
-    return Batch(
-        np.concatenate([cloud - cloud.mean(axis=0) for cloud in clouds]),
-        [len(cloud) for cloud in clouds],
-        np.stack([pair.reference_sample for pair in pairs]),
-        np.stack([pair.current_sample for pair in pairs]),
-        np.array([pair.label for pair in pairs], dtype=np.int64),
-    )

@@ -193,19 +193,20 @@ class Run:
         rng = np.random.default_rng((self._settings.seed, 0))
         sides, statistics = [], []
         for batch in self._makers[0].batches(SETTLING_PAIRS, self._settings.batch, rng):
-            points, reference_sample, current_sample = self._tensors(batch)
+            points, compared = self._tensors(batch)
             sides.append(self._network.encoder(points, batch.sizes)[0].chunk(2))
-            statistics.append(chamfer_statistics(reference_sample, current_sample))
+            clouds = torch.split(compared, batch.chamfer_sizes)
+            statistics.append(chamfer_statistics(clouds[: len(clouds) // 2], clouds[len(clouds) // 2 :]))
         reference, current = (torch.cat(side) for side in zip(*sides, strict=True))
         self._network.head.settle(reference, current, torch.cat(statistics))
 
     def _forward(self, batch: Batch) -> PairOutput:
-        points, reference_sample, current_sample = self._tensors(batch)
-        output: PairOutput = self._network(points, batch.sizes, reference_sample, current_sample)
+        points, compared = self._tensors(batch)
+        output: PairOutput = self._network(points, batch.sizes, compared, batch.chamfer_sizes)
         return output
 
     def _tensors(self, batch: Batch) -> list[Tensor]:
-        arrays = (batch.points, batch.reference_sample, batch.current_sample)
+        arrays = (batch.points, batch.chamfer_points)
         return [torch.from_numpy(array).to(self._device) for array in arrays]
 
     def _save(self, name: str, more: dict[str, Any]) -> None:

@@ -18,12 +18,12 @@ from worker.pipeline.tiling import TileGrid, TilePairs, Tiles
 def network() -> SpicdNetwork:
     torch.manual_seed(0)
     net = SpicdNetwork()
-    sample = torch.rand(4, 128, 3)
+    compared = torch.rand(8 * 128, 3)
     with torch.no_grad():
         for parameter in net.parameters():  # away from the identity, so that every layer matters
             parameter.add_(0.02 * torch.randn_like(parameter))
         for _ in range(20):
-            net(torch.rand(8 * 200, 3) - 0.5, [200] * 8, sample, sample)
+            net(torch.rand(8 * 200, 3) - 0.5, [200] * 8, compared, [128] * 8)
     return net.eval()
 
 

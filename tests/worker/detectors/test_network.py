@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import sys
+
 import pytest
 import torch
 from torch import nn
 
-from worker.detectors.spicd_net.chamfer import chamfer_statistics
+from worker.detectors.spicd_net.chamfer import chamfer_statistics, nearest_distances
 from worker.detectors.spicd_net.frozen import FrozenEncoder
 from worker.detectors.spicd_net.layers import Moments, NormedLinear, PooledLinear
 from worker.detectors.spicd_net.network import PairHead, SpicdNetwork, TransformNet, fused
@@ -111,18 +113,38 @@ def test_the_frozen_encoder_on_distinct_points_is_the_network_on_repeated_ones(n
 
 
 def test_chamfer_statistics_of_a_shifted_copy_are_the_shift():
-    grid = torch.stack(torch.meshgrid(*[torch.arange(5.0)] * 3, indexing="ij"), -1).reshape(1, 125, 3)
+    grid = torch.stack(torch.meshgrid(*[torch.arange(5.0)] * 3, indexing="ij"), -1).reshape(125, 3)
     shifted = grid + torch.tensor([0.0, 0.0, 0.3])
     expected = torch.full((1, 8), 1.3).log()
-    assert torch.allclose(chamfer_statistics(grid, shifted), expected, atol=1e-4)
+    assert torch.allclose(chamfer_statistics([grid], [shifted]), expected, atol=1e-4)
 
 
 def test_chamfer_statistics_see_the_lone_point_in_its_direction_only():
-    near = torch.zeros(1, 128, 3)
+    near = torch.zeros(128, 3)
     far = near.clone()
-    far[0, 0, 0] = 2.0
-    statistics = chamfer_statistics(near, far).expm1()
+    far[0, 0] = 2.0
+    statistics = chamfer_statistics([near], [far]).expm1()
     assert statistics[0].tolist() == pytest.approx([0, 0, 0, 0, 2 / 128, 2, 0, 0], abs=1e-5)
+
+
+def test_a_cloud_and_itself_in_another_order_are_at_distance_zero_to_the_bit():
+    cloud = torch.rand(300, 3)
+    assert not chamfer_statistics([cloud], [cloud[torch.randperm(300)]]).any()
+
+
+def test_clouds_of_a_batch_are_compared_pair_by_pair_whatever_their_sizes():
+    clouds = [torch.rand(size, 3) for size in (40, 70, 55, 30)]
+    together = chamfer_statistics(clouds[:2], clouds[2:])
+    alone = [chamfer_statistics([clouds[i]], [clouds[i + 2]])[0] for i in range(2)]
+    assert torch.equal(together, torch.stack(alone))
+
+
+def test_the_tree_finds_the_distances_of_all_pairs(monkeypatch):
+    a, b = torch.rand(200, 3), torch.rand(150, 3)
+    by_tree = nearest_distances(a, b)
+    monkeypatch.setitem(sys.modules, "scipy.spatial", None)  # as on a machine that only trains
+    for found, expected in zip(by_tree, nearest_distances(a, b), strict=True):
+        assert torch.allclose(found, expected, atol=1e-6)
 
 
 def test_the_chamfer_feature_is_gated_in_training_only():

@@ -25,10 +25,7 @@ def test_scores_are_probabilities_where_observed_and_nan_elsewhere(detector, pai
 
 def test_a_kept_description_gives_the_same_scores(detector, pairs):
     description = detector.describe(pairs.reference)
-    assert {name: array.shape for name, array in description.items()} == {
-        "descriptors": (5, 1024),
-        "samples": (5, 128, 3),
-    }
+    assert {name: array.shape for name, array in description.items()} == {"descriptors": (5, 1024)}
     kept, fresh = detector.score(pairs, description=description), detector.score(pairs)
     assert np.array_equal(kept.probabilities, fresh.probabilities, equal_nan=True)
 
@@ -39,9 +36,23 @@ def test_distinct_points_give_the_scores_of_the_padded_patch(detector, pairs):
     assert np.nanstd(distinct.change) > 1e-4  # the tiles are told apart, so that equality says something
 
 
-def test_samples_are_in_the_frame_of_their_tile(detector, pairs):
-    samples = detector.describe(pairs.reference)["samples"]
-    assert (np.abs(samples) <= np.array([0.75, 0.75, 0.5]) + 1e-4).all()
+@pytest.mark.parametrize("chamfer_points", [None, 128])
+def test_a_survey_that_finds_the_same_points_differs_by_nothing_but_the_sample(
+    card, network, pairs, chamfer_points
+):
+    """All points of equal tiles are at distance 0; two samples of them are not, and the scores say so."""
+    needs = card.preprocessing.model_copy(update={"chamfer_points": chamfer_points})
+    detector = SpicdNet(card.model_copy(update={"preprocessing": needs}), network, torch.device("cpu"))
+    same = type(pairs)(reference=pairs.reference, current=pairs.reference.points, observed=pairs.observed)
+    statistics = detector.statistics(same)[pairs.observed]
+    assert (statistics == 0).all() == (chamfer_points is None)
+    assert statistics.max() < 0.5
+
+
+def test_a_sample_larger_than_the_patch_is_refused(card, network):
+    needs = card.preprocessing.model_copy(update={"chamfer_points": card.preprocessing.patch_points + 1})
+    with pytest.raises(ValueError, match="Chamfer sample"):
+        SpicdNet(card.model_copy(update={"preprocessing": needs}), network, torch.device("cpu"))
 
 
 def test_a_description_of_another_map_is_refused(detector, pairs):

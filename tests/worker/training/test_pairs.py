@@ -23,7 +23,13 @@ from worker.training.pairs import PAPER_PAIRS, PairMaker, PairSettings, altered,
 STILL = Augmentation(jitter=0, dropout=0, shift=0, yaw=0)
 SAME_LOOK = Nuisance(yaw=0, shift=0, dropout=(0, 0), magnitude=(-0.02, -0.02))  # 0.001 + 0.05 m is 0
 PLAIN = PairSettings(
-    patch_points=512, min_shown=0, augmentation=STILL, nuisance=SAME_LOOK, symmetries=False, rerun_share=1.0
+    patch_points=512,
+    min_shown=0,
+    augmentation=STILL,
+    nuisance=SAME_LOOK,
+    symmetries=False,
+    rerun_share=1.0,
+    edited_share=0.0,
 )
 
 
@@ -53,6 +59,7 @@ def test_the_papers_preset_is_section_3_5():
     assert preset.nuisance.dropout == (0.10, 0.50)
     # and nothing of ours
     assert (preset.revisit_share, preset.min_shown, preset.symmetries, preset.twins) == (0.0, 0, False, False)
+    assert (preset.chamfer_points, preset.edited_share, preset.stored_still) == (128, 0.0, False)
 
 
 def test_the_papers_pairs_are_of_one_dense_tile_seven_in_ten_sampled_anew(tiles):
@@ -102,7 +109,7 @@ def test_where_no_two_tiles_are_3_m_apart_there_is_no_different_pair(tiles):
 def test_a_changed_pair_and_its_unchanged_one_look_at_the_same_tile(tiles):
     maker = PairMaker(tiles, replace(PLAIN, shares=(0.5, 0.5, 0.0), revisit_share=1.0))
     batch = next(maker.batches(2, 2, np.random.default_rng(0)))
-    first, second = np.split(batch.points, np.cumsum(batch.sizes)[:-1])[:2]
+    first, second = np.split(batch.chamfer_points, np.cumsum(batch.chamfer_sizes)[:-1])[:2]
     assert sorted(batch.labels) == [0, 1]
     assert rows(first) == rows(second)  # the references
 
@@ -128,7 +135,55 @@ def test_a_batch_holds_both_branches_end_to_end_about_their_centroids(tiles):
     assert sum(batch.sizes) == len(batch.points)
     for cloud in np.split(batch.points, np.cumsum(batch.sizes)[:-1]):
         assert cloud.mean(axis=0) == pytest.approx(0, abs=1e-5)
-    assert batch.reference_sample.shape == batch.current_sample.shape == (8, 128, 3)
+    assert batch.chamfer_sizes == batch.sizes  # all points are compared, in the frame of the tile
+    moved = np.split(batch.chamfer_points - batch.points, np.cumsum(batch.sizes)[:-1])
+    assert max(np.ptp(cloud, axis=0).max() for cloud in moved) < 1e-6
+    assert max(np.abs(cloud).max() for cloud in moved) > 0.05
+
+
+def test_the_papers_chamfer_branch_gets_128_points_of_each_patch(tiles):
+    batch = next(PairMaker(tiles, PAPER_PAIRS).batches(16, 8, np.random.default_rng(0)))
+    assert batch.chamfer_sizes == [128] * 16
+    for sample, size in zip(batch.chamfer_points.reshape(16, 128, 3), batch.sizes, strict=True):
+        assert len(rows(sample)) > 0.5 * min(size, 128)  # of a padded patch, so a few points come twice
+
+
+def test_of_changed_pairs_the_given_share_is_of_whole_things_beside_an_honest_unchanged_pair(tiles):
+    settings = replace(PLAIN, shares=(0.5, 0.5, 0.0), edited_share=0.6, revisit_share=1.0)
+    maker, found = PairMaker(tiles, settings), 0
+    real = {frozenset(rows(points)) for points in tiles.points_c if len(points)}
+    assert len(real) == len(tiles) / 2
+    for seed in range(100):
+        batch = next(maker.batches(2, 2, np.random.default_rng(seed)))
+        clouds = np.split(batch.chamfer_points, np.cumsum(batch.chamfer_sizes)[:-1])
+        pairs = {label: (clouds[i], clouds[i + 2]) for i, label in enumerate(batch.labels.tolist())}
+        edited = [frozenset(rows(cloud)) in real for cloud in pairs[1]]
+        assert not any(frozenset(rows(cloud)) in real for cloud in pairs[0])
+        if any(edited):
+            found += 1
+            same = [rows(a) == rows(b) for a, b in zip(pairs[0], pairs[1], strict=True)]
+            assert sum(same) == 1  # the other look is that of the unchanged pair
+            assert sorted(edited) == [False, True]
+    assert 45 < found < 75
+
+
+def test_a_set_without_edits_has_synthetic_changes_alone(tiles):
+    bare = replace(tiles, points_c=tuple(points[:0] for points in tiles.points_c))
+    maker = PairMaker(bare, replace(PLAIN, edited_share=1.0, revisit_share=0.0))
+    pair = maker.pair(1, np.random.default_rng(0))
+    assert rows(pair.reference) != rows(pair.current)
+
+
+def test_a_stored_patch_comes_back_without_augmentation_and_so_does_a_change_of_one(tiles):
+    settings = replace(
+        PairSettings(patch_points=512, symmetries=False), revisit_share=0.0, rerun_share=0.0, edited_share=0.0
+    )
+    for seed in range(10):
+        same = PairMaker(tiles, settings).pair(0, np.random.default_rng(seed))
+        assert np.abs(same.current - same.reference).max() < 6 * 0.0001
+        changed = PairMaker(tiles, settings).pair(1, np.random.default_rng(seed))
+        assert rows(changed.reference) in [rows(points) for points in tiles.points_a]
+        assert len(rows(changed.current) & rows(changed.reference)) > 0.6 * len(changed.reference)
 
 
 def test_the_same_stream_gives_the_same_pairs(tiles):
@@ -224,7 +279,9 @@ def test_a_saved_set_comes_back_within_half_a_millimetre(tiles, tmp_path):
     save_tiles(tiles, tmp_path / "tiles.npz")
     loaded = load_tiles(tmp_path / "tiles.npz")
     for before, after in zip(
-        (*tiles.points_a, *tiles.points_b), (*loaded.points_a, *loaded.points_b), strict=True
+        (*tiles.points_a, *tiles.points_b, *tiles.points_c),
+        (*loaded.points_a, *loaded.points_b, *loaded.points_c),
+        strict=True,
     ):
         assert after == pytest.approx(before, abs=5e-4)
     assert np.array_equal(loaded.centres, tiles.centres)

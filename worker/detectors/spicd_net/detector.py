@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -11,7 +11,7 @@ from torch import Tensor
 
 from worker.detectors.card import Card
 from worker.detectors.detector import TileScores
-from worker.detectors.spicd_net.chamfer import SAMPLE_POINTS, chamfer_statistics
+from worker.detectors.spicd_net.chamfer import STATISTICS, chamfer_statistics
 from worker.detectors.spicd_net.frozen import FrozenEncoder
 from worker.detectors.spicd_net.network import DESCRIPTOR, SpicdNetwork
 from worker.pipeline.patches import Patch, patch
@@ -28,15 +28,14 @@ REFERENCE, CURRENT = 0, 1  #: streams of the Chamfer sample, so that two equal p
 class SpicdNet:
     """Detector (worker.detectors.detector) around the network of the paper's Section 3.6.
 
-    A reference is described by the encoder's output and the Chamfer sample of its patch; both depend on the
-    reference alone, so a map keeps them and a survey encodes its own tiles only.
+    A reference is described by the encoder's output, which depends on the reference alone, so a map keeps it and a
+    survey encodes its own tiles only.
     """
 
     def __init__(self, card: Card, network: SpicdNetwork, device: torch.device) -> None:
-        if card.preprocessing.patch_points < SAMPLE_POINTS:
-            raise ValueError(
-                f"the Chamfer sample takes {SAMPLE_POINTS} of a patch's points without replacement"
-            )
+        sample = card.preprocessing.chamfer_points
+        if sample is not None and card.preprocessing.patch_points < sample:
+            raise ValueError(f"the Chamfer sample takes {sample} of a patch's points without replacement")
         self.card = card
         self._device = device
         self._network = network.to(device).eval()
@@ -54,11 +53,9 @@ class SpicdNet:
         return dict(self._network.state_dict())
 
     def describe(self, tiles: Tiles, *, progress: Progress = silent) -> Arrays:
-        """`descriptors` (T, 1024) float32 and `samples` (T, 128, 3) float32, metres, tile-centre frame."""
-        indices = np.arange(len(tiles.points))
-        return self._described(
-            tiles.points, tiles.grid.centers(tiles.indices), indices, REFERENCE, progress, "describe", False
-        )
+        """`descriptors` (T, 1024) float32."""
+        patches = self._patches(tiles, tiles.points, np.arange(len(tiles.points)))
+        return {"descriptors": self._encoded(patches, progress, "describe", padded=False)}
 
     def score(
         self,
@@ -74,41 +71,56 @@ class SpicdNet:
         both branches on the padded patches of the paper and keeps nothing: the same scores within 1e-4, for
         the bench. Raises ValueError for a description of other tiles.
         """
-        centres = pairs.reference.grid.centers(pairs.reference.indices)
         observed = np.flatnonzero(pairs.observed)
         probabilities = np.full((len(pairs.observed), 3), np.nan, dtype=np.float32)
         if len(observed) == 0:
             return TileScores(probabilities=probabilities)
+        before, after = self._both(pairs, observed)
         if description is None or padded:
-            reference = self._described(
-                pairs.reference.points, centres, observed, REFERENCE, progress, "describe", padded
-            )
+            known = self._encoded(before, progress, "describe", padded=padded)
         else:
-            reference = _selected(description, observed, tiles=len(pairs.observed))
-        current = self._described(pairs.current, centres, observed, CURRENT, progress, "score", padded)
-        probabilities[observed] = self._compare(reference, current)
+            known = _selected(description, observed, tiles=len(pairs.observed))
+        found = self._encoded(after, progress, "score", padded=padded)
+        probabilities[observed] = self._probabilities(known, found, self._statistics(before, after))
         return TileScores(probabilities=probabilities)
 
-    def _described(
-        self,
-        points: tuple[Points, ...],
-        centres: NDArray[np.float64],
-        indices: NDArray[np.intp],
-        stream: int,
-        progress: Progress,
-        stage: str,
-        padded: bool,
-    ) -> Arrays:
-        preprocessing = self.card.preprocessing
-        descriptors = np.empty((len(indices), DESCRIPTOR), dtype=np.float32)
-        samples = np.empty((len(indices), SAMPLE_POINTS, 3), dtype=np.float32)
-        chosen = _sample_indices(preprocessing.patch_points, preprocessing.seed, stream)
-        for row, tile in _reporting(indices, progress, stage):
-            local = (points[tile] - centres[tile]).astype(np.float32)
-            prepared = patch(local, size=preprocessing.patch_points, seed=preprocessing.seed)
+    def statistics(self, pairs: TilePairs) -> NDArray[np.float32]:
+        """(T, 8) what the Chamfer branch is given; NaN where not observed."""
+        observed = np.flatnonzero(pairs.observed)
+        found = np.full((len(pairs.observed), STATISTICS), np.nan, np.float32)
+        if len(observed):
+            found[observed] = self._statistics(*self._both(pairs, observed)).cpu().numpy()
+        return found
+
+    def _both(self, pairs: TilePairs, chosen: NDArray[np.intp]) -> tuple[list[Patch], list[Patch]]:
+        return (
+            self._patches(pairs.reference, pairs.reference.points, chosen),
+            self._patches(pairs.reference, pairs.current, chosen),
+        )
+
+    def _patches(self, tiles: Tiles, points: Sequence[Points], indices: NDArray[np.intp]) -> list[Patch]:
+        """Of the tiles at these indices, with these points (n, 3), metres, map frame."""
+        preprocessing, centres = self.card.preprocessing, tiles.grid.centers(tiles.indices)
+        return [
+            patch(
+                (points[tile] - centres[tile]).astype(np.float32),
+                size=preprocessing.patch_points,
+                seed=preprocessing.seed,
+            )
+            for tile in indices.tolist()
+        ]
+
+    def _encoded(
+        self, patches: Sequence[Patch], progress: Progress, stage: str, *, padded: bool
+    ) -> NDArray[np.float32]:
+        """(t, 1024)"""
+        descriptors = np.empty((len(patches), DESCRIPTOR), dtype=np.float32)
+        for row, prepared in enumerate(patches):
+            if row % TILES_PER_REPORT == 0:
+                progress(stage, row / len(patches))
             descriptors[row] = self._encode(prepared, padded).cpu().numpy()
-            samples[row] = prepared.at(chosen)
-        return {"descriptors": descriptors, "samples": samples}
+        progress(stage, 1.0)
+        return descriptors
 
     def _encode(self, prepared: Patch, padded: bool) -> Tensor:
         if padded:
@@ -119,39 +131,37 @@ class SpicdNet:
         distinct = torch.from_numpy(prepared.distinct).to(self._device)
         return self._encoder(distinct, torch.from_numpy(prepared.centroid).to(self._device))
 
+    def _statistics(self, before: Sequence[Patch], after: Sequence[Patch]) -> Tensor:
+        return chamfer_statistics(self._compared(before, REFERENCE), self._compared(after, CURRENT))
+
+    def _compared(self, patches: Sequence[Patch], stream: int) -> list[Tensor]:
+        """What of each patch the Chamfer branch sees, (n, 3)."""
+        preprocessing = self.card.preprocessing
+        if preprocessing.chamfer_points is None:
+            clouds = [prepared.distinct for prepared in patches]
+        else:
+            places = np.random.default_rng((preprocessing.seed, stream)).choice(
+                preprocessing.patch_points, preprocessing.chamfer_points, replace=False
+            )
+            clouds = [prepared.at(places) for prepared in patches]
+        return [torch.from_numpy(cloud).to(self._device) for cloud in clouds]
+
     @torch.inference_mode()
-    def _compare(self, reference: Arrays, current: Arrays) -> NDArray[np.float32]:
-        """Two descriptions of the same (t,) tiles -> (t, 3) probabilities."""
-        f_ref, f_cur, s_ref, s_cur = (
-            torch.from_numpy(np.ascontiguousarray(side[name], dtype=np.float32)).to(self._device)
-            for name in ("descriptors", "samples")
-            for side in (reference, current)
-        )
-        logits: Tensor = self._network.head(f_ref, f_cur, chamfer_statistics(s_ref, s_cur))
+    def _probabilities(
+        self, reference: NDArray[np.float32], current: NDArray[np.float32], statistics: Tensor
+    ) -> NDArray[np.float32]:
+        """Descriptors (t, 1024) of both sides and (t, 8) -> (t, 3)"""
+        f_ref, f_cur = (torch.from_numpy(side).to(self._device) for side in (reference, current))
+        logits: Tensor = self._network.head(f_ref, f_cur, statistics)
         probabilities: NDArray[np.float32] = logits.softmax(dim=1).cpu().numpy()
         return probabilities
 
 
-def _sample_indices(size: int, seed: int, stream: int) -> NDArray[np.int64]:
-    """(128,) of the padded patch's points, without replacement."""
-    return np.random.default_rng((seed, stream)).choice(size, SAMPLE_POINTS, replace=False)
-
-
-def _selected(description: Arrays, observed: NDArray[np.intp], *, tiles: int) -> Arrays:
-    expected = {"descriptors": (tiles, DESCRIPTOR), "samples": (tiles, SAMPLE_POINTS, 3)}
-    for name, shape in expected.items():
-        found = description[name].shape if name in description else None
-        if found != shape:
-            raise ValueError(
-                f"the description's {name} are {found}, not {shape}: it is of another map or model"
-            )
-    return {name: description[name][observed] for name in expected}
-
-
-def _reporting(indices: NDArray[np.intp], progress: Progress, stage: str) -> Iterator[tuple[int, int]]:
-    """(row, tile) of each index, with a report before every few and at the end."""
-    for row, tile in enumerate(indices.tolist()):
-        if row % TILES_PER_REPORT == 0:
-            progress(stage, row / len(indices))
-        yield row, tile
-    progress(stage, 1.0)
+def _selected(description: Arrays, observed: NDArray[np.intp], *, tiles: int) -> NDArray[np.float32]:
+    found = description.get("descriptors")
+    if found is None or found.shape != (tiles, DESCRIPTOR):
+        shape = None if found is None else found.shape
+        raise ValueError(
+            f"the description's descriptors are {shape}, not {(tiles, DESCRIPTOR)}: it is of another map or model"
+        )
+    return np.ascontiguousarray(found[observed], dtype=np.float32)

@@ -145,17 +145,19 @@ class SpicdNetwork(nn.Module):
         self.head = PairHead()
 
     def forward(
-        self, points: Tensor, sizes: list[int], reference_sample: Tensor, current_sample: Tensor
+        self, points: Tensor, sizes: list[int], chamfer_points: Tensor, chamfer_sizes: list[int]
     ) -> PairOutput:
         """B pairs as 2 B clouds of `sizes`, the references before the currents.
 
-        `points` is (P, 3) metres with each cloud's centroid at 0, the samples for the Chamfer branch are
-        (B, 128, 3) metres, tile-centre frame. Both branches are one batch: the same weights, and the same
-        statistics to normalise by.
+        `points` is (P, 3) metres with each cloud's centroid at 0. What the Chamfer branch compares is (Q, 3) metres,
+        tile-centre frame, as many clouds of `chamfer_sizes` in the same order. Both branches are one batch: the same
+        weights, and the same statistics to normalise by.
         """
         descriptors, a3, a64 = self.encoder(points, sizes)
         f_ref, f_cur = descriptors.chunk(2)
-        logits = self.head(f_ref, f_cur, chamfer_statistics(reference_sample, current_sample))
+        compared = torch.split(chamfer_points, chamfer_sizes)
+        half = len(compared) // 2
+        logits = self.head(f_ref, f_cur, chamfer_statistics(compared[:half], compared[half:]))
         return PairOutput(logits, (*a3.chunk(2), *a64.chunk(2)))
 
 

@@ -25,6 +25,7 @@ def open_measured(model_store: Path, model: str, weights: Path | None) -> Detect
         state = torch.load(weights, map_location="cpu", weights_only=True)
         own = {
             "patch_points": state["settings"]["pairs"]["patch_points"],
+            "chamfer_points": state["settings"]["pairs"].get("chamfer_points", 128),
             "seed": state["settings"]["seed"],
         }
         card = card.model_copy(
