@@ -1,7 +1,6 @@
 """`make bench`: seconds in each stage of a map and of a survey, and what the network costs.
 
-A simulated corridor of 25 scans with about 100,000 points each. Timings on a shared machine are worth little by
-themselves, so the ways of running the network are repeated in turn within one run and given as ratios too.
+A simulated corridor of 25 scans with about 100,000 points each.
 """
 
 from __future__ import annotations
@@ -10,7 +9,7 @@ import json
 import platform
 import resource
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -23,6 +22,7 @@ import torch
 from worker.detectors.card import MODEL_STORE
 from worker.detectors.spicd_net.detector import SpicdNet
 from worker.detectors.store import open_detector
+from worker.evaluation.network_bench import network_bench, resized
 from worker.evaluation.scenes import corridor
 from worker.evaluation.sensor import SimulatedScan
 from worker.evaluation.visits import visit
@@ -77,9 +77,7 @@ def bench(settings: BenchSettings, progress: Progress = silent) -> dict[str, Any
     """Run everything once and return the figures, JSON-ready; seconds unless the name says otherwise."""
     detector = open_detector(settings.model_store, settings.model)
     if not isinstance(detector, SpicdNet):
-        raise ValueError(
-            f"bench compares two ways of running SPICD-Net; {settings.model} is another detector"
-        )
+        raise ValueError(f"bench compares ways of running SPICD-Net; {settings.model} is another detector")
     pipeline = PipelineSettings().for_model(detector.card.preprocessing)
     with TemporaryDirectory(prefix="spicd-bench-") as folder:
         scratch = Path(folder)
@@ -93,8 +91,8 @@ def bench(settings: BenchSettings, progress: Progress = silent) -> dict[str, Any
         progress("one-scan survey", 0.0)
         with_prior = _survey(one, built, detector, pipeline, scratch)
         without = _survey(replace(one, pose=None), built, detector, pipeline, scratch)
-        pairs = _full_visit(second, first, built, count=settings.tiles)
-        network = _network(pairs, detector, settings, progress)
+        pairs = resized(_full_visit(second, first, built), settings.tiles)
+        network = network_bench(pairs, detector, repeats=settings.repeats, progress=progress)
     return {
         "machine": _machine(),
         "scene": {
@@ -192,60 +190,14 @@ def _survey(
 
 
 def _full_visit(
-    second: tuple[SimulatedScan, ...], first: tuple[SimulatedScan, ...], built: _Built, *, count: int
+    second: tuple[SimulatedScan, ...], first: tuple[SimulatedScan, ...], built: _Built
 ) -> TilePairs:
-    """The second visit at its true poses, so that nearly every tile is observed; `count` tiles, some twice."""
+    """The second visit at its true poses, so that nearly every tile is observed."""
     map_from_world = built.map_from_world(first)
     points = np.concatenate([scan.world_points for scan in second])
     moved = points @ map_from_world[:3, :3].T + map_from_world[:3, 3]
     fused = Voxels.of(moved, size=built.reference.voxel_size)
-    pairs = pair_tiles(built.tiles, fused.points, settings=PipelineSettings().tiling)
-    chosen = np.resize(np.flatnonzero(pairs.observed), count)
-    reference = pairs.reference
-    return TilePairs(
-        reference=Tiles(
-            grid=reference.grid,
-            indices=reference.indices[chosen],
-            points=tuple(reference.points[tile] for tile in chosen),
-        ),
-        current=tuple(pairs.current[tile] for tile in chosen),
-        observed=np.ones(len(chosen), bool),
-    )
-
-
-def _network(
-    pairs: TilePairs, detector: SpicdNet, settings: BenchSettings, progress: Progress
-) -> dict[str, Any]:
-    """Our way, the same without the cached reference, and the paper's way (padded patches, both branches)."""
-    description = detector.describe(pairs.reference)
-    ways: dict[str, Callable[[], Any]] = {
-        "cached_distinct": lambda: detector.score(pairs, description=description),
-        "uncached_distinct": lambda: detector.score(pairs),
-        "uncached_padded": lambda: detector.score(pairs, padded=True),
-    }
-    seconds: dict[str, list[float]] = {name: [] for name in ways}
-    scores: dict[str, Any] = {}
-    for turn in range(settings.repeats):
-        for number, (name, run) in enumerate(ways.items()):
-            progress("network", (turn + number / len(ways)) / settings.repeats)
-            begun = time.perf_counter()
-            scores[name] = run().probabilities
-            seconds[name].append(time.perf_counter() - begun)
-    plain = scores["uncached_padded"]
-    return {
-        "tiles": len(pairs.observed),
-        "distinct_points_per_tile": round(float(np.mean([len(points) for points in pairs.current]))),
-        "seconds": {name: _spread(values) for name, values in seconds.items()},
-        "times_faster_than_padded": {
-            name: round(float(np.median(seconds["uncached_padded"]) / np.median(values)), 1)
-            for name, values in seconds.items()
-        },
-        "largest_score_difference": float(max(np.abs(other - plain).max() for other in scores.values())),
-    }
-
-
-def _spread(values: list[float]) -> dict[str, float]:
-    return {"median": float(np.median(values)), "least": min(values), "most": max(values)}
+    return pair_tiles(built.tiles, fused.points, settings=PipelineSettings().tiling)
 
 
 def _pose_errors(

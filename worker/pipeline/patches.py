@@ -67,7 +67,7 @@ def farthest_points(points: Points, count: int, *, start: int) -> NDArray[np.int
     try:
         from fpsample import bucket_fps_kdline_sampling  # noqa: PLC0415 (optional where only training runs)
     except ImportError:
-        return _farthest_points_numpy(points, count, start=start)
+        return farthest_points_numpy(points, count, start=start)
     found = bucket_fps_kdline_sampling(points, count, h=_tree_height(len(points)), start_idx=start)
     return np.asarray(found, dtype=np.int64)
 
@@ -77,7 +77,8 @@ def _tree_height(n: int) -> int:
     return int(np.clip(np.log2(n) - 5, 3, 9))
 
 
-def _farthest_points_numpy(points: Points, count: int, *, start: int) -> NDArray[np.int64]:
+def farthest_points_numpy(points: Points, count: int, *, start: int) -> NDArray[np.int64]:
+    """Indices (count,) as `farthest_points` gives them, `start` counted in the cloud's own order; no library but NumPy."""
     chosen = np.empty(count, dtype=np.int64)
     nearest = np.full(len(points), np.inf, dtype=np.float32)
     for i in range(count):
