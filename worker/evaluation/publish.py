@@ -9,6 +9,7 @@ import argparse
 import hashlib
 import json
 import platform
+import shutil
 import sys
 from collections.abc import Mapping
 from dataclasses import asdict
@@ -33,6 +34,7 @@ from worker.training.calibration import (
     survey_pairs,
 )
 from worker.training.dataset import TileSet, load_tiles, split_tiles
+from worker.training.log import LOG
 from worker.training.pairs import PairSettings
 
 WEIGHTS = "weights.safetensors"
@@ -68,6 +70,7 @@ def publish(
     `unseen` is a training set of other buildings, on which the card's evaluation is measured; without one
     the validation tiles serve for that too, and the card says so. `about` adds to what the card says of the
     training; `beside` are other detectors by name, measured on the validation pairs at their own thresholds. `preprocessing` is the paper's where it is left out.
+    The training's log, where it lies beside the checkpoint, comes along.
     """
     state = torch.load(checkpoint, map_location="cpu", weights_only=True)
     settings, training_set = state["settings"], load_tiles(tiles)
@@ -107,11 +110,13 @@ def publish(
         "two independent visits, the second with a synthetic change or none (paper, Section 3.5.1), "
         f"no augmentation; precision and F1 for {PREVALENCE:.0%} changed tiles; threshold of the highest F1 on the validation tiles"
     )
-    return _write(
+    folder = _write(
         model_store / name / version,
         card.model_copy(update={"threshold": chosen.threshold, "evaluation": evaluation}),
         state["network"],
     )
+    _take_log(checkpoint.parent / LOG, folder / LOG)
+    return folder
 
 
 def change_scores(detector: SpicdNet, pairs: SurveyPairs) -> NDArray[np.float32]:
@@ -181,6 +186,14 @@ def _write(folder: Path, card: Card, weights: Weights) -> Path:
     text = json.dumps(signed.model_dump(mode="json"), indent=2, allow_nan=False)
     (folder / "card.json").write_text(text + "\n", encoding="utf-8")
     return folder
+
+
+def _take_log(log: Path, place: Path) -> None:
+    """None rather than that of an earlier training."""
+    if log.exists():
+        shutil.copyfile(log, place)
+    else:
+        place.unlink(missing_ok=True)
 
 
 def main() -> None:

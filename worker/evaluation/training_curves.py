@@ -19,7 +19,14 @@ Log = list[dict[str, float]]  #: a row an epoch, columns as in `worker.training.
 
 def draw_curves(folder: Path) -> None:
     """Write `curves.png` beside the log in the folder of a training. Raises OSError, and ValueError for another file."""
-    log = read_log(folder / LOG)
+    figure = curves(read_log(folder / LOG))
+    partial = folder / f"{CURVES}.partial"
+    FigureCanvasAgg(figure).print_png(partial)  # type: ignore[no-untyped-call]
+    partial.replace(folder / CURVES)
+
+
+def curves(log: Log) -> Figure:
+    """Loss on the left, accuracy on the right, of training and validation."""
     figure = Figure(figsize=(10, 4), dpi=120, layout="constrained")
     left, right = figure.subplots(1, 2)
     _draw(left, log, "train_loss", "validation_loss")
@@ -28,9 +35,7 @@ def draw_curves(folder: Path) -> None:
     _draw(right, log, "train_accuracy", "accuracy", scale=100)
     right.set_ylabel("accuracy (%)")
     right.set_ylim(0, 100)
-    partial = folder / f"{CURVES}.partial"
-    FigureCanvasAgg(figure).print_png(partial)  # type: ignore[no-untyped-call]
-    partial.replace(folder / CURVES)
+    return figure
 
 
 def read_log(path: Path) -> Log:

@@ -13,6 +13,7 @@ from worker.errors import DetectorUnavailable
 from worker.evaluation.publish import DEVIATIONS, change_scores, deviations, publish
 from worker.training.calibration import best_threshold, survey_pairs
 from worker.training.dataset import save_tiles, split_tiles
+from worker.training.log import LOG
 from worker.training.pairs import PairSettings
 from worker.training.settings import PAPER, TrainSettings
 from worker.training.trainer import train
@@ -61,6 +62,19 @@ def test_a_published_model_holds_the_checkpoints_weights(store):
     opened = open_detector(store, "spicd-net/3", device="cpu")
     for name, tensor in opened._network.state_dict().items():
         assert torch.equal(tensor, state[name])
+
+
+def test_the_trainings_log_comes_along_and_that_of_an_earlier_one_goes(store, tmp_path):
+    run = store.parent / "run"
+    assert (store / "spicd-net" / "3" / LOG).read_bytes() == (run / LOG).read_bytes()
+    alone = tmp_path / "alone" / "best.pt"
+    alone.parent.mkdir()
+    alone.write_bytes((run / "best.pt").read_bytes())
+    tiles, models = store.parent / "tiles.npz", tmp_path / "store"
+    folder = publish(run / "best.pt", tiles, models, summary="")
+    assert (folder / LOG).exists()
+    assert publish(alone, tiles, models, summary="") == folder
+    assert not (folder / LOG).exists()
 
 
 def test_a_card_names_the_deviations_of_its_own_training():

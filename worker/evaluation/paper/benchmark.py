@@ -16,7 +16,7 @@ from worker.evaluation.detection.m3c2 import M3c2, m3c2_is_installed
 from worker.evaluation.detection.metrics import PAPER_SWEEP, best_f1
 from worker.evaluation.paper.embedding import Embedding, embed
 from worker.evaluation.paper.experiment import Experiment
-from worker.evaluation.paper.measured import open_measured
+from worker.evaluation.paper.measured import open_measured, training_log
 from worker.evaluation.paper.published import experiments
 from worker.evaluation.paper.robustness import RobustnessPoint, sweep_disturbances
 from worker.evaluation.paper.scoring import (
@@ -27,6 +27,7 @@ from worker.evaluation.paper.scoring import (
 )
 from worker.evaluation.paper.site import Site, SiteSettings, build_site
 from worker.evaluation.paper.trial import Trial, trials
+from worker.evaluation.training_curves import Log
 from worker.pipeline.flow import PipelineSettings
 from worker.progress import Progress, silent
 
@@ -72,6 +73,7 @@ class PaperResult:
     left_out: tuple[str, ...]  #: methods that are not installed
     robustness: tuple[RobustnessPoint, ...]
     embedding: Embedding | None
+    training: Log | None  #: of the detector, where it was kept
     seconds: float
     machine: dict[str, str | int | None]
 
@@ -86,6 +88,7 @@ def evaluate(settings: PaperSettings, progress: Progress = silent) -> PaperResul
     begun = time.perf_counter()
     chosen = _experiments(settings.only)
     detector = open_measured(settings.model_store, settings.model, settings.weights)
+    log = training_log(settings.model_store, settings.model, settings.weights)
     pipeline = PipelineSettings().for_model(detector.card.preprocessing)
     sites, given = [], []
     for seed in (settings.site.seed, settings.validation_seed):
@@ -115,6 +118,7 @@ def evaluate(settings: PaperSettings, progress: Progress = silent) -> PaperResul
         left_out=() if m3c2_is_installed() else ("M3C2",),
         robustness=disturbed,
         embedding=embed(caches[0], given[0], measured.test, measured.threshold),
+        training=log,
         seconds=time.perf_counter() - begun,
         machine=_machine(detector),
     )

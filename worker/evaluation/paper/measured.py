@@ -1,4 +1,4 @@
-"""The detector that is measured: a model of the store, or a checkpoint that has not become one yet."""
+"""The detector that is measured: a model of the store, or a checkpoint that has not become one yet; and its training's log."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ from worker.detectors.detector import Detector
 from worker.detectors.spicd_net.detector import SpicdNet
 from worker.detectors.store import open_card, open_detector, resolve_device
 from worker.errors import DetectorUnavailable
+from worker.evaluation.training_curves import Log, read_log
+from worker.training.log import LOG
 
 
 def open_measured(model_store: Path, model: str, weights: Path | None) -> Detector:
@@ -36,3 +38,12 @@ def open_measured(model_store: Path, model: str, weights: Path | None) -> Detect
         raise DetectorUnavailable(f"no checkpoint at {weights}: {missing.strerror}") from missing
     except (KeyError, TypeError, EOFError, RuntimeError, pickle.UnpicklingError) as unsound:
         raise DetectorUnavailable(f"{weights} is no checkpoint of spicd-worker train: {unsound}") from unsound
+
+
+def training_log(model_store: Path, model: str, weights: Path | None) -> Log | None:
+    """The log that lies beside the model's card, or beside the checkpoint; None where there is none.
+
+    Raises ValueError for a file that is none.
+    """
+    path = (model_store / model if weights is None else weights.parent) / LOG
+    return (read_log(path) or None) if path.exists() else None

@@ -12,10 +12,9 @@ from typing import Any
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from worker.evaluation.paper import figures
 from worker.evaluation.paper.benchmark import PaperResult
+from worker.evaluation.paper.pictures import pictures
 from worker.evaluation.paper.tables import COUNTS, ratio
-from worker.evaluation.paper.tile_figures import failure_case, tile_map
 
 STYLE = """body{font:15px/1.5 system-ui,sans-serif;max-width:62rem;margin:2rem auto;padding:0 1rem;color:#1a1a1a}
 table{border-collapse:collapse;font-size:13px;display:block;overflow-x:auto}th,td{padding:.2rem .6rem;text-align:right;border-bottom:1px solid #ddd}
@@ -26,58 +25,18 @@ figure{margin:2rem 0}figcaption,.quiet{color:#666;font-size:13px}"""
 def write_report(result: PaperResult, told: dict[str, Any], folder: Path) -> Path:
     """`report.html`, `paper.json` and a PNG a figure, each written aside and renamed. Raises OSError."""
     folder.mkdir(parents=True, exist_ok=True)
-    drawn = [
-        (name, caption, _png(figure)) for name, caption, figure in _figures(result) if figure is not None
-    ]
+    every = pictures(result)
+    drawn = [(one.name, one.caption, _png(one.figure)) for one in every if one.figure is not None]
     for name, _, picture in drawn:
         _save(folder / f"{name}.png", picture)
     _save(folder / "paper.json", (json.dumps(told, indent=2, allow_nan=False) + "\n").encode())
-    page = _page(told, drawn)
+    page = _page(told, drawn, [one.left_out for one in every if one.figure is None])
     _save(folder / "report.html", page.encode())
     return folder / "report.html"
 
 
-def _figures(result: PaperResult) -> list[tuple[str, str, Figure | None]]:
-    """Name of the file, caption with the paper's number, picture."""
-    types = ("type_add", "type_remove", "type_move")
-    borders = ("baseline_no_change", "challenge_easy", "challenge_hard")
-    return [
-        ("figure-05", "Figure 5: sensitivity to the threshold.", figures.threshold_sensitivity(result)),
-        ("figure-06", "Figure 6: precision and recall.", figures.precision_recall_curves(result)),
-        ("roc", "Section 4.3: ROC.", figures.roc_curves(result)),
-        ("figure-07", "Figure 7: sensitivity by kind of change.", figures.sensitivity_by_kind(result)),
-        ("figure-09", "Figure 9: the type series.", figures.confusion_matrices(result, types, "Type series")),
-        (
-            "figure-10",
-            "Figure 10: baseline and challenges.",
-            figures.confusion_matrices(result, borders, "Baseline and challenges"),
-        ),
-        (
-            "figure-11",
-            "Figure 11: robustness; a shifted map is not registered again.",
-            figures.robustness(result) if result.robustness else None,
-        ),
-        (
-            "figure-12",
-            "Figure 12: fused embeddings; of the true negatives 15 an experiment.",
-            figures.embedding(result.embedding) if result.embedding else None,
-        ),
-        (
-            "figure-13",
-            "Figure 13: tiles from above; green found, blue missed, red false alarms.",
-            tile_map(result),
-        ),
-        ("figure-14", "Figure 14: the missed change with the highest score.", failure_case(result)),
-        (
-            "figure-15",
-            "Figure 15: scores of changed and unchanged tiles.",
-            figures.score_distributions(result),
-        ),
-    ]
-
-
-def _page(told: dict[str, Any], drawn: list[tuple[str, str, bytes]]) -> str:
-    pictures = "".join(
+def _page(told: dict[str, Any], drawn: list[tuple[str, str, bytes]], left_out: list[str]) -> str:
+    images = "".join(
         f'<figure><img alt="{html.escape(caption)}" src="data:image/png;base64,{base64.b64encode(picture).decode()}">'
         f"<figcaption>{html.escape(caption)}</figcaption></figure>"
         for _, caption, picture in drawn
@@ -102,7 +61,9 @@ def _page(told: dict[str, Any], drawn: list[tuple[str, str, bytes]]) -> str:
         f"{thresholds['card']:.2f} stands in the card.</p>"
         f"<h2>Table 5</h2>{_rows(_table_5(told))}<h2>Table 6</h2>{_rows(_table_6(told))}"
         f'<p class="quiet">In brackets: at the threshold that is best on these experiments, as the paper chose its own. Paper: {html.escape(told["source"])}; '
-        f"its seconds are those of a GTX 1650.</p><h2>Pictures</h2>{pictures}</html>"
+        f"its seconds are those of a GTX 1650.</p><h2>Pictures</h2>{images}"
+        + "".join(f'<p class="quiet">Left out: {html.escape(words)}</p>' for words in left_out)
+        + "</html>"
     )
 
 

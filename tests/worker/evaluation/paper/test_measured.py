@@ -11,7 +11,8 @@ from worker.detectors.card import MODEL_STORE
 from worker.detectors.spicd_net.network import SpicdNetwork
 from worker.detectors.store import open_card
 from worker.errors import DetectorUnavailable
-from worker.evaluation.paper.measured import open_measured
+from worker.evaluation.paper.measured import open_measured, training_log
+from worker.training.log import LOG
 
 
 def test_a_checkpoint_brings_its_weights_patch_size_and_seed(tmp_path: Path) -> None:
@@ -34,3 +35,19 @@ def test_what_is_no_checkpoint_is_refused(tmp_path: Path, content: bytes | None)
         path.write_bytes(content)
     with pytest.raises(DetectorUnavailable, match=r"odd\.pt is no checkpoint"):
         open_measured(MODEL_STORE, "spicd-net/1", path)
+
+
+def test_the_log_is_that_beside_the_model_or_beside_the_checkpoint(tmp_path: Path) -> None:
+    model, run = tmp_path / "spicd-net" / "7", tmp_path / "run"
+    for folder, loss in ((model, 0.5), (run, 0.25)):
+        folder.mkdir(parents=True)
+        (folder / LOG).write_text(f"epoch,train_loss\n1,{loss}\n")
+    assert training_log(tmp_path, "spicd-net/7", None) == [{"epoch": 1, "train_loss": 0.5}]
+    assert training_log(tmp_path, "spicd-net/7", run / "best.pt") == [{"epoch": 1, "train_loss": 0.25}]
+
+
+@pytest.mark.parametrize("text", [None, "epoch,train_loss\n"])
+def test_without_a_log_or_an_epoch_in_it_there_is_none(tmp_path: Path, text: str | None) -> None:
+    if text is not None:
+        (tmp_path / LOG).write_text(text)
+    assert training_log(tmp_path, "spicd-net/7", tmp_path / "best.pt") is None
