@@ -84,7 +84,7 @@ def strip(length: int, *, twice: int) -> TileSet:
     return TileSet(
         points_a=(point,) * length,
         points_b=tuple(point if number % twice == 0 else nothing for number in range(length)),
-        points_c=tuple(nothing for _ in range(length)),
+        looks=(),
         centres=np.c_[1.5 * np.arange(length), np.zeros((length, 2))],
         buildings=np.zeros(length, np.int32),
         tile_size=(1.5, 1.5, 1.0),

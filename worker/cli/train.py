@@ -48,6 +48,9 @@ def train(
     start_from: Annotated[
         Path | None, typer.Option("--start-from", help="Checkpoint whose network is trained on.")
     ] = None,
+    fresh_head: Annotated[
+        bool | None, typer.Option("--fresh-head", help="Take its encoder alone, and start the head anew.")
+    ] = None,
     learning_rate: Annotated[
         float | None, typer.Option("--learning-rate", min=0, help="To begin with.")
     ] = None,
@@ -79,6 +82,7 @@ def train(
             validation_pairs=validation_pairs,
             batch=batch,
             learning_rate=learning_rate,
+            fresh_head=fresh_head,
             start_from=None if start_from is None else str(start_from),
         ),
     )

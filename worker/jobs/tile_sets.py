@@ -44,7 +44,7 @@ def training_set(
     return TileSet(
         points_a=tuple(_about(a, centre) for (a, _), centre in zip(pairs, middle, strict=True)),
         points_b=tuple(_about(b, centre) for (_, b), centre in zip(pairs, middle, strict=True)),
-        points_c=tuple(np.empty((0, 3), np.float32) for _ in pairs),
+        looks=(),
         centres=middle,
         buildings=np.zeros(len(pairs), np.int32),
         tile_size=settings.tile_size,

@@ -17,7 +17,16 @@ from worker.training.settings import PAPER, TrainSettings
 from worker.training.trainer import train
 
 #: Options by the settings that they are fields of.
-RUN = ("epochs", "minutes", "train_pairs", "validation_pairs", "batch", "start_from", "learning_rate")
+RUN = (
+    "epochs",
+    "minutes",
+    "train_pairs",
+    "validation_pairs",
+    "batch",
+    "start_from",
+    "fresh_head",
+    "learning_rate",
+)
 PAIRS = ("revisit_share", "density")
 
 
@@ -35,6 +44,12 @@ def main() -> None:
     parser.add_argument("--revisit-share", type=float)
     parser.add_argument("--density", type=float, nargs=2, metavar=("LOW", "HIGH"))
     parser.add_argument("--start-from", help="checkpoint whose network is trained on")
+    parser.add_argument(
+        "--fresh-head",
+        action="store_const",
+        const=True,
+        help="take its encoder alone, and start the head anew",
+    )
     parser.add_argument("--learning-rate", type=float, help="to begin with")
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     parser.add_argument("--threads", type=int, help="of the CPU")

@@ -1,8 +1,10 @@
-"""The training set: dense tiles, each seen on up to three visits, in one .npz file."""
+"""The training set: dense tiles, each seen on two visits and sometimes more, in one .npz file."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -14,18 +16,25 @@ FORMAT = 2
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
+class Look:
+    """A further look at a tile whose truth is known without anybody's labels."""
+
+    tile: int  #: its place in the set
+    points: Points  #: (n, 3) float32, metres, relative to the tile's centre
+    changed: bool  #: whether the tile is another than `points_a` shows
+    rebuilt: bool  #: of the first visit's own scans, fused anew; otherwise of a visit of its own
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
 class TileSet:
     """T dense tiles before any sampling, fused at 5 cm.
 
-    Nothing changed between the first two visits: `points_a` and `points_b` differ as two honest surveys do. Before
-    the third, whole things were added, removed and moved.
+    Nothing changed between the two visits: `points_a` and `points_b` differ as two honest surveys do.
     """
 
     points_a: tuple[Points, ...]  #: T arrays (n, 3) float32, metres, relative to the tile's centre
     points_b: tuple[Points, ...]  #: the same tiles on a second visit; (0, 3) where there was none
-    points_c: tuple[
-        Points, ...
-    ]  #: the same tiles on the third visit where it found them changed; (0, 3) elsewhere
+    looks: tuple[Look, ...]  #: further ones, of the first look's tiles; changed or not
     centres: NDArray[np.float64]  #: (T, 3) metres, frame of the tile's own building
     buildings: NDArray[np.int32]  #: (T,) which building the tile is of
     tile_size: tuple[float, float, float]  #: metres
@@ -36,11 +45,13 @@ class TileSet:
 
     def subset(self, chosen: NDArray[np.bool_]) -> TileSet:
         """The tiles where `chosen` (T,) is true."""
-        kept = np.flatnonzero(chosen).tolist()
+        kept, place = np.flatnonzero(chosen).tolist(), np.cumsum(chosen) - 1
         return TileSet(
             points_a=tuple(self.points_a[i] for i in kept),
             points_b=tuple(self.points_b[i] for i in kept),
-            points_c=tuple(self.points_c[i] for i in kept),
+            looks=tuple(
+                replace(look, tile=int(place[look.tile])) for look in self.looks if chosen[look.tile]
+            ),
             centres=self.centres[chosen],
             buildings=self.buildings[chosen],
             tile_size=self.tile_size,
@@ -57,7 +68,7 @@ def save_tiles(tiles: TileSet, path: Path) -> None:
     with path.open("wb") as file:
         points_a, offsets_a = _packed(tiles.points_a)
         points_b, offsets_b = _packed(tiles.points_b)
-        points_c, offsets_c = _packed(tiles.points_c)
+        points_looks, offsets_looks = _packed(tuple(look.points for look in tiles.looks))
         np.savez(
             file,
             format=FORMAT,
@@ -69,8 +80,11 @@ def save_tiles(tiles: TileSet, path: Path) -> None:
             offsets_a=offsets_a,
             points_b=points_b,
             offsets_b=offsets_b,
-            points_c=points_c,
-            offsets_c=offsets_c,
+            points_looks=points_looks,
+            offsets_looks=offsets_looks,
+            looks=np.array(
+                [(look.tile, look.changed, look.rebuilt) for look in tiles.looks], dtype=np.int32
+            ).reshape(-1, 3),
         )
 
 
@@ -83,12 +97,32 @@ def load_tiles(path: Path) -> TileSet:
         return TileSet(
             points_a=_unpacked(file["points_a"], file["offsets_a"]),
             points_b=_unpacked(file["points_b"], file["offsets_b"]),
-            points_c=_unpacked(file["points_c"], file["offsets_c"]),
+            looks=_looks(file["looks"], _unpacked(file["points_looks"], file["offsets_looks"])),
             centres=file["centres"].astype(np.float64),
             buildings=file["buildings"].astype(np.int32),
             tile_size=(size[0], size[1], size[2]),
             source=str(file["source"]),
         )
+
+
+def joined(parts: Sequence[TileSet], *, source: str) -> TileSet:
+    """The tiles of several sets in one, each set a building of its own. Raises ValueError for none."""
+    if not parts:
+        raise ValueError("a training set needs a building")
+    starts = np.cumsum([0, *map(len, parts)]).tolist()
+    return TileSet(
+        points_a=tuple(points for part in parts for points in part.points_a),
+        points_b=tuple(points for part in parts for points in part.points_b),
+        looks=tuple(
+            replace(look, tile=look.tile + start)
+            for part, start in zip(parts, starts, strict=False)
+            for look in part.looks
+        ),
+        centres=np.concatenate([part.centres for part in parts]),
+        buildings=np.repeat(np.arange(len(parts), dtype=np.int32), [len(part) for part in parts]),
+        tile_size=parts[0].tile_size,
+        source=source,
+    )
 
 
 def split_tiles(tiles: TileSet, *, share: float = 0.1, seed: int = 42) -> tuple[TileSet, TileSet]:
@@ -109,10 +143,18 @@ def split_tiles(tiles: TileSet, *, share: float = 0.1, seed: int = 42) -> tuple[
     return tiles.subset(~held_out), tiles.subset(held_out)
 
 
+def _looks(rows: NDArray[np.int32], points: tuple[Points, ...]) -> tuple[Look, ...]:
+    return tuple(
+        Look(tile=tile, points=cloud, changed=bool(changed), rebuilt=bool(rebuilt))
+        for (tile, changed, rebuilt), cloud in zip(rows.tolist(), points, strict=True)
+    )
+
+
 def _packed(clouds: tuple[Points, ...]) -> tuple[NDArray[np.float16], NDArray[np.int64]]:
     offsets = np.cumsum([0, *map(len, clouds)], dtype=np.int64)
     return np.concatenate([*clouds, np.empty((0, 3))]).astype(np.float16), offsets
 
 
 def _unpacked(points: NDArray[np.float16], offsets: NDArray[np.int64]) -> tuple[Points, ...]:
-    return tuple(np.split(points.astype(np.float32), offsets[1:-1]))
+    whole = points.astype(np.float32)
+    return tuple(whole[start:end] for start, end in pairwise(offsets.tolist()))

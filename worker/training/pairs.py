@@ -12,7 +12,7 @@ from worker.pipeline.patches import patch
 from worker.pipeline.values import Points
 from worker.training.anomalies import OPERATIONS, Change, Half, Operation, shown
 from worker.training.augmentation import Augmentation, Nuisance, augmented, second_look, turned_alike
-from worker.training.dataset import TileSet
+from worker.training.dataset import Look, TileSet
 
 UNCHANGED, CHANGED, DIFFERENT = 0, 1, 2
 SAMPLE_POINTS = 128  #: of the Chamfer branch in the paper (Section 3.6.3)
@@ -35,7 +35,13 @@ class PairSettings:
         True  #: ours: a stored patch that comes back is not augmented either, nor a change of one
     )
     edited_share: float = (
-        0.6  #: ours: of changed pairs, those of whole things added, removed or moved, where there are any
+        0.5  #: ours: of changed pairs, those of whole things added, removed or moved, where there are any
+    )
+    rebuilt_share: float = (
+        0.2  #: ours: of changed pairs, those changed in some of the scans that the map is fused of
+    )
+    beside_share: float = (
+        0.5  #: ours: of unchanged pairs without a twin, those beside a change, where there are any
     )
     revisit_share: float = 0.7  #: ours: pairs of both visits, where there are two; 0 is the paper's protocol
     revisit_intensity: float = 0.0  #: ours: of the nuisance on such pairs, which have an honest one
@@ -56,6 +62,8 @@ PAPER_PAIRS = PairSettings(
     chamfer_points=SAMPLE_POINTS,
     stored_still=False,
     edited_share=0.0,
+    rebuilt_share=0.0,
+    beside_share=0.0,
     revisit_share=0.0,
     min_shown=0,
     symmetries=False,
@@ -85,14 +93,14 @@ class Batch:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Looks:
-    """Dense looks at one tile, (n, 3) each, between which nothing changed, and at what changed where it did."""
+    """Two dense looks at one tile, (n, 3) each, between which nothing changed, and two between which something did."""
 
     unchanged: tuple[Points, Points]
-    changed: tuple[Points, Points] | None = (
-        None  #: whole things came, went or moved; None: a synthetic change is due
+    changed: tuple[Points, Points] | None = None  #: None: a synthetic change is due
+    revisit: bool = False  #: of two visits, not one tile twice
+    still: bool = (
+        False  #: of the very same scans, so that nothing differs but the change: no nuisance, no noise
     )
-    revisit: bool  #: of two visits, not one tile twice
-    still: bool = False  #: the stored patch itself comes back
 
 
 class PairMaker:
@@ -104,7 +112,10 @@ class PairMaker:
         self._tiles = tiles
         self._settings = settings
         self._half = (np.asarray(tiles.tile_size) / 2).astype(np.float32)
-        self._edited = np.flatnonzero([len(points) > 0 for points in tiles.points_c])
+        self._edited, self._rebuilt, self._beside, self._untouched = (
+            [look for look in tiles.looks if (look.changed, look.rebuilt) == kind]
+            for kind in ((True, False), (True, True), (False, False), (False, True))
+        )
 
     def batches(self, count: int, size: int, rng: np.random.Generator) -> Iterator[Batch]:
         """`count` pairs in the classes' exact shares, `size` at a time; a last few are left out.
@@ -115,7 +126,7 @@ class PairMaker:
         ready: list[Pair] = []
         groups = composition(count, self._settings.shares, twins=self._settings.twins)
         for place in rng.permutation(len(groups)):
-            looks = self._looks(rng, changed=CHANGED in groups[place])
+            looks = self._looks(groups[place], rng)
             ready += [self.pair(label, rng, looks) for label in groups[place]]
             if len(ready) >= size:
                 yield self._batched(ready[:size], rng)
@@ -123,7 +134,7 @@ class PairMaker:
 
     def pair(self, label: int, rng: np.random.Generator, looks: Looks | None = None) -> Pair:
         """One example of a class, of the given looks where the class is of one tile."""
-        looks = looks or self._looks(rng, changed=label == CHANGED)
+        looks = looks or self._looks((label,), rng)
         settings = self._settings
         if label == DIFFERENT:
             reference, current = self._different(rng)
@@ -139,20 +150,22 @@ class PairMaker:
         return Pair(reference, current, label)
 
     def _unchanged(self, looks: Looks, rng: np.random.Generator) -> tuple[Points, Points]:
+        if looks.still and self._settings.stored_still:
+            return self._sampled(*looks.unchanged, 0.0, rng)
         if looks.still:
             stored = self._patch(looks.unchanged[0], rng)
-            return stored, (stored + rng.normal(scale=STORED_JITTER, size=stored.shape)).astype(np.float32)
+            return stored, _stored_again(stored, rng)
         intensity = self._settings.revisit_intensity if looks.revisit else 1.0
         return self._sampled(*looks.unchanged, intensity, rng)
 
     def _changed(self, looks: Looks, rng: np.random.Generator) -> tuple[Points, Points]:
         settings = self._settings
         intensity = settings.revisit_intensity if looks.revisit else settings.changed_intensity
+        if looks.still and settings.stored_still:
+            intensity = 0.0
         if looks.changed is not None:
             return self._sampled(*looks.changed, intensity, rng)
         first, second = looks.unchanged
-        if looks.still and settings.stored_still:
-            intensity = 0.0
         return self._sampled(first, changed(second, settings, self._half, rng), intensity, rng)
 
     def _different(self, rng: np.random.Generator) -> tuple[Points, Points]:
@@ -174,21 +187,47 @@ class PairMaker:
         away = np.linalg.norm(tiles.centres - tiles.centres[i], axis=1) >= self._settings.min_separation
         return np.flatnonzero(away | (tiles.buildings != tiles.buildings[i]))
 
-    def _looks(self, rng: np.random.Generator, *, changed: bool) -> Looks:
-        """At a random tile; where a change is wanted, often at one that has a real one. In either order of visits."""
+    def _looks(self, labels: tuple[int, ...], rng: np.random.Generator) -> Looks:
+        """At a random tile, for pairs of these labels; visits in either order."""
+        settings, draw = self._settings, rng.random()
+        if CHANGED in labels:
+            if draw < settings.edited_share and self._edited:
+                return self._revisited(self._edited[int(rng.integers(len(self._edited)))], rng)
+            if (
+                settings.edited_share <= draw < settings.edited_share + settings.rebuilt_share
+                and self._rebuilt
+            ):
+                return self._rebuilt_looks(rng)
+        elif UNCHANGED in labels and draw < settings.beside_share and self._beside:
+            return self._revisited(self._beside[int(rng.integers(len(self._beside)))], rng)
+        return self._two_looks(rng)
+
+    def _two_looks(self, rng: np.random.Generator) -> Looks:
         tiles, settings = self._tiles, self._settings
-        if changed and len(self._edited) and rng.random() < settings.edited_share:
-            i = int(rng.choice(self._edited))
-            a, b, c = tiles.points_a[i], tiles.points_b[i], tiles.points_c[i]
-            forth = rng.random() < 0.5
-            return Looks(
-                unchanged=(a, b) if forth else (b, a), changed=(a, c) if forth else (c, a), revisit=True
-            )
         i = int(rng.integers(len(tiles)))
         a, b = tiles.points_a[i], tiles.points_b[i]
         if len(b) == 0 or rng.random() >= settings.revisit_share:
-            return Looks(unchanged=(a, a), revisit=False, still=rng.random() >= settings.rerun_share)
+            still = rng.random() >= settings.rerun_share
+            return Looks(unchanged=(a, _stored_again(a, rng) if still else a), still=still)
         return Looks(unchanged=(a, b) if rng.random() < 0.5 else (b, a), revisit=True)
+
+    def _revisited(self, look: Look, rng: np.random.Generator) -> Looks:
+        """The look beside the first visit's, and in a changed pair's twin the second visit's."""
+        a, b = self._tiles.points_a[look.tile], self._tiles.points_b[look.tile]
+        forth = rng.random() < 0.5
+        found = (a, look.points) if forth else (look.points, a)
+        if not look.changed:
+            return Looks(unchanged=found, revisit=True)
+        return Looks(unchanged=(a, b) if forth else (b, a), changed=found, revisit=True)
+
+    def _rebuilt_looks(self, rng: np.random.Generator) -> Looks:
+        """A rebuilt map against the map: a tile that a synthetic change was made in, and one that none was."""
+        changed = self._rebuilt[int(rng.integers(len(self._rebuilt)))]
+        pair = (self._tiles.points_a[changed.tile], changed.points)
+        if not self._untouched:
+            return Looks(unchanged=(pair[0], pair[0]), changed=pair, still=True)
+        other = self._untouched[int(rng.integers(len(self._untouched)))]
+        return Looks(unchanged=(self._tiles.points_a[other.tile], other.points), changed=pair, still=True)
 
     def _sampled(
         self, first: Points, second: Points, intensity: float, rng: np.random.Generator
@@ -218,6 +257,11 @@ class PairMaker:
         if count is None:
             return distinct
         return distinct[rng.choice(self._settings.patch_points, count, replace=False) % len(distinct)]
+
+
+def _stored_again(points: Points, rng: np.random.Generator) -> Points:
+    """(n, 3) a stored patch as it comes from the disk (paper, Section 3.5.3)."""
+    return (points + rng.normal(scale=STORED_JITTER, size=points.shape)).astype(np.float32)
 
 
 def changed(points: Points, settings: PairSettings, half: Half, rng: np.random.Generator) -> Points:

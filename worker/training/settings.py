@@ -27,6 +27,7 @@ class TrainSettings:
     start_from: str | None = (
         None  #: what network is trained on, with a fresh optimiser: a checkpoint, or as said with `start`
     )
+    fresh_head: bool = False  #: ours: of that network the encoder alone is taken, and the head starts anew
     settle_head: bool = True  #: ours: the head's first layers start as if their inputs were standardised
     device: str = "cpu"
     coarse_search: bool = (

@@ -20,7 +20,7 @@ from worker.training.dataset import TileSet, load_tiles, split_tiles
 from worker.training.log import EpochRow, append_row, by_class, cut_log
 from worker.training.losses import total_loss
 from worker.training.metrics import Measured, measured
-from worker.training.pairs import Batch, PairMaker
+from worker.training.pairs import DIFFERENT, Batch, PairMaker
 from worker.training.prefetch import prefetched
 from worker.training.settings import TrainSettings, whole
 
@@ -85,9 +85,11 @@ class Run:
         self._makers = PairMaker(training, settings.pairs), PairMaker(validation, settings.pairs)
         if start is None and settings.start_from is not None:
             start = torch.load(settings.start_from, map_location=self._device, weights_only=True)["network"]
-        if start is not None:
+        if start is not None and settings.fresh_head:
+            self._network.encoder.load_state_dict(_encoder(start))
+        elif start is not None:
             self._network.load_state_dict(start)
-        elif settings.settle_head:
+        if settings.settle_head and (start is None or settings.fresh_head):
             self._settle()
         self._epochs = 0
         self._seconds = 0.0
@@ -189,14 +191,18 @@ class Run:
 
     @torch.no_grad()
     def _settle(self) -> None:
-        """Initialise the head by the data of a few batches."""
+        """Initialise the head by the data of a few batches: pairs of one place, whose distances are the fine ones."""
         rng = np.random.default_rng((self._settings.seed, 0))
         sides, statistics = [], []
         for batch in self._makers[0].batches(SETTLING_PAIRS, self._settings.batch, rng):
             points, compared = self._tensors(batch)
-            sides.append(self._network.encoder(points, batch.sizes)[0].chunk(2))
+            same_place = torch.from_numpy(batch.labels) != DIFFERENT
+            sides.append(
+                [side[same_place] for side in self._network.encoder(points, batch.sizes)[0].chunk(2)]
+            )
             clouds = torch.split(compared, batch.chamfer_sizes)
-            statistics.append(chamfer_statistics(clouds[: len(clouds) // 2], clouds[len(clouds) // 2 :]))
+            found = chamfer_statistics(clouds[: len(clouds) // 2], clouds[len(clouds) // 2 :])
+            statistics.append(found[same_place])
         reference, current = (torch.cat(side) for side in zip(*sides, strict=True))
         self._network.head.settle(reference, current, torch.cat(statistics))
 
@@ -238,6 +244,12 @@ class Run:
         )
         append_row(self._out, row)
         return row
+
+
+def _encoder(network: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Of a whole network's state."""
+    inner = "encoder."
+    return {name.removeprefix(inner): value for name, value in network.items() if name.startswith(inner)}
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -14,13 +16,25 @@ def pairs(tiles):
     return survey_pairs(tiles, PairSettings(), seed=0)
 
 
-def test_every_tile_is_paired_both_ways_once_unchanged_and_once_by_each_operation(tiles, pairs):
-    assert {kind: pairs.kinds.count(kind) for kind in set(pairs.kinds)} == {
-        "unchanged": 80,
-        "add": 80,
-        "remove": 80,
-        "move": 80,
-    }
+def test_every_tile_is_paired_both_ways_once_unchanged_and_once_by_each_operation(tiles):
+    pairs = survey_pairs(replace(tiles, looks=()), PairSettings(), seed=0)
+    counts = {kind: pairs.kinds.count(kind) for kind in set(pairs.kinds)}
+    assert counts == {"unchanged": 80, "add": 80, "remove": 80, "move": 80}
+    assert pairs.told.all()
+
+
+def test_looks_of_other_visits_are_paired_both_ways_too_and_rebuilt_ones_are_not(pairs):
+    counts = {kind: pairs.kinds.count(kind) for kind in set(pairs.kinds)}
+    assert counts == {"unchanged": 80 + 20, "whole": 20, "add": 80, "remove": 80, "move": 80}
+
+
+def test_where_whole_things_changed_the_threshold_is_chosen_by_them_and_not_by_synthetic_changes(pairs):
+    kinds = np.array(pairs.kinds)
+    scores = np.select([kinds == "whole", kinds == "unchanged"], [0.9, 0.5], 0.1).astype(np.float32)
+    chosen = best_threshold(scores, pairs)
+    assert chosen.threshold == pytest.approx(0.7, abs=0.02)
+    assert (chosen.f1, chosen.recall) == (1, 1)
+    assert chosen.recall_by_kind == {"add": 0, "remove": 0, "move": 0, "whole": 1}
 
 
 def test_perfect_scores_are_parted_in_the_middle_of_the_gap(pairs):

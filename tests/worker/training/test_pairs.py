@@ -17,7 +17,7 @@ from worker.training.augmentation import (
     second_look,
     turned_alike,
 )
-from worker.training.dataset import TileSet, load_tiles, save_tiles, split_tiles
+from worker.training.dataset import TileSet, joined, load_tiles, save_tiles, split_tiles
 from worker.training.pairs import PAPER_PAIRS, PairMaker, PairSettings, altered, composition
 
 STILL = Augmentation(jitter=0, dropout=0, shift=0, yaw=0)
@@ -30,6 +30,8 @@ PLAIN = PairSettings(
     symmetries=False,
     rerun_share=1.0,
     edited_share=0.0,
+    rebuilt_share=0.0,
+    beside_share=0.0,
 )
 
 
@@ -59,7 +61,8 @@ def test_the_papers_preset_is_section_3_5():
     assert preset.nuisance.dropout == (0.10, 0.50)
     # and nothing of ours
     assert (preset.revisit_share, preset.min_shown, preset.symmetries, preset.twins) == (0.0, 0, False, False)
-    assert (preset.chamfer_points, preset.edited_share, preset.stored_still) == (128, 0.0, False)
+    assert (preset.chamfer_points, preset.stored_still) == (128, False)
+    assert (preset.edited_share, preset.rebuilt_share, preset.beside_share) == (0.0, 0.0, 0.0)
 
 
 def test_the_papers_pairs_are_of_one_dense_tile_seven_in_ten_sampled_anew(tiles):
@@ -148,15 +151,26 @@ def test_the_papers_chamfer_branch_gets_128_points_of_each_patch(tiles):
         assert len(rows(sample)) > 0.5 * min(size, 128)  # of a padded patch, so a few points come twice
 
 
+def drawn(maker: PairMaker, label_counts: int, seed: int) -> dict[int, tuple[np.ndarray, np.ndarray]]:
+    """A changed pair and its twin, (reference, current) by label."""
+    batch = next(maker.batches(label_counts, label_counts, np.random.default_rng(seed)))
+    clouds = np.split(batch.chamfer_points, np.cumsum(batch.chamfer_sizes)[:-1])
+    half = len(clouds) // 2
+    return {label: (clouds[i], clouds[i + half]) for i, label in enumerate(batch.labels.tolist())}
+
+
+def looks_of(tiles: TileSet, *, changed: bool, rebuilt: bool) -> set[frozenset[tuple[float, ...]]]:
+    kind = (changed, rebuilt)
+    return {frozenset(rows(look.points)) for look in tiles.looks if (look.changed, look.rebuilt) == kind}
+
+
 def test_of_changed_pairs_the_given_share_is_of_whole_things_beside_an_honest_unchanged_pair(tiles):
     settings = replace(PLAIN, shares=(0.5, 0.5, 0.0), edited_share=0.6, revisit_share=1.0)
     maker, found = PairMaker(tiles, settings), 0
-    real = {frozenset(rows(points)) for points in tiles.points_c if len(points)}
-    assert len(real) == len(tiles) / 2
+    real = looks_of(tiles, changed=True, rebuilt=False)
+    assert len(real) == len(tiles) / 4
     for seed in range(100):
-        batch = next(maker.batches(2, 2, np.random.default_rng(seed)))
-        clouds = np.split(batch.chamfer_points, np.cumsum(batch.chamfer_sizes)[:-1])
-        pairs = {label: (clouds[i], clouds[i + 2]) for i, label in enumerate(batch.labels.tolist())}
+        pairs = drawn(maker, 2, seed)
         edited = [frozenset(rows(cloud)) in real for cloud in pairs[1]]
         assert not any(frozenset(rows(cloud)) in real for cloud in pairs[0])
         if any(edited):
@@ -167,23 +181,52 @@ def test_of_changed_pairs_the_given_share_is_of_whole_things_beside_an_honest_un
     assert 45 < found < 75
 
 
-def test_a_set_without_edits_has_synthetic_changes_alone(tiles):
-    bare = replace(tiles, points_c=tuple(points[:0] for points in tiles.points_c))
-    maker = PairMaker(bare, replace(PLAIN, edited_share=1.0, revisit_share=0.0))
-    pair = maker.pair(1, np.random.default_rng(0))
+def test_of_changed_pairs_the_given_share_is_of_rebuilt_maps_untouched_but_for_the_change(tiles):
+    noisy = replace(PLAIN, augmentation=Augmentation(), nuisance=Nuisance())
+    settings = replace(noisy, shares=(0.5, 0.5, 0.0), rebuilt_share=0.6, revisit_share=1.0)
+    maker, found = PairMaker(tiles, settings), 0
+    owner = {frozenset(rows(look.points)): look for look in tiles.looks if look.rebuilt}
+    for seed in range(100):
+        pairs = drawn(maker, 2, seed)
+        looks = {label: owner.get(frozenset(rows(current))) for label, (_, current) in pairs.items()}
+        if looks[1] is not None:
+            found += 1
+            assert looks[0] is not None
+            assert (looks[0].changed, looks[1].changed) == (False, True)
+            for label, look in looks.items():
+                assert rows(pairs[label][0]) == rows(tiles.points_a[look.tile])  # the map is the reference
+    assert 45 < found < 75
+
+
+def test_unchanged_pairs_beside_a_change_are_looks_of_that_visit(tiles):
+    maker = PairMaker(tiles, replace(PLAIN, shares=(1.0, 0.0, 0.0), beside_share=0.5, revisit_share=1.0))
+    beside = looks_of(tiles, changed=False, rebuilt=False)
+    found = sum(
+        any(frozenset(rows(cloud)) in beside for cloud in drawn(maker, 1, seed)[0]) for seed in range(100)
+    )
+    assert 35 < found < 65
+
+
+def test_a_set_without_further_looks_has_synthetic_changes_alone(tiles):
+    bare = replace(tiles, looks=())
+    settings = replace(PLAIN, edited_share=0.5, rebuilt_share=0.5, beside_share=1.0, revisit_share=0.0)
+    pair = PairMaker(bare, settings).pair(1, np.random.default_rng(0))
     assert rows(pair.reference) != rows(pair.current)
 
 
 def test_a_stored_patch_comes_back_without_augmentation_and_so_does_a_change_of_one(tiles):
-    settings = replace(
-        PairSettings(patch_points=512, symmetries=False), revisit_share=0.0, rerun_share=0.0, edited_share=0.0
-    )
+    noise = replace(PLAIN, augmentation=Augmentation(), nuisance=Nuisance())
+    maker = PairMaker(tiles, replace(noise, revisit_share=0.0, rerun_share=0.0))
     for seed in range(10):
-        same = PairMaker(tiles, settings).pair(0, np.random.default_rng(seed))
-        assert np.abs(same.current - same.reference).max() < 6 * 0.0001
-        changed = PairMaker(tiles, settings).pair(1, np.random.default_rng(seed))
-        assert rows(changed.reference) in [rows(points) for points in tiles.points_a]
-        assert len(rows(changed.current) & rows(changed.reference)) > 0.6 * len(changed.reference)
+        same, changed = (maker.pair(label, np.random.default_rng(seed)) for label in (0, 1))
+        assert nearest(same.current, same.reference).max() < 6 * 0.0001
+        assert frozenset(rows(changed.reference)) in {frozenset(rows(points)) for points in tiles.points_a}
+        untouched = nearest(changed.current, changed.reference) < 6 * 0.0001
+        assert 0.6 < untouched.mean() < 1 or len(changed.current) < 0.95 * len(changed.reference)
+
+
+def nearest(points: np.ndarray, others: np.ndarray) -> np.ndarray:
+    return np.linalg.norm(points[:, None] - others, axis=2).min(axis=1)
 
 
 def test_the_same_stream_gives_the_same_pairs(tiles):
@@ -279,11 +322,14 @@ def test_a_saved_set_comes_back_within_half_a_millimetre(tiles, tmp_path):
     save_tiles(tiles, tmp_path / "tiles.npz")
     loaded = load_tiles(tmp_path / "tiles.npz")
     for before, after in zip(
-        (*tiles.points_a, *tiles.points_b, *tiles.points_c),
-        (*loaded.points_a, *loaded.points_b, *loaded.points_c),
+        (*tiles.points_a, *tiles.points_b, *(look.points for look in tiles.looks)),
+        (*loaded.points_a, *loaded.points_b, *(look.points for look in loaded.looks)),
         strict=True,
     ):
         assert after == pytest.approx(before, abs=5e-4)
+    assert [(look.tile, look.changed, look.rebuilt) for look in loaded.looks] == [
+        (look.tile, look.changed, look.rebuilt) for look in tiles.looks
+    ]
     assert np.array_equal(loaded.centres, tiles.centres)
     assert np.array_equal(loaded.buildings, tiles.buildings)
     assert (loaded.tile_size, loaded.source) == (tiles.tile_size, tiles.source)
@@ -302,6 +348,23 @@ def test_the_split_holds_out_one_region_of_every_building(tiles):
         region = validation.centres[validation.buildings == building]
         assert len(region) == 4
         assert np.ptp(region, axis=0).max() <= 3.0 + 1e-9  # four of twenty tiles, side by side
+
+
+def test_looks_stay_with_their_tiles_in_a_part_and_in_a_whole(tiles):
+    chosen = np.arange(len(tiles)) % 3 == 1
+    part = tiles.subset(chosen)
+    assert len(part.looks) == chosen.sum()
+    whole = joined([part, tiles], source="both")
+    assert len(whole) == len(part) + len(tiles)
+    assert np.bincount(whole.buildings).tolist() == [len(part), len(tiles)]
+    for one, origin in ((part, part), (whole, whole)):
+        for look in one.looks:
+            floor = {tuple(point) for point in origin.points_a[look.tile].round(1)}
+            assert len({tuple(point) for point in look.points.round(1)} & floor) > 20
+    first, later = whole.looks[0], whole.looks[len(part.looks)]
+    assert (first.tile, later.tile) == (0, len(part))
+    assert np.array_equal(first.points, tiles.looks[1].points)
+    assert np.array_equal(later.points, tiles.looks[0].points)
 
 
 def _visits(tiles: TileSet) -> list[tuple[np.ndarray, np.ndarray]]:
