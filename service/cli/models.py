@@ -81,7 +81,7 @@ def _whole(card: Document) -> Group:
             ("threshold", card.get("threshold")),
         ]
     )
-    figures = columns("measured on held-out tiles", "area under ROC", "precision", "recall", "F1")
+    figures = columns("measured on", "area under ROC", "precision", "recall", "F1")
     for name, measured in card.get("evaluation", {}).items():
         if isinstance(measured, dict):
             figures.add_row(

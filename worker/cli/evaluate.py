@@ -1,4 +1,4 @@
-"""`spicd-worker evaluate`: the benchmarks, each a command of its own."""
+"""`spicd-worker evaluate`: the benchmarks, each a command of its own, and one that puts their figures on a card."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from worker.cli import evaluate_paper, evaluate_revisit, terminal
+from worker.cli import evaluate_paper, evaluate_record, evaluate_revisit, terminal
 
 
 def register(commands: typer.Typer) -> None:
@@ -19,6 +19,7 @@ def register(commands: typer.Typer) -> None:
     group.command("registration")(registration)
     evaluate_paper.register(group)
     evaluate_revisit.register(group)
+    evaluate_record.register(group)
     commands.add_typer(group)
 
 

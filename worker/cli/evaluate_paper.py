@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from worker.cli import terminal
+from worker.cli.as_given import as_given
 from worker.detectors.card import MODEL_STORE
 
 
@@ -18,6 +19,7 @@ def register(group: typer.Typer) -> None:
 
 
 def paper(
+    context: typer.Context,
     model: Annotated[str, typer.Option(envvar="SPICD_MODEL", help="name/version")] = "spicd-net/1",
     model_store: Annotated[
         Path, typer.Option("--model-store", envvar="SPICD_MODEL_STORE", help="Folder of the models.")
@@ -65,7 +67,7 @@ def paper(
     )
     with terminal.progress_bar() as progress:
         result = evaluate(settings, progress)
-        told = document(result)
+        told = {"command": as_given(context), **document(result)}
         written = None if out is None else write_report(result, told, out)
     if as_json:
         terminal.print_json(told)

@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from worker.cli import terminal
+from worker.cli.as_given import as_given
 from worker.detectors.card import MODEL_STORE
 
 
@@ -18,6 +19,7 @@ def register(group: typer.Typer) -> None:
 
 
 def revisit(
+    context: typer.Context,
     visits: Annotated[
         int, typer.Option(min=1, help="Second visits; every three go to a building of their own.")
     ] = 24,
@@ -59,7 +61,7 @@ def revisit(
         made=RevisitSettings(kinds=kinds_named(buildings)),
     )
     with terminal.progress_bar() as progress:
-        result = evaluate(settings, progress)
+        result = {"command": as_given(context), **evaluate(settings, progress)}
     aside = out / "revisit.json.tmp"
     aside.write_text(json.dumps(result, indent=2, allow_nan=False) + "\n", encoding="utf-8")
     aside.replace(out / "revisit.json")

@@ -6,8 +6,6 @@ It stands apart from training, which needs torch and NumPy alone: a GPU machine 
 from __future__ import annotations
 
 import argparse
-import hashlib
-import json
 import platform
 import shutil
 import sys
@@ -19,11 +17,10 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from safetensors.torch import save
 
 from worker.detectors.card import MODEL_STORE, Card, Preprocessing
 from worker.detectors.spicd_net.detector import SpicdNet
-from worker.detectors.store import Weights
+from worker.evaluation.model_folder import WEIGHTS, write_model
 from worker.pipeline.tiling import TileGrid, TilePairs, Tiles
 from worker.training.calibration import (
     PREVALENCE,
@@ -37,7 +34,6 @@ from worker.training.dataset import TileSet, load_tiles, split_tiles
 from worker.training.log import LOG
 from worker.training.pairs import PairSettings
 
-WEIGHTS = "weights.safetensors"
 VOXEL_SIZE, MIN_POINTS = 0.05, 512  #: paper, Table 3; the training tiles are made with the same
 
 #: Of the pair settings, what says which synthetic changes there are.
@@ -110,7 +106,7 @@ def publish(
         "two independent visits, the second with a synthetic change or none (paper, Section 3.5.1), "
         f"no augmentation; precision and F1 for {PREVALENCE:.0%} changed tiles; threshold of the highest F1 on the validation tiles"
     )
-    folder = _write(
+    folder = write_model(
         model_store / name / version,
         card.model_copy(update={"threshold": chosen.threshold, "evaluation": evaluation}),
         state["network"],
@@ -175,17 +171,6 @@ def deviations(settings: dict[str, Any]) -> list[str]:
 def _pair_settings(settings: dict[str, Any]) -> PairSettings:
     kept = {name: value for name, value in settings["pairs"].items() if name in KEPT}
     return PairSettings(**kept)
-
-
-def _write(folder: Path, card: Card, weights: Weights) -> Path:
-    """The weights before the card that vouches for them."""
-    content = save({name: tensor.contiguous() for name, tensor in weights.items()})
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / WEIGHTS).write_bytes(content)
-    signed = card.model_copy(update={"sha256": hashlib.sha256(content).hexdigest()})
-    text = json.dumps(signed.model_dump(mode="json"), indent=2, allow_nan=False)
-    (folder / "card.json").write_text(text + "\n", encoding="utf-8")
-    return folder
 
 
 def _take_log(log: Path, place: Path) -> None:

@@ -9,7 +9,7 @@ from worker.cli.bench import _tables
 from worker.detectors.card import Card, Preprocessing
 from worker.detectors.spicd_net.network import SpicdNetwork
 from worker.evaluation.bench import BenchSettings, bench, save
-from worker.evaluation.publish import _write
+from worker.evaluation.model_folder import write_model
 
 
 @pytest.fixture
@@ -27,7 +27,7 @@ def model_store(tmp_path: Path) -> Path:
         preprocessing=needs,
         weights="weights.safetensors",
     )
-    _write(tmp_path / "spicd-net" / "1", card, SpicdNetwork().state_dict())
+    write_model(tmp_path / "spicd-net" / "1", card, SpicdNetwork().state_dict())
     return tmp_path
 
 

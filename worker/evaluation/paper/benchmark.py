@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from worker.detectors.card import MODEL_STORE
+from worker.detectors.card import MODEL_STORE, Card
 from worker.detectors.detector import Detector
 from worker.evaluation.detection.baselines import Baseline, CloudToCloud, M3c2Approximation
 from worker.evaluation.detection.m3c2 import M3c2, m3c2_is_installed
@@ -64,7 +64,7 @@ class PaperResult:
     """Everything that tables and pictures are made of."""
 
     settings: PaperSettings
-    card_threshold: float
+    card: Card  #: of the detector, with the sha256 of what was measured
     site: Site
     validation: Site
     trials: tuple[Trial, ...]
@@ -109,7 +109,7 @@ def evaluate(settings: PaperSettings, progress: Progress = silent) -> PaperResul
     progress("embedding", 0.0)
     return PaperResult(
         settings=settings,
-        card_threshold=detector.card.threshold,
+        card=detector.card,
         site=sites[0],
         validation=sites[1],
         trials=given[0],

@@ -25,6 +25,7 @@ def document(result: PaperResult) -> dict[str, Any]:
         "benchmark": "paper",
         "source": tables["source"],
         "model": settings.model if settings.weights is None else settings.weights.name,
+        "sha256": result.card.sha256,
         "settings": {
             **asdict(settings.site),
             "validation_seed": settings.validation_seed,
@@ -42,7 +43,7 @@ def document(result: PaperResult) -> dict[str, Any]:
         "thresholds": {
             "validation": result.detector.threshold,
             "test": result.detector.test_threshold,
-            "card": result.card_threshold,
+            "card": result.card.threshold,
             "paper": tables["table_6"]["SPICD-Net"]["threshold"],
         },
         "table_5": _table_5(result),

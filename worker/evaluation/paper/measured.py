@@ -11,6 +11,7 @@ from worker.detectors.detector import Detector
 from worker.detectors.spicd_net.detector import SpicdNet
 from worker.detectors.store import open_card, open_detector, resolve_device
 from worker.errors import DetectorUnavailable
+from worker.evaluation.model_folder import sha256_of
 from worker.evaluation.training_curves import Log, read_log
 from worker.training.log import LOG
 
@@ -18,7 +19,7 @@ from worker.training.log import LOG
 def open_measured(model_store: Path, model: str, weights: Path | None) -> Detector:
     """The model, or with `weights` the network of a checkpoint of `worker.training`, under the model's card.
 
-    A checkpoint brings its own patch size and seed. Raises DetectorUnavailable.
+    A checkpoint brings its own patch size and seed, and the sha256 that its weights will have in a model. Raises DetectorUnavailable.
     """
     if weights is None:
         return open_detector(model_store, model)
@@ -30,13 +31,16 @@ def open_measured(model_store: Path, model: str, weights: Path | None) -> Detect
             "chamfer_points": state["settings"]["pairs"].get("chamfer_points", 128),
             "seed": state["settings"]["seed"],
         }
-        card = card.model_copy(
-            update={"preprocessing": card.preprocessing.model_copy(update=own), "version": weights.stem}
-        )
+        update = {
+            "version": weights.stem,
+            "preprocessing": card.preprocessing.model_copy(update=own),
+            "sha256": sha256_of(state["network"]),
+        }
+        card = card.model_copy(update=update)
         return SpicdNet.load(card, state["network"], resolve_device("auto"))
     except OSError as missing:
         raise DetectorUnavailable(f"no checkpoint at {weights}: {missing.strerror}") from missing
-    except (KeyError, TypeError, EOFError, RuntimeError, pickle.UnpicklingError) as unsound:
+    except (AttributeError, KeyError, TypeError, EOFError, RuntimeError, pickle.UnpicklingError) as unsound:
         raise DetectorUnavailable(f"{weights} is no checkpoint of spicd-worker train: {unsound}") from unsound
 
 

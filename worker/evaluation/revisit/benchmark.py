@@ -78,7 +78,10 @@ def evaluate(settings: BenchmarkSettings, progress: Progress = silent) -> dict[s
         "made": made_now + made_more,
         "test": summary(table, test),
         "validation": summary(other_table, other),
-        "methods": [measured.document() for measured in found],
+        "methods": [
+            {**measured.document(), "sha256": method.sha256}
+            for method, measured in zip(methods, found, strict=True)
+        ],
     }
 
 

@@ -29,6 +29,7 @@ class Method:
     name: str
     score: Callable[[TilePairs], TileScore]
     stated: float | None = None  #: the threshold it comes with; None where it has none
+    sha256: str | None = None  #: of its weights; None where it has none
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
@@ -70,7 +71,10 @@ class DetectorScore:
 def opened(model_store: Path, model: str) -> Method:
     """A model of the store, with the threshold of its card. Raises DetectorUnavailable."""
     detector = open_detector(model_store, model)
-    return Method(name=model, score=DetectorScore(detector=detector), stated=detector.card.threshold)
+    card = detector.card
+    return Method(
+        name=model, score=DetectorScore(detector=detector), stated=card.threshold, sha256=card.sha256
+    )
 
 
 def from_checkpoint(path: Path, model_store: Path, model: str) -> Method:
@@ -79,7 +83,9 @@ def from_checkpoint(path: Path, model_store: Path, model: str) -> Method:
     Raises DetectorUnavailable where the file is no such checkpoint, or there is none.
     """
     detector = open_measured(model_store, model, path)
-    return Method(name="/".join(path.parts[-2:]), score=DetectorScore(detector=detector))
+    return Method(
+        name="/".join(path.parts[-2:]), score=DetectorScore(detector=detector), sha256=detector.card.sha256
+    )
 
 
 def _equal(a: Tiles, b: Tiles) -> bool:

@@ -8,6 +8,8 @@ from pathlib import Path
 import pytest
 
 from worker.cli import main
+from worker.detectors.card import MODEL_STORE
+from worker.detectors.store import open_card
 from worker.evaluation.detection.m3c2 import m3c2_is_installed
 
 
@@ -23,6 +25,8 @@ def test_three_experiments_are_run_told_and_drawn(tmp_path: Path, capsys: pytest
     assert run("--quick", "--true-poses", "--json", "--out", str(tmp_path)) == 0
     told = json.loads(capsys.readouterr().out)
     assert json.loads((tmp_path / "paper.json").read_text()) == told
+    assert told["command"] == "spicd-worker evaluate paper --true-poses --quick"
+    assert told["sha256"] == open_card(MODEL_STORE, "spicd-net/1").sha256
     names = [row["name"] for row in told["table_5"]]
     assert names == ["magnitude_15cm", "type_remove", "baseline_no_change", "aggregated"]
     tiles = told["map"]["tiles"]

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import hashlib
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 
 from worker.detectors.card import MODEL_STORE
 from worker.detectors.spicd_net.network import SpicdNetwork
-from worker.detectors.store import open_card
+from worker.detectors.store import open_card, read_card
 from worker.errors import DetectorUnavailable
+from worker.evaluation.model_folder import WEIGHTS, write_model
 from worker.evaluation.paper.measured import open_measured, training_log
 from worker.training.log import LOG
 
@@ -24,15 +27,31 @@ def test_a_checkpoint_brings_its_weights_patch_size_and_seed(tmp_path: Path) -> 
     assert (card.name, card.version) == ("spicd-net", "fresh")
     assert card.preprocessing.tile_size == shipped.preprocessing.tile_size
     assert card.threshold == shipped.threshold
+    assert card.sha256 != shipped.sha256
 
 
-@pytest.mark.parametrize("content", [b"no archive at all", None])
-def test_what_is_no_checkpoint_is_refused(tmp_path: Path, content: bytes | None) -> None:
+def test_a_checkpoint_has_the_sha256_of_the_model_that_is_made_of_it(tmp_path: Path) -> None:
+    weights = SpicdNetwork().state_dict()
+    settings = {"seed": 7, "pairs": {"patch_points": 1024}}
+    torch.save({"settings": settings, "network": weights}, tmp_path / "fresh.pt")
+    measured = open_measured(MODEL_STORE, "spicd-net/1", tmp_path / "fresh.pt").card
+    made = write_model(tmp_path / "model", measured, weights)
+    assert measured.sha256 == hashlib.sha256((made / WEIGHTS).read_bytes()).hexdigest()
+    assert read_card(made) == measured
+
+
+SOUND = {"seed": 7, "pairs": {"patch_points": 1024}}
+
+
+@pytest.mark.parametrize(
+    "content", [b"no archive at all", {"network": {}}, {"network": {"layer": 1}, "settings": SOUND}]
+)
+def test_what_is_no_checkpoint_is_refused(tmp_path: Path, content: bytes | dict[str, Any]) -> None:
     path = tmp_path / "odd.pt"
-    if content is None:
-        torch.save({"network": {}}, path)
-    else:
+    if isinstance(content, bytes):
         path.write_bytes(content)
+    else:
+        torch.save(content, path)
     with pytest.raises(DetectorUnavailable, match=r"odd\.pt is no checkpoint"):
         open_measured(MODEL_STORE, "spicd-net/1", path)
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from tests.worker.evaluation.paper.test_injection import ONE
+from tests.worker.evaluation.paper.test_trial import CountingDetector
 from worker.evaluation.paper.benchmark import Method, PaperResult, PaperSettings
 from worker.evaluation.paper.document import document
 from worker.evaluation.paper.pictures import pictures
@@ -33,7 +34,7 @@ def result(site: Site) -> PaperResult:
     )
     return PaperResult(
         settings=PaperSettings(),
-        card_threshold=0.5,
+        card=CountingDetector.card,
         site=site,
         validation=site,
         trials=given,

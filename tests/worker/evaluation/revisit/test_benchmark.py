@@ -39,7 +39,8 @@ def result(out: Path) -> dict:
     with pytest.MonkeyPatch.context() as patch:
         for name in ("TEST_SEED", "VALIDATION_SEED"):
             patch.setattr(benchmark, name, 51)
-        patch.setattr(benchmark, "opened", lambda *_: Method(name="heights", score=heights, stated=0.5))
+        method = Method(name="heights", score=heights, stated=0.5, sha256="0123")
+        patch.setattr(benchmark, "opened", lambda *_: method)
         settings = benchmark.BenchmarkSettings(out=out, visits=3, validation=3, made=TINY)
         return benchmark.evaluate(settings)
 
@@ -49,6 +50,7 @@ def test_methods_stand_in_one_document_and_nothing_is_made_twice(result: dict):
     assert result["made"] == 0
     assert [row["name"] for row in result["methods"]][:2] == ["heights", "C2C (mean)"]
     assert result["methods"][0]["stated"]["threshold"] == 0.5
+    assert [row["sha256"] for row in result["methods"]][:2] == ["0123", None]
     assert (result["test"]["visits"], result["test"]["without_change"]) == (3, 1)
 
 
