@@ -36,7 +36,7 @@ class Injection:
 def inject(site: Site, experiment: Experiment, number: int, *, everywhere: bool = False) -> Injection:
     """Modify `experiment.scans` scans at `experiment.tiles_per_scan` tiles each; the same number, the same changes.
 
-    A scan is modified at tiles in which it has as many points as a tile of the map needs, drawn for each scan
+    A scan is modified at tiles in which it has as many voxels as a tile of the map needs, drawn for each scan
     by itself, so that two may fall on the same tile. As the paper has it, only that scan changes, and the others
     still show what was there; with `everywhere` all scans do, as in a place that really changed. Raises
     ValueError where too few scans have so many tiles.

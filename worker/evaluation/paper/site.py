@@ -56,7 +56,7 @@ class Site:
     tiles: Tiles  #: the stored reference
     dense: tuple[
         NDArray[np.intp], ...
-    ]  #: S times the places in `tiles` in which the scan alone has enough points
+    ]  #: S times the places in `tiles` in which the scan alone, a point a voxel, would make a tile
     points: Points  #: (M, 3) the map, for pictures
     surface: Surface | None  #: what a modified scan is registered to; None at true poses
     settings: PipelineSettings
@@ -125,7 +125,7 @@ def _mapped(
         poses=tuple(pose for _, pose in placed),
         voxels=voxels,
         tiles=tiles,
-        dense=tuple(_dense(points, tiles, pipeline.tiling.min_points) for points in there),
+        dense=tuple(_dense(part.points, tiles, pipeline.tiling.min_points) for part in voxels),
         points=whole.points,
         surface=known,
         settings=pipeline,
