@@ -37,7 +37,9 @@ def paper(
     everywhere: Annotated[
         bool, typer.Option("--everywhere", help="Changes are in all scans of a tile, not in one alone.")
     ] = False,
-    robustness: Annotated[bool, typer.Option(help="Also disturb one experiment, level by level.")] = True,
+    robustness: Annotated[
+        bool, typer.Option(help="Also disturb one experiment of each kind, level by level.")
+    ] = True,
     quick: Annotated[
         bool,
         typer.Option(

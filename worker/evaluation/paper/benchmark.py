@@ -18,7 +18,7 @@ from worker.evaluation.paper.embedding import Embedding, embed
 from worker.evaluation.paper.experiment import Experiment
 from worker.evaluation.paper.measured import open_measured, training_log
 from worker.evaluation.paper.published import experiments
-from worker.evaluation.paper.robustness import RobustnessPoint, sweep_disturbances
+from worker.evaluation.paper.robustness import RobustnessPoint, chosen_trials, sweep_disturbances
 from worker.evaluation.paper.scoring import (
     CachedDetector,
     MethodScores,
@@ -32,7 +32,6 @@ from worker.pipeline.flow import PipelineSettings
 from worker.progress import Progress, silent
 
 QUICK = ("magnitude_15cm", "type_remove", "baseline_no_change")
-ROBUSTNESS = ("magnitude_15cm",)  #: the experiment that is disturbed, that of the paper's Figure 13
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -104,8 +103,9 @@ def evaluate(settings: PaperSettings, progress: Progress = silent) -> PaperResul
     rivals = _baselines(given, progress)
     disturbed: tuple[RobustnessPoint, ...] = ()
     if settings.robustness:
-        trial = next((one for one in given[0] if one.experiment.name in ROBUSTNESS), given[0][0])
-        disturbed = sweep_disturbances(sites[0], trial, caches[0], measured.threshold, progress)
+        disturbed = sweep_disturbances(
+            sites[0], chosen_trials(given[0]), caches[0], measured.threshold, progress
+        )
     progress("embedding", 0.0)
     return PaperResult(
         settings=settings,

@@ -11,6 +11,7 @@ from worker.evaluation.detection.metrics import Confusion, confusion, pooled, pr
 from worker.evaluation.paper.benchmark import Method, PaperResult
 from worker.evaluation.paper.experiment import Kind
 from worker.evaluation.paper.published import published
+from worker.evaluation.paper.robustness import chosen_trials
 
 KINDS: tuple[Kind, ...] = ("add", "remove", "move")
 #: The name in the paper's Table 6 of each of ours that it has.
@@ -49,6 +50,7 @@ def document(result: PaperResult) -> dict[str, Any]:
         "table_5": _table_5(result),
         "table_6": [_row(method, number == 0) for number, method in enumerate(result.methods)],
         "by_kind": {kind: _kind(result, kind) for kind in KINDS},
+        "robustness_experiments": [trial.experiment.name for trial in chosen_trials(result.trials)],
         "robustness": [
             {"disturbance": point.disturbance, "level": point.level, **point.counts.figures()}
             for point in result.robustness

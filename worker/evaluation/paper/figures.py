@@ -125,6 +125,15 @@ def robustness(result: PaperResult) -> Figure:
         for name, color in zip(("precision", "recall", "f1", "false_positive_rate"), LINES, strict=False):
             values = [getattr(point.counts, name) for point in points]
             axes.plot(levels, values, "o-", markersize=3, color=color, label=name.replace("_", " "))
+        if what == "dropout (%)":
+            paper = published()["robustness"]["dropout"]
+            axes.plot(
+                [100 * float(level) for level in paper],
+                list(paper.values()),
+                "D",
+                color="#555",
+                label="paper, F1",
+            )
         axes.set_ylim(-0.03, 1.03)
         _labels(axes, what, "share")
     return figure

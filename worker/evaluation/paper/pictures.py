@@ -8,6 +8,7 @@ from matplotlib.figure import Figure
 
 from worker.evaluation.paper import figures
 from worker.evaluation.paper.benchmark import PaperResult
+from worker.evaluation.paper.robustness import chosen_trials
 from worker.evaluation.paper.tile_figures import failure_case, tile_map
 from worker.evaluation.training_curves import curves
 
@@ -78,11 +79,16 @@ def _of_experiments(result: PaperResult) -> list[Picture]:
         ),
         Picture(
             name="figure-11",
-            caption="Figure 11: robustness; a shifted map is not registered again.",
+            caption=f"Figure 11: robustness, over {_named(result)}; a shifted map is not registered again. "
+            "Diamonds: F1 as far as the paper's text tells it, on experiments that it does not name.",
             figure=figures.robustness(result) if result.robustness else None,
             missing="it was not asked for",
         ),
     ]
+
+
+def _named(result: PaperResult) -> str:
+    return ", ".join(trial.experiment.name for trial in chosen_trials(result.trials))
 
 
 def _of_tiles(result: PaperResult) -> list[Picture]:

@@ -42,6 +42,9 @@ def test_three_experiments_are_run_told_and_drawn(tmp_path: Path, capsys: pytest
     # at true poses untouched tiles are equal to the last bit, so that any distance is a change
     assert methods["C2C (mean)"]["at_test_threshold"]["f1"] == 1.0
     assert told["robustness"][0]["level"] == 0
+    assert told["robustness_experiments"] == ["type_remove"]  # of those that were run
+    undisturbed, row = told["robustness"][0], told["table_5"][1]
+    assert {name: undisturbed[name] for name in COUNTS} == {name: row[name] for name in COUNTS}
     page = (tmp_path / "report.html").read_text()
     assert page.count("data:image/png;base64,") == len(list(tmp_path.glob("*.png"))) >= 9
     assert "magnitude_15cm" in page
