@@ -38,7 +38,9 @@ class Card(BaseModel):
     detector: str = Field(description="key in worker.detectors.store.DETECTORS")
     summary: str
     classes: tuple[str, str, str] = ("unchanged", "changed", "different place")
-    threshold: float = Field(ge=0, le=1, description="a tile is changed above this probability of class 1")
+    threshold: float = Field(
+        ge=0, le=1, description="a tile is changed above this score, the probability that it is not as it was"
+    )
     preprocessing: Preprocessing
     weights: str | None = Field(default=None, description="file beside the card")
     sha256: str | None = Field(default=None, description="of the weights file")

@@ -22,8 +22,17 @@ class TileScores:
 
     @property
     def change(self) -> NDArray[np.float32]:
-        """(T,) probability of class 1, the change score (paper, Section 3.9.2)."""
-        return self.probabilities[:, 1]
+        """(T,) see `change_score`."""
+        return change_score(self.probabilities)
+
+
+def change_score(probabilities: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(T, 3) -> (T,) probability that the tile is not as it was, 1 - p0; NaN stays NaN.
+
+    The paper takes class 1 alone (Section 3.9.2). A tile of a registered survey that looks like another place has
+    changed altogether, or was registered wrongly: reason enough to look there.
+    """
+    return 1 - probabilities[:, 0]
 
 
 class Detector(Protocol):

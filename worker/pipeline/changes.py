@@ -9,7 +9,7 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from worker.detectors.detector import TileScores
+from worker.detectors.detector import TileScores, change_score
 from worker.pipeline.tiling import TilePairs
 
 
@@ -36,6 +36,11 @@ class ChangeSet:
     states: NDArray[np.uint8]  #: (T,) values of TileState
     threshold: float
 
+    @property
+    def scores(self) -> NDArray[np.float32]:
+        """(T,) probability that the tile is not as it was, NaN where unobserved."""
+        return change_score(self.probabilities)
+
     def counts(self) -> dict[str, int]:
         """Tiles by state, every state named."""
         found = Counter(int(state) for state in self.states)
@@ -43,7 +48,7 @@ class ChangeSet:
 
 
 def decide(pairs: TilePairs, scores: TileScores, *, threshold: float) -> ChangeSet:
-    """Call a tile changed above the threshold of class 1, and inconsistent where class 2 wins below it.
+    """Call a tile changed where its score is above the threshold, and inconsistent where class 2 wins below it.
 
     The paper only knows the first; a tile that looks like another place is no proof of "no change" either.
     Raises ValueError where an observed tile has no score: that is a fault of the detector, and no state fits it.
@@ -55,6 +60,6 @@ def decide(pairs: TilePairs, scores: TileScores, *, threshold: float) -> ChangeS
     probabilities = np.where(observed[:, None], scores.probabilities, np.float32(np.nan))
     states = np.full(len(probabilities), TileState.UNCHANGED, np.uint8)
     states[np.nan_to_num(probabilities).argmax(axis=1) == 2] = TileState.INCONSISTENT
-    states[probabilities[:, 1] > threshold] = TileState.CHANGED
+    states[change_score(probabilities) > threshold] = TileState.CHANGED
     states[~observed] = TileState.UNOBSERVED
     return ChangeSet(pairs=pairs, probabilities=probabilities, states=states, threshold=threshold)

@@ -63,7 +63,7 @@ def _tile_result(
         lower=_rounded(lower),
         upper=_rounded(upper),
         state=state.label,
-        score=changed if scored else None,
+        score=float(changes.scores[tile]) if scored else None,
         probabilities=(same, changed, other) if scored else None,
         n_reference=len(changes.pairs.reference.points[tile]),
         n_current=len(changes.pairs.current[tile]),
@@ -86,7 +86,7 @@ def write_coloured_cloud(path: Path, current: CurrentMap, changes: ChangeSet) ->
     state = np.full(len(tile), NOT_IN_A_TILE, np.uint8)
     state[inside] = changes.states[tile[inside]]
     score = np.full(len(tile), np.nan, np.float32)
-    score[inside] = changes.probabilities[tile[inside], 1]
+    score[inside] = changes.scores[tile[inside]]
     write_ply(
         path,
         current.points,
@@ -99,8 +99,8 @@ def _tile_of_points(points: Points, changes: ChangeSet) -> NDArray[np.int64]:
     """(N,) row of the tile that holds each point, -1 where none does."""
     tiles = changes.pairs.reference
     table = np.full(tiles.grid.shape, -1, np.int64)
-    table[tuple(tiles.indices.T)] = np.arange(len(tiles.indices))
-    index = np.floor((points - tiles.grid.origin) / tiles.grid.size).astype(np.int64)
+    table[tuple((tiles.indices - tiles.grid.lowest).T)] = np.arange(len(tiles.indices))
+    index = np.floor((points - tiles.grid.origin) / tiles.grid.size).astype(np.int64) - tiles.grid.lowest
     inside = np.all((index >= 0) & (index < tiles.grid.shape), axis=1)
     found = np.full(len(points), -1, np.int64)
     found[inside] = table[tuple(index[inside].T)]

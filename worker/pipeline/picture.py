@@ -135,7 +135,7 @@ def _topmost(changes: ChangeSet) -> list[int]:
 
 
 def _order(changes: ChangeSet, row: int) -> tuple[int, float]:
-    score = float(np.nan_to_num(changes.probabilities[row, 1]))
+    score = float(np.nan_to_num(changes.scores[row]))
     return PRECEDENCE.index(TileState(int(changes.states[row]))), -score
 
 
@@ -144,7 +144,7 @@ def _label(axes: Axes, changes: ChangeSet, row: int, *, with_id: bool) -> None:
     tiles = changes.pairs.reference
     index = tiles.indices[row]
     x, y = tiles.grid.lower(index)[0], tiles.grid.lower(index)[1] + tiles.grid.size[1]
-    lines = [(f"{changes.probabilities[row, 1]:.2f}", 9 if with_id else 7, 4.0)]
+    lines = [(f"{changes.scores[row]:.2f}", 9 if with_id else 7, 4.0)]
     if with_id:
         lines.append(("_".join(f"{number:03d}" for number in index), 6, 14.0))
     for text, size, down in lines:

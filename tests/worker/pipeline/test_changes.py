@@ -35,11 +35,17 @@ def test_the_threshold_decides_and_not_the_larger_class() -> None:
 
 
 def test_a_tile_of_another_place_is_inconsistent_below_the_threshold() -> None:
-    assert _state(0.25, 0.25, 0.5, threshold=0.5) is TileState.INCONSISTENT
+    assert _state(0.25, 0.25, 0.5, threshold=0.875) is TileState.INCONSISTENT
 
 
 def test_a_tile_of_another_place_is_changed_above_the_threshold() -> None:
-    assert _state(0.0, 0.375, 0.625, threshold=0.25) is TileState.CHANGED
+    assert _state(0.0, 0.375, 0.625, threshold=0.75) is TileState.CHANGED
+
+
+def test_what_counts_is_that_the_tile_is_not_as_it_was_as_another_thing_or_as_another_place() -> None:
+    changes = decide(row_of([600], [600], observed=[True]), scores_of((0.25, 0.375, 0.375)), threshold=0.5)
+    assert changes.scores.tolist() == [0.75]
+    assert TileState(changes.states[0]) is TileState.CHANGED
 
 
 @pytest.mark.parametrize("row", [NAN, (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)])
@@ -65,8 +71,8 @@ def test_a_threshold_of_1_is_never_passed() -> None:
 
 
 def test_each_tile_gets_its_own_state() -> None:
-    rows = [(0.0, 1.0, 0.0), NAN, (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)]
-    found = _states(*rows, threshold=0.5, observed=[True, False, True, True])
+    rows = [(0.0, 1.0, 0.0), NAN, (1.0, 0.0, 0.0), (0.25, 0.25, 0.5)]
+    found = _states(*rows, threshold=0.875, observed=[True, False, True, True])
     assert found == [TileState.CHANGED, TileState.UNOBSERVED, TileState.UNCHANGED, TileState.INCONSISTENT]
 
 

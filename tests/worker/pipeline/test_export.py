@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -46,7 +47,7 @@ def test_open3d_reads_state_and_score_of_each_point(written: Path) -> None:
     cloud = o3d.t.io.read_point_cloud(str(written))
     state, score = (cloud.point[name].numpy().ravel() for name in ("tile_state", "change_score"))
     assert state.tolist() == [0, 1, 1, 2, 2, 2, 3, 3, 3, 3, NOT_IN_A_TILE, NOT_IN_A_TILE]
-    assert score[:6].tolist() == [0.25, 0.75, 0.75, 0.125, 0.125, 0.125]
+    assert score[:6].tolist() == [0.25, 0.75, 0.75, 0.875, 0.875, 0.875]
     assert np.isnan(score[6:]).all()
     assert cloud.point.positions.numpy() == pytest.approx(CLOUD)
 
@@ -57,6 +58,21 @@ def test_a_point_on_a_border_has_the_colour_of_the_upper_tile(tmp_path: Path) ->
     colors = read_scan(tmp_path / "c.ply").colors
     assert colors is not None
     assert tuple(colors[0].tolist()) == STATE_COLORS[TileState.CHANGED]
+
+
+def test_in_a_map_that_grew_below_its_origin_points_have_the_colours_of_their_own_tiles(
+    tmp_path: Path,
+) -> None:
+    known = four_states()
+    tiles = known.pairs.reference
+    grown = replace(tiles.grid, lowest=(-2, 0, 0))
+    pairs = replace(known.pairs, reference=replace(tiles, grid=grown, indices=tiles.indices - [2, 0, 0]))
+    cloud = np.concatenate([in_tile(i - 2, 0, 0, 1) for i in range(5)])  # the last one is of no tile
+    write_coloured_cloud(
+        tmp_path / "c.ply", CurrentMap(points=cloud, colors=None), replace(known, pairs=pairs)
+    )
+    state = o3d.t.io.read_point_cloud(str(tmp_path / "c.ply")).point["tile_state"].numpy().ravel()
+    assert state.tolist() == [0, 1, 2, 3, NOT_IN_A_TILE]
 
 
 def test_a_changed_tile_as_a_client_is_told_of_it() -> None:

@@ -39,7 +39,7 @@ def row_of(reference: Sequence[int], current: Sequence[int], *, observed: Sequen
 
 
 def four_states(threshold: float = 0.5) -> ChangeSet:
-    """One tile of each state, in the order of their numbers: scores 0.25, 0.75, 0.125 and none."""
+    """One tile of each state, in the order of their numbers: scores 0.25, 0.75, 0.875 and none."""
     return ChangeSet(
         pairs=row_of([600, 700, 800, 900], [610, 710, 810, 3], observed=[True, True, True, False]),
         probabilities=np.array(

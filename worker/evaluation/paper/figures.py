@@ -83,7 +83,7 @@ def score_distributions(result: PaperResult) -> Figure:
         axes.hist(part, bins, weights=weights, color=color, alpha=0.7, label=f"{label} ({len(part)} tiles)")
     axes.set_yscale("log")
     _mark_thresholds(axes, result)
-    _labels(axes, "probability of class 1", "share of tiles")
+    _labels(axes, "score", "share of tiles")
     return figure
 
 
