@@ -119,6 +119,8 @@ def test_a_model_is_trained_further_calibrated_and_named_by_a_survey(house: Hous
     assert (model.model, model.status, model.map_version) == ("lobby-net/1", "ready", 1)
     card = Card.model_validate(model.card)
     assert (card.name, card.version, card.preprocessing.patch_points) == ("lobby-net", "1", 512)
+    trained_on = card.training["settings"]["pairs"]["chamfer_points"]
+    assert card.preprocessing.chamfer_points == trained_on == 128  # as the base, whose card names none
     assert (card.training["map_id"], card.training["base"]) == (MAP, MODEL)
     assert set(card.evaluation) == {"validation", MODEL, "pairs"}  # beside what it started from
     assert card.evaluation["validation"]["threshold"] == card.threshold

@@ -102,6 +102,7 @@ def _settings(at: Context, model: ModelRecord, tiles: Path) -> TrainSettings:
     version = at.catalog.versions.get(model.map_id, model.map_version)
     device = resolve_device(at.settings.device).type
     share = held_out_share(load_tiles(tiles), min_separation=SITE.pairs.min_separation)
+    needs = _needs(at, model, version)
     return replace(
         SITE,
         epochs=model.epochs or SITE.epochs,
@@ -111,7 +112,9 @@ def _settings(at: Context, model: ModelRecord, tiles: Path) -> TrainSettings:
         learning_rate=SITE.learning_rate if model.base is None else FURTHER,
         device=device,
         coarse_search=device == "cpu",
-        pairs=replace(SITE.pairs, patch_points=_needs(at, model, version).patch_points),
+        pairs=replace(
+            SITE.pairs, patch_points=needs.patch_points, chamfer_points=needs.chamfer_points
+        ),  # else the network would be used on another input than it was trained on
     )
 
 
