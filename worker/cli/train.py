@@ -29,7 +29,7 @@ def train(
     offices: Annotated[int | None, typer.Option(min=0, help="Simulated offices of a new set.")] = None,
     corridors: Annotated[int | None, typer.Option(min=0, help="Simulated corridors.")] = None,
     rooms: Annotated[int | None, typer.Option(min=0, help="Simulated single rooms.")] = None,
-    epochs: Annotated[int | None, typer.Option(min=1, help="At most so many.")] = None,
+    epochs: Annotated[int | None, typer.Option(min=0, help="At most so many.")] = None,
     minutes: Annotated[
         float | None, typer.Option(min=0, help="Wall clock of the training; the learning rate follows it.")
     ] = None,
@@ -50,6 +50,10 @@ def train(
     ] = None,
     fresh_head: Annotated[
         bool | None, typer.Option("--fresh-head", help="Take its encoder alone, and start the head anew.")
+    ] = None,
+    head_epochs: Annotated[
+        int | None,
+        typer.Option("--head-epochs", min=0, help="Of the head alone, after the rest: seconds each."),
     ] = None,
     learning_rate: Annotated[
         float | None, typer.Option("--learning-rate", min=0, help="To begin with.")
@@ -83,6 +87,7 @@ def train(
             batch=batch,
             learning_rate=learning_rate,
             fresh_head=fresh_head,
+            head_epochs=head_epochs,
             start_from=None if start_from is None else str(start_from),
         ),
     )

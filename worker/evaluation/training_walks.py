@@ -228,7 +228,8 @@ def _set(again: TilePairs, looks: Sequence[Look], settings: WalkSettings) -> Til
     middle = tiles.grid.centers(tiles.indices)
 
     def about(points: Points, tile: int) -> Points:
-        return (points - middle[tile]).astype(np.float32)
+        local: Points = (points - middle[tile]).astype(np.float32)
+        return local
 
     every = range(len(tiles.points))
     return TileSet(

@@ -26,6 +26,7 @@ RUN = (
     "start_from",
     "fresh_head",
     "learning_rate",
+    "head_epochs",
 )
 PAIRS = ("revisit_share", "density")
 
@@ -50,6 +51,7 @@ def main() -> None:
         const=True,
         help="take its encoder alone, and start the head anew",
     )
+    parser.add_argument("--head-epochs", type=int, help="of the head alone, after the rest")
     parser.add_argument("--learning-rate", type=float, help="to begin with")
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     parser.add_argument("--threads", type=int, help="of the CPU")

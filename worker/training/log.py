@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
 LOG = "epochs.csv"
+HEAD_LOG = "head_epochs.csv"  #: of what the head was trained on its own
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -28,9 +29,9 @@ class EpochRow:
     recall_different: float
 
 
-def append_row(folder: Path, row: EpochRow) -> None:
+def append_row(folder: Path, row: EpochRow, name: str = LOG) -> None:
     """Write one more row, and the columns' names first where there is no log yet."""
-    path = folder / LOG
+    path = folder / name
     fresh = not path.exists()
     with path.open("a", newline="") as file:
         writer = csv.DictWriter(file, list(asdict(row)))

@@ -29,6 +29,10 @@ class TrainSettings:
     )
     fresh_head: bool = False  #: ours: of that network the encoder alone is taken, and the head starts anew
     settle_head: bool = True  #: ours: the head's first layers start as if their inputs were standardised
+    head_epochs: int = 0  #: ours: after the last epoch the head goes on alone, on descriptors computed once
+    head_batch: int = 64  #: pairs
+    head_learning_rate: float = 5e-4  #: to begin with
+    head_validation_pairs: int = 4000  #: they cost next to nothing
     device: str = "cpu"
     coarse_search: bool = (
         True  #: bfloat16 where max-pooling looks for its winners; a third less time on the CPU

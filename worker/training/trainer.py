@@ -17,6 +17,7 @@ from worker.detectors.spicd_net.layers import PooledLinear
 from worker.detectors.spicd_net.network import PairOutput, SpicdNetwork
 from worker.progress import Progress, silent
 from worker.training.dataset import TileSet, load_tiles, split_tiles
+from worker.training.head import told, train_head
 from worker.training.log import EpochRow, append_row, by_class, cut_log
 from worker.training.losses import total_loss
 from worker.training.metrics import Measured, measured
@@ -52,6 +53,8 @@ def train(
         run.epoch(progress)
         if on_epoch is not None:
             on_epoch(out)
+    if settings.head_epochs:
+        run.finish_head(training, validation, progress)
     progress("train", 1.0)
     return out / BEST
 
@@ -118,6 +121,20 @@ class Run:
         )
         return row
 
+    def finish_head(self, training: TileSet, validation: TileSet, progress: Progress) -> None:
+        """Train the best network's head alone, unless that was done before."""
+        path = self._out / BEST
+        if not path.exists():  # no epoch was asked for
+            self._save(BEST, {"measured": None})
+        state = torch.load(path, map_location=self._device, weights_only=True)
+        if "head" in state:
+            return
+        network = SpicdNetwork().to(self._device)
+        network.load_state_dict(state["network"])
+        found = train_head(network, training, validation, self._settings, self._out, progress)
+        more = {"network": network.state_dict(), "head": told(found), "settings": asdict(self._settings)}
+        write_aside(path, {**state, **more})
+
     def resume(self) -> None:
         """Take up the last checkpoint, if the folder has one."""
         path = self._out / CHECKPOINT
@@ -127,7 +144,7 @@ class Run:
 
     def _take_up(self, path: Path) -> None:
         state = torch.load(path, map_location=self._device, weights_only=True)
-        if whole(state["settings"]) != asdict(self._settings):
+        if _of_epochs(whole(state["settings"])) != _of_epochs(asdict(self._settings)):
             raise ValueError(f"{path} was made with other settings; use them, or another folder")
         self._network.load_state_dict(state["network"])
         self._optimizer.load_state_dict(state["optimizer"])
@@ -216,7 +233,6 @@ class Run:
         return [torch.from_numpy(array).to(self._device) for array in arrays]
 
     def _save(self, name: str, more: dict[str, Any]) -> None:
-        """Written beside and moved, so that a stop in between leaves the old file whole."""
         state = {
             "settings": asdict(self._settings),
             "network": self._network.state_dict(),
@@ -226,9 +242,7 @@ class Run:
             "best_epoch": self._best_epoch,
             **more,
         }
-        partial = self._out / f"{name}.partial"
-        torch.save(state, partial)
-        partial.replace(self._out / name)
+        write_aside(self._out / name, state)
 
     def _log(self, trained: _Trained, found: Measured) -> EpochRow:
         row = EpochRow(
@@ -244,6 +258,18 @@ class Run:
         )
         append_row(self._out, row)
         return row
+
+
+def _of_epochs(settings: dict[str, Any]) -> dict[str, Any]:
+    """Without what only comes after the last epoch, and may be asked for then."""
+    return {name: value for name, value in settings.items() if not name.startswith("head_")}
+
+
+def write_aside(path: Path, state: Mapping[str, Any]) -> None:
+    """Written beside and moved, so that a stop in between leaves the old file whole."""
+    partial = path.with_name(f"{path.name}.partial")
+    torch.save(dict(state), partial)
+    partial.replace(path)
 
 
 def _encoder(network: Mapping[str, Tensor]) -> dict[str, Tensor]:

@@ -80,7 +80,7 @@ def test_the_trainings_log_comes_along_and_that_of_an_earlier_one_goes(store, tm
 def test_a_card_names_the_deviations_of_its_own_training():
     assert deviations(asdict(PAPER)) == list(DEVIATIONS)
     ours = asdict(TrainSettings())
-    assert len(deviations(ours)) == len(DEVIATIONS) + 5  # the density is the paper's
+    assert len(deviations(ours)) == len(DEVIATIONS) + 9  # the density is the paper's
     ours["pairs"]["density"] = (0.05, 0.3)
     assert "change density is the range given in settings" in deviations(ours)
 
