@@ -135,7 +135,7 @@ def test_a_model_is_trained_further_calibrated_and_named_by_a_survey(house: Hous
     assert any(tile["score"] is not None for tile in house.tiles(found.survey_id))
 
 
-def test_the_weights_differ_from_the_bases_and_are_those_that_the_card_vouches_for(house: House) -> None:
+def test_the_weights_are_the_bases_or_near_them_and_those_that_the_card_vouches_for(house: House) -> None:
     job = asked(house)
     run(job)
     at = context(house, job)
@@ -143,7 +143,9 @@ def test_the_weights_differ_from_the_bases_and_are_those_that_the_card_vouches_f
     assert isinstance(ours, SpicdNet)
     assert isinstance(base, SpicdNet)
     name = "head.classifier.0.weight"
-    assert 0 < (ours.weights()[name] - base.weights()[name]).abs().max() < 0.1
+    apart = float((ours.weights()[name] - base.weights()[name]).abs().max())
+    kept = "kept" in Card.model_validate(made(house, job).card).training
+    assert apart == 0 if kept else 0 < apart < 0.1
     content = house.catalog.blobs.get_bytes(keys.model_weights(job.job_id))
     assert hashlib.sha256(content).hexdigest() == Card.model_validate(made(house, job).card).sha256
 

@@ -61,13 +61,16 @@ def publish(
     name: str = "spicd-net",
     about: Mapping[str, Any] | None = None,
     beside: Mapping[str, SpicdNet] | None = None,
+    base: str | None = None,
     preprocessing: Preprocessing | None = None,
 ) -> Path:
     """Write `model_store/<name>/<version>/`, its threshold chosen on the validation tiles; returns the folder.
 
     `unseen` is a training set of other buildings, on which the card's evaluation is measured; without one
     the validation tiles serve for that too, and the card says so. `about` adds to what the card says of the
-    training; `beside` are other detectors by name, measured on the validation pairs at their own thresholds. `preprocessing` is the paper's where it is left out.
+    training; `beside` are other detectors by name, measured on the validation pairs at their own thresholds.
+    `base` names the one of them that was trained further: where that ranks the validation pairs no worse, its weights are published, with the
+    threshold that is best here. `preprocessing` is the paper's where it is left out.
     The training's log, where it lies beside the checkpoint, comes along.
     """
     state = torch.load(checkpoint, map_location="cpu", weights_only=True)
@@ -96,14 +99,24 @@ def publish(
     detector = SpicdNet.load(card, state["network"], torch.device("cpu"))
     pair_settings = _pair_settings(settings)
     pairs = survey_pairs(validation, pair_settings, seed=settings["seed"])
-    scores = change_scores(detector, pairs)
+    network, scores = state["network"], change_scores(detector, pairs)
+    others = {other: change_scores(one, pairs) for other, one in (beside or {}).items()}
+    if beside and base in others and _area(others[base], pairs) >= _area(scores, pairs):
+        kept = {
+            "kept": f"the weights of {base}: the training ranked the validation pairs no better",
+            "trained": _area(scores, pairs),
+        }
+        card = card.model_copy(update={"training": {**card.training, **kept}})
+        detector, network, scores = beside[base], beside[base].weights(), others[base]
     chosen = best_threshold(scores, pairs)
     evaluation: dict[str, Any] = {"validation": _measured(chosen.threshold, scores, pairs)}
-    for other_name, other_one in (beside or {}).items():
-        evaluation[other_name] = _measured(other_one.card.threshold, change_scores(other_one, pairs), pairs)
+    for other, found in others.items():
+        evaluation[other] = _measured((beside or {})[other].card.threshold, found, pairs)
     if unseen is not None:
-        other = survey_pairs(load_tiles(unseen), pair_settings, seed=settings["seed"])
-        evaluation["unseen buildings"] = _measured(chosen.threshold, change_scores(detector, other), other)
+        unknown = survey_pairs(load_tiles(unseen), pair_settings, seed=settings["seed"])
+        evaluation["unseen buildings"] = _measured(
+            chosen.threshold, change_scores(detector, unknown), unknown
+        )
     evaluation["pairs"] = (
         "two independent visits: nothing changed, a synthetic change (paper, Section 3.5.1), or whole things added, removed and moved "
         "where the set has such; no augmentation. Recall, precision and F1 are of whole things where there are any, precision and F1 "
@@ -112,7 +125,7 @@ def publish(
     folder = write_model(
         model_store / name / version,
         card.model_copy(update={"threshold": chosen.threshold, "evaluation": evaluation}),
-        state["network"],
+        network,
     )
     _take_log(checkpoint.parent / LOG, folder / LOG)
     return folder
@@ -140,10 +153,15 @@ def change_scores(detector: SpicdNet, pairs: SurveyPairs) -> NDArray[np.float32]
     ).change
 
 
+def _area(scores: NDArray[np.float32], pairs: SurveyPairs) -> float:
+    """Under ROC, over the pairs that the threshold is chosen by."""
+    return area_under_roc(scores[pairs.told], pairs.changed[pairs.told])
+
+
 def _measured(threshold: float, scores: NDArray[np.float32], pairs: SurveyPairs) -> dict[str, Any]:
     return {
         "pairs": len(pairs.kinds),
-        "area_under_roc": area_under_roc(scores, pairs.changed),
+        "area_under_roc": _area(scores, pairs),
         **asdict(operating(threshold, scores, pairs)),
     }
 

@@ -119,7 +119,10 @@ def _settings(at: Context, model: ModelRecord, tiles: Path) -> TrainSettings:
 
 
 def _published(at: Context, model: ModelRecord, version: VersionRecord, best: Path, tiles: Path) -> Path:
-    """The folder of the model; beside its figures stand those of the model that it would replace."""
+    """The folder of the model; beside its figures stand those of the model that it would replace.
+
+    A base that ranks the held-out tiles no worse keeps its weights, and gets the threshold of this place.
+    """
     other = model.base or version.model
     asked = {"base": model.base, "minutes": model.minutes, "epochs": model.epochs}
     about: dict[str, Any] = {"map_id": model.map_id, "map_version": model.map_version, "base": model.base}
@@ -135,6 +138,7 @@ def _published(at: Context, model: ModelRecord, version: VersionRecord, best: Pa
         command=f"POST /maps/{model.map_id}/models {json.dumps(asked)}",
         about=about,
         beside={other: detector} if isinstance(detector, SpicdNet) else {},
+        base=model.base,
         preprocessing=_needs(at, model, version),
     )
 

@@ -8,6 +8,7 @@ from dataclasses import asdict
 import pytest
 import torch
 
+from worker.detectors.spicd_net.detector import SpicdNet
 from worker.detectors.store import open_detector, read_card
 from worker.errors import DetectorUnavailable
 from worker.evaluation.publish import DEVIATIONS, change_scores, deviations, publish
@@ -62,6 +63,29 @@ def test_a_published_model_holds_the_checkpoints_weights(store):
     opened = open_detector(store, "spicd-net/3", device="cpu")
     for name, tensor in opened._network.state_dict().items():
         assert torch.equal(tensor, state[name])
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_of_a_base_and_what_became_of_it_the_one_that_ranks_better_is_published(store, tmp_path, turned):
+    """Turned round, a network ranks as badly as it ranked well; as it was, training has brought nothing."""
+    run, tiles = store.parent / "run", store.parent / "tiles.npz"
+    base = open_detector(store, "spicd-net/3", device="cpu")
+    if turned:
+        weights = {name: value.clone() for name, value in base.weights().items()}
+        for name in ("weight", "bias"):
+            weights[f"head.classifier.6.{name}"].neg_()
+        base = SpicdNet.load(base.card, weights, torch.device("cpu"))
+    folder = publish(run / "best.pt", tiles, tmp_path, summary="", beside={"base": base}, base="base")
+    card = read_card(folder)
+    areas = {name: card.evaluation[name]["area_under_roc"] for name in ("validation", "base")}
+    kept = "kept" in card.training
+    assert areas["validation"] == max(*areas.values(), card.training.get("trained", 0.0))
+    assert kept == (areas["validation"] == areas["base"])
+    if not turned:
+        assert kept
+    written = open_detector(tmp_path, "spicd-net/1", device="cpu").weights()
+    expected = base.weights() if kept else torch.load(run / "best.pt", weights_only=True)["network"]
+    assert all(torch.equal(written[name], expected[name]) for name in expected)
 
 
 def test_the_trainings_log_comes_along_and_that_of_an_earlier_one_goes(store, tmp_path):
