@@ -42,6 +42,16 @@ def train(
         float | None,
         typer.Option("--revisit-share", min=0, max=1, help="Of pairs of two visits, not one sampled twice."),
     ] = None,
+    edited_share: Annotated[
+        float | None,
+        typer.Option("--edited-share", min=0, max=1, help="Of changed pairs, those of whole things."),
+    ] = None,
+    rebuilt_share: Annotated[
+        float | None,
+        typer.Option(
+            "--rebuilt-share", min=0, max=1, help="Of changed pairs, those of a map with changed scans."
+        ),
+    ] = None,
     density: Annotated[
         tuple[float, float] | None, typer.Option(help="Least and largest share of points that changes take.")
     ] = None,
@@ -78,7 +88,15 @@ def train(
         default,
         device=where,
         coarse_search=where == "cpu",
-        pairs=replace(default.pairs, **_given(revisit_share=revisit_share, density=density)),
+        pairs=replace(
+            default.pairs,
+            **_given(
+                revisit_share=revisit_share,
+                edited_share=edited_share,
+                rebuilt_share=rebuilt_share,
+                density=density,
+            ),
+        ),
         **_given(
             epochs=epochs,
             minutes=minutes,

@@ -28,7 +28,7 @@ RUN = (
     "learning_rate",
     "head_epochs",
 )
-PAIRS = ("revisit_share", "density")
+PAIRS = ("revisit_share", "edited_share", "rebuilt_share", "density")
 
 
 def main() -> None:
@@ -43,6 +43,8 @@ def main() -> None:
     parser.add_argument("--validation-pairs", type=int)
     parser.add_argument("--batch", type=int)
     parser.add_argument("--revisit-share", type=float)
+    parser.add_argument("--edited-share", type=float)
+    parser.add_argument("--rebuilt-share", type=float)
     parser.add_argument("--density", type=float, nargs=2, metavar=("LOW", "HIGH"))
     parser.add_argument("--start-from", help="checkpoint whose network is trained on")
     parser.add_argument(

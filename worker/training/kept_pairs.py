@@ -23,8 +23,8 @@ from worker.progress import Progress, silent
 from worker.training.dataset import TileSet
 from worker.training.pairs import CHANGED, DIFFERENT, UNCHANGED, PairSettings, changed
 
-#: Shares of the unchanged pairs by what they are of, about those that `PairMaker` comes to with its twins.
-UNCHANGED_SHARES = {"revisit": 0.55, "beside": 0.20, "untouched": 0.15, "stored": 0.10}
+#: Shares of the unchanged pairs by what they are of.
+UNCHANGED_SHARES = {"revisit": 0.50, "beside": 0.30, "untouched": 0.15, "stored": 0.05}
 DIFFERENT_EACH = 2  #: pairs of different tiles that are kept for each tile
 TILES_PER_REPORT = 32
 
@@ -182,6 +182,8 @@ def _kept(kind: str, pairs: Sequence[tuple[int, int]], clouds: Sequence[Tensor])
 def _shares(kinds: dict[str, KeptPairs], settings: PairSettings) -> dict[str, float]:
     """Of all pairs, by kind; what a class lacks goes to its other kinds."""
     synthetic = 1 - settings.edited_share - settings.rebuilt_share
+    if not {"whole", "rebuilt"} & kinds.keys():
+        synthetic = 1.0
     within = {
         **UNCHANGED_SHARES,
         "whole": settings.edited_share,

@@ -35,10 +35,10 @@ class PairSettings:
         True  #: ours: a stored patch that comes back is not augmented either, nor a change of one
     )
     edited_share: float = (
-        0.5  #: ours: of changed pairs, those of whole things added, removed or moved, where there are any
+        0.65  #: ours: of changed pairs, those of whole things added, removed or moved, where there are any
     )
     rebuilt_share: float = (
-        0.2  #: ours: of changed pairs, those changed in some of the scans that the map is fused of
+        0.35  #: ours: of changed pairs, those changed in some of the scans that the map is fused of
     )
     beside_share: float = (
         0.5  #: ours: of unchanged pairs without a twin, those beside a change, where there are any

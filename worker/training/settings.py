@@ -31,7 +31,7 @@ class TrainSettings:
     settle_head: bool = True  #: ours: the head's first layers start as if their inputs were standardised
     head_epochs: int = 0  #: ours: after the last epoch the head goes on alone, on descriptors computed once
     head_batch: int = 64  #: pairs
-    head_learning_rate: float = 5e-4  #: to begin with
+    head_learning_rate: float = 1e-3  #: to begin with
     head_validation_pairs: int = 4000  #: they cost next to nothing
     device: str = "cpu"
     coarse_search: bool = (

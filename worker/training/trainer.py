@@ -132,7 +132,12 @@ class Run:
         network = SpicdNetwork().to(self._device)
         network.load_state_dict(state["network"])
         found = train_head(network, training, validation, self._settings, self._out, progress)
-        more = {"network": network.state_dict(), "head": told(found), "settings": asdict(self._settings)}
+        more = {
+            "network": network.state_dict(),
+            "measured": asdict(found.measured),
+            "head": told(found),
+            "settings": asdict(self._settings),
+        }
         write_aside(path, {**state, **more})
 
     def resume(self) -> None:
