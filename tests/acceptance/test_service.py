@@ -113,7 +113,7 @@ def test_a_tile_is_changed_exactly_above_the_threshold(
     for tile in tiles:
         if tile["state"] != "unobserved":
             assert sum(tile["probabilities"]) == pytest.approx(1, abs=1e-4)
-            assert tile["score"] == tile["probabilities"][1]
+            assert tile["score"] == pytest.approx(1 - tile["probabilities"][0], abs=1e-6)
             assert (tile["state"] == "changed") == (tile["score"] > survey["threshold"])
 
 

@@ -81,7 +81,7 @@ def test_only_tiles_with_new_points_are_scored_again(site: Site) -> None:
     (tile,) = np.flatnonzero(given[1].truth)
     expected = 1 - len(given[1].pairs.current[tile]) / len(site.tiles.points[tile])
     assert expected > 0
-    assert found.scores[1][tile] == np.float32(expected)
+    assert found.scores[1][tile] == pytest.approx(expected, abs=1e-6)
 
 
 def test_a_tile_that_was_not_observed_has_no_score(site: Site) -> None:
