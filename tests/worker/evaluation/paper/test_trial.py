@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from tests.worker.evaluation.paper.test_injection import ONE
 from worker.detectors.card import Card, Preprocessing
