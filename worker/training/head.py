@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -126,8 +126,3 @@ class _HeadRun:
             for each in (drawn.reference, drawn.current, drawn.statistics, drawn.labels)
         )
         return self._head(reference, current, statistics), labels
-
-
-def told(result: HeadResult) -> dict[str, object]:
-    """For a checkpoint and its card."""
-    return asdict(result)

@@ -17,7 +17,7 @@ from worker.detectors.spicd_net.layers import PooledLinear
 from worker.detectors.spicd_net.network import PairOutput, SpicdNetwork
 from worker.progress import Progress, silent
 from worker.training.dataset import TileSet, load_tiles, split_tiles
-from worker.training.head import told, train_head
+from worker.training.head import train_head
 from worker.training.log import EpochRow, append_row, by_class, cut_log
 from worker.training.losses import total_loss
 from worker.training.metrics import Measured, measured
@@ -135,7 +135,7 @@ class Run:
         more = {
             "network": network.state_dict(),
             "measured": asdict(found.measured),
-            "head": told(found),
+            "head": asdict(found),
             "settings": asdict(self._settings),
         }
         write_aside(path, {**state, **more})

@@ -70,9 +70,10 @@ def test_a_set_without_further_looks_makes_up_each_class_of_what_it_has(tiles, n
 def test_different_places_are_3_m_apart_or_of_two_buildings(pool, tiles):
     pairs = pool.kinds["different"]
     for i, j in zip(pairs.reference.tolist(), pairs.current.tolist(), strict=True):
-        tile_i, tile_j = i, j  # the first rows are the tiles' first looks
-        apart = np.linalg.norm(tiles.centres[tile_i] - tiles.centres[tile_j])
-        assert apart >= 3.0 or tiles.buildings[tile_i] != tiles.buildings[tile_j]
+        apart = np.linalg.norm(
+            tiles.centres[i] - tiles.centres[j]
+        )  # the first rows are the tiles' first looks
+        assert apart >= 3.0 or tiles.buildings[i] != tiles.buildings[j]
 
 
 def test_kept_statistics_are_those_of_the_two_tiles_in_either_order(pool, tiles):
@@ -83,13 +84,31 @@ def test_kept_statistics_are_those_of_the_two_tiles_in_either_order(pool, tiles)
     assert not pool.kinds["stored"].statistics.any()
 
 
-def test_drawing_turns_descriptors_and_statistics_together(pool):
-    drawn = pool.draw(600, np.random.default_rng(2))
-    difference = (drawn.reference - drawn.current).abs().sum(dim=1)
-    assert torch.equal(difference == 0, (drawn.statistics == 0).all(dim=1))
-    again = pool.draw(600, np.random.default_rng(2))
-    assert torch.equal(drawn.statistics, again.statistics)
-    assert torch.equal(drawn.labels, again.labels)
+def test_a_pair_that_is_drawn_turned_has_its_statistics_turned_too(tiles, network):
+    visits = keep_pairs(
+        network.encoder, replace(tiles, looks=()), replace(SETTINGS.pairs, shares=(1, 0, 0)), seed=1
+    )
+    drawn = visits.draw(400, np.random.default_rng(2))
+    kept = visits.kinds["revisit"]
+    ways = {"forth": 0, "back": 0}
+    first, second = (network_rows(visits, rows) for rows in (kept.reference, kept.current))
+    for reference, current, found in zip(drawn.reference, drawn.current, drawn.statistics, strict=True):
+        for way, (a, b, shift) in {"forth": (first, second, 0), "back": (second, first, 4)}.items():
+            here = ((a == reference).all(dim=1) & (b == current).all(dim=1)).nonzero()
+            if len(here):
+                assert np.array_equal(found.numpy(), np.roll(kept.statistics[int(here[0])], shift))
+                ways[way] += 1
+    assert min(ways.values()) > 50
+
+
+def network_rows(pool: PairPool, rows: np.ndarray) -> torch.Tensor:
+    return pool._descriptors[torch.from_numpy(rows)]
+
+
+def test_the_same_generator_draws_the_same_pairs(pool):
+    one, again = (pool.draw(600, np.random.default_rng(2)) for _ in range(2))
+    assert torch.equal(one.statistics, again.statistics)
+    assert torch.equal(one.labels, again.labels)
 
 
 def test_the_head_learns_and_the_encoder_stays_as_it_was(tiles, tmp_path):
