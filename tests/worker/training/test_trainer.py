@@ -9,6 +9,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from worker.detectors.spicd_net.network import PairHead
 from worker.errors import Cancelled
 from worker.training.dataset import save_tiles
 from worker.training.log import LOG
@@ -17,7 +18,7 @@ from worker.training.pairs import PairSettings
 from worker.training.prefetch import prefetched
 from worker.training.schedule import Schedule
 from worker.training.settings import PAPER, TrainSettings
-from worker.training.trainer import BEST, CHECKPOINT, train
+from worker.training.trainer import BEST, CHECKPOINT, SETTLING_PAIRS, train
 
 TINY = TrainSettings(
     epochs=2, batch=8, train_pairs=48, validation_pairs=16, held_out=0.2, pairs=PairSettings(patch_points=256)
@@ -96,6 +97,14 @@ def test_a_checkpoint_from_before_a_setting_was_there_is_taken_up(dataset, tmp_p
     assert train(quick, dataset, tmp_path).name == BEST
     with pytest.raises(ValueError, match="other settings"):
         train(replace(quick, settle_head=False), dataset, tmp_path)
+
+
+def test_the_head_begins_by_pairs_of_one_place_alone(dataset, tmp_path, monkeypatch):
+    seen = []
+    monkeypatch.setattr(PairHead, "settle", lambda _, *inputs: seen.append([len(each) for each in inputs]))
+    train(replace(TINY, epochs=1, train_pairs=8, validation_pairs=8), dataset, tmp_path)
+    different = round(0.15 * SETTLING_PAIRS)
+    assert seen == [[SETTLING_PAIRS - different] * 3]
 
 
 def test_every_epoch_is_announced_once_its_files_are_there(dataset, tmp_path):
