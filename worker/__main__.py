@@ -15,9 +15,9 @@ from service.catalog.database import Database
 from service.catalog.jobs import Jobs
 from service.catalog.records import Problem
 from service.catalog.steps import ALLOWED_FUNCTIONS
-from service.lifetime import end_with_parent
 from service.logs import set_up_logging
 from service.settings import Settings
+from service.up.lifetime import end_with_parent
 from worker.rq_workers import GeometryWorker, InferenceWorker
 from worker.threads import wait_passively
 

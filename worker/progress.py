@@ -15,11 +15,11 @@ class Progress(Protocol):
     def __call__(self, stage: str, share: float) -> None: ...
 
 
-def silent(stage: str, share: float) -> None:
+def no_progress(stage: str, share: float) -> None:
     """Report nothing."""
 
 
-def rising(progress: Progress) -> Progress:
+def monotonic_progress(progress: Progress) -> Progress:
     """The same, for work whose rounds begin anew: a share that would fall is told as the highest so far."""
     highest: dict[str, float] = {}
 

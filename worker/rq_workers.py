@@ -28,7 +28,7 @@ from rq.serializers import JSONSerializer
 from rq.timeouts import JobTimeoutException
 from rq.worker.base import BaseWorker
 
-from service.lifetime import end_with_parent
+from service.up.lifetime import end_with_parent
 from worker.errors import PipelineError
 from worker.rq_jobs import FunctionRefused, StepJob, step_job
 

@@ -19,7 +19,7 @@ from service.api.schema import body_of
 from service.api.services import Provided, Services
 from service.api.submission import kept_scans, stop_if_open, submit
 from service.api.values import Id
-from service.catalog import keys
+from service.catalog import blob_keys
 from service.catalog.records import JobRecord, MapRecord
 
 router = APIRouter(tags=["maps"])
@@ -106,7 +106,7 @@ def delete_map(services: Provided, map_id: MapId) -> None:
 def get_manifest(services: Provided, map_id: MapId) -> Response:
     """Tile size, bounds, and every tile that is kept."""
     found = services.catalog.maps.ready(map_id)
-    key = keys.map_manifest(found.job_id)
+    key = blob_keys.map_manifest(found.job_id)
     return blob_response(services.catalog.blobs, key, media_type="application/json")
 
 
@@ -123,7 +123,10 @@ def get_map_cloud(services: Provided, map_id: MapId) -> Response:
     """The fused reference map, in metres."""
     found = services.catalog.maps.ready(map_id)
     return blob_response(
-        services.catalog.blobs, keys.map_cloud(found.job_id), media_type=bodies.RAW, filename=f"{map_id}.ply"
+        services.catalog.blobs,
+        blob_keys.map_cloud(found.job_id),
+        media_type=bodies.RAW,
+        filename=f"{map_id}.ply",
     )
 
 

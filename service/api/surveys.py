@@ -19,7 +19,7 @@ from service.api.schema import body_of
 from service.api.services import Provided, Services
 from service.api.submission import kept_scans, stop_if_open, submit
 from service.api.values import Id
-from service.catalog import keys
+from service.catalog import blob_keys
 from service.catalog.records import JobRecord, MapRecord, SurveyRecord
 
 router = APIRouter(tags=["surveys"])
@@ -140,7 +140,7 @@ def get_survey_cloud(services: Provided, survey_id: SurveyId) -> Response:
     services.catalog.surveys.ready(survey_id)
     return blob_response(
         services.catalog.blobs,
-        keys.survey_cloud(survey_id),
+        blob_keys.survey_cloud(survey_id),
         media_type=bodies.RAW,
         filename=f"{survey_id}.ply",
     )
@@ -158,7 +158,7 @@ def get_survey_cloud(services: Provided, survey_id: SurveyId) -> Response:
 def get_picture(services: Provided, survey_id: SurveyId) -> Response:
     """Top view of the map with the tiles by state."""
     services.catalog.surveys.ready(survey_id)
-    return blob_response(services.catalog.blobs, keys.survey_picture(survey_id), media_type="image/png")
+    return blob_response(services.catalog.blobs, blob_keys.survey_picture(survey_id), media_type="image/png")
 
 
 def _create(

@@ -19,7 +19,7 @@ from service.api.schema import body_of
 from service.api.services import Provided, Services
 from service.api.submission import kept_scans, submit
 from service.api.values import Id
-from service.catalog import keys
+from service.catalog import blob_keys
 from service.catalog.records import JobRecord, VersionRecord
 
 router = APIRouter(tags=["versions"])
@@ -128,7 +128,7 @@ def delete_version(services: Provided, map_id: MapId, number: Number) -> None:
 def get_version_manifest(services: Provided, map_id: MapId, number: Number) -> Response:
     """Tile size, bounds, and every tile that is kept; a place has the same tile id in every version."""
     found = services.catalog.versions.ready(map_id, number)
-    key = keys.map_manifest(found.job_id)
+    key = blob_keys.map_manifest(found.job_id)
     return blob_response(services.catalog.blobs, key, media_type="application/json")
 
 
@@ -146,7 +146,7 @@ def get_version_cloud(services: Provided, map_id: MapId, number: Number) -> Resp
     found = services.catalog.versions.ready(map_id, number)
     return blob_response(
         services.catalog.blobs,
-        keys.map_cloud(found.job_id),
+        blob_keys.map_cloud(found.job_id),
         media_type=bodies.RAW,
         filename=f"{map_id}-{number}.ply",
     )

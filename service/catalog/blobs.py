@@ -17,7 +17,7 @@ from uuid import uuid4
 import obstore
 from obstore.store import LocalStore, ObjectStore, from_url
 
-from service.catalog import keys
+from service.catalog import blob_keys
 
 CHUNK = 1 << 20  #: bytes handed on at a time
 _NO_LINKS = (
@@ -31,7 +31,7 @@ _PARTS_AT_ONCE = 2  #: obstore holds 12 parts of 5 MB by default, more than an u
 
 
 class Blobs:
-    """A key-value store of files; keys come from `service.catalog.keys`."""
+    """A key-value store of files; keys come from `service.catalog.blob_keys`."""
 
     def __init__(self, url: str) -> None:
         """`url` is `file:///folder` (made when absent) or anything that obstore opens, such as `s3://bucket/prefix`."""
@@ -128,7 +128,7 @@ class Blobs:
 
     def ping(self) -> None:
         """Write and remove a small blob, as an upload would. Raises what the store raises."""
-        key = keys.probe(uuid4().hex)
+        key = blob_keys.probe(uuid4().hex)
         self.put_bytes(key, b"ping")
         with contextlib.suppress(FileNotFoundError):
             obstore.delete(self._store, key)

@@ -9,7 +9,7 @@ from sqlalchemy import Select, select
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import selectinload
 
-from service.catalog import keys, tables
+from service.catalog import blob_keys, tables
 from service.catalog.blobs import Blobs
 from service.catalog.clock import new_id, now
 from service.catalog.database import Database
@@ -101,9 +101,9 @@ class Maps:
         models = select(tables.Model.job_id).where(tables.Model.map_id == map_id)
         with self._database.write() as session:
             row = map_row(session, map_id, lock=True)
-            folders = [keys.map_folder(job_id) for job_id in session.scalars(versions)]
-            folders += [keys.survey_folder(survey_id) for survey_id in session.scalars(surveys)]
-            folders += [keys.model_folder(job_id) for job_id in session.scalars(models)]
+            folders = [blob_keys.map_folder(job_id) for job_id in session.scalars(versions)]
+            folders += [blob_keys.survey_folder(survey_id) for survey_id in session.scalars(surveys)]
+            folders += [blob_keys.model_folder(job_id) for job_id in session.scalars(models)]
             session.delete(row)
         for folder in folders:
             self._blobs.delete_prefix(folder)

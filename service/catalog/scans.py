@@ -13,7 +13,7 @@ from sqlalchemy import ColumnElement, delete, exists, select, update
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
-from service.catalog import keys, tables
+from service.catalog import blob_keys, tables
 from service.catalog.blobs import Blobs
 from service.catalog.clock import now
 from service.catalog.database import Database
@@ -54,7 +54,7 @@ class Scans:
         scan_id = scan_id_of(sha256, device_id)
         if known := self._sent_again(scan_id):
             return known, False
-        key = keys.scan_file(scan_id, uuid4().hex, filename)
+        key = blob_keys.scan_file(scan_id, uuid4().hex, filename)
         self._blobs.put_file(key, path, move=True)
         row = tables.Scan(
             id=scan_id,
@@ -74,7 +74,7 @@ class Scans:
                 session.flush()
                 return _record(row), True
         except IntegrityError:  # the same upload, a moment earlier
-            self._blobs.delete_prefix(keys.folder_of(key))
+            self._blobs.delete_prefix(blob_keys.folder_of(key))
             if known := self._sent_again(scan_id):
                 return known, False
             raise Conflict(
@@ -148,7 +148,7 @@ class Scans:
             key = session.scalar(delete(tables.Scan).where(*which).returning(tables.Scan.key))
         if key is None:
             return False
-        self._blobs.delete_prefix(keys.folder_of(key))
+        self._blobs.delete_prefix(blob_keys.folder_of(key))
         return True
 
     def _sent_again(self, scan_id: str) -> ScanRecord | None:

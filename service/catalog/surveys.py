@@ -10,7 +10,7 @@ from typing import Any, get_args
 from sqlalchemy import delete, select
 from sqlalchemy.orm import Session, selectinload
 
-from service.catalog import keys, tables
+from service.catalog import blob_keys, tables
 from service.catalog.blobs import Blobs
 from service.catalog.clock import new_id, now
 from service.catalog.database import Database
@@ -142,7 +142,7 @@ class Surveys:
             row = _row(session, survey_id, lock=True)
             _check_unused(session, row)
             session.delete(row)
-        self._blobs.delete_prefix(keys.survey_folder(survey_id))
+        self._blobs.delete_prefix(blob_keys.survey_folder(survey_id))
 
 
 def _check_unused(session: Session, row: tables.Survey) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 from sqlalchemy import select
 from sqlalchemy.orm import Session, selectinload
 
-from service.catalog import keys, tables
+from service.catalog import blob_keys, tables
 from service.catalog.blobs import Blobs
 from service.catalog.clock import now
 from service.catalog.database import Database
@@ -146,7 +146,7 @@ class Versions:
             check_deletable(session, row)
             built_by = row.job_id
             forget(session, row)
-        self._blobs.delete_prefix(keys.map_folder(built_by))
+        self._blobs.delete_prefix(blob_keys.map_folder(built_by))
 
     def take_back(self, job_id: str) -> None:
         """Forget a version whose job never reached the queue."""

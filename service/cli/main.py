@@ -10,7 +10,7 @@ import typer
 from service.cli import jobs, maps, models, scans, surveys, up, versions
 from service.cli.terminal import Terminal
 from service.client import DEFAULT_URL, ClientError
-from service.embedded_redis import LaunchFailed
+from service.up.embedded_redis import LaunchFailed
 
 _GLOBAL_FLAGS = ("--json",)
 _GLOBAL_OPTIONS = ("--url",)

@@ -13,8 +13,8 @@ from pydantic import ValidationError
 from rich.table import Table
 
 from service.cli.terminal import Terminal
-from service.embedded_redis import LaunchFailed
 from service.settings import Settings
+from service.up.embedded_redis import LaunchFailed
 
 
 def register(commands: typer.Typer) -> None:
@@ -38,10 +38,10 @@ def up(
 ) -> None:
     """Start API, workers and Redis, and stay; Ctrl-C ends all. What is left out comes from SPICD_* or defaults."""
     # The API and uvicorn are of no use to the other commands, which start the faster without.
-    from service.launcher import Running  # noqa: PLC0415
-    from service.launcher import up as launch  # noqa: PLC0415
-    from service.lifetime import end_with_parent as end  # noqa: PLC0415
     from service.logs import set_up_logging  # noqa: PLC0415
+    from service.up.launcher import Running  # noqa: PLC0415
+    from service.up.launcher import up as launch  # noqa: PLC0415
+    from service.up.lifetime import end_with_parent as end  # noqa: PLC0415
 
     if end_with_parent:
         end(os.getppid())

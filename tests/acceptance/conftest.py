@@ -18,11 +18,11 @@ import httpx
 import numpy as np
 import pytest
 
-from worker.evaluation.scenes import corridor, random_room
-from worker.evaluation.scenes.furniture import crate
-from worker.evaluation.sensor import SimulatedScan
-from worker.evaluation.visits import stops, visit
-from worker.pipeline.pcd import write_pcd
+from worker.cloud.formats.pcd import write_pcd
+from worker.simulation.scenes import corridor, random_room
+from worker.simulation.scenes.furniture import crate
+from worker.simulation.sensor import SimulatedScan
+from worker.simulation.visits import stops, visit
 
 ROOT = Path(__file__).parents[2]
 MODEL = "spicd-net/1"

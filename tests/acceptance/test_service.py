@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 
 from tests.acceptance.conftest import MODEL, Service, Visits
-from worker.pipeline.poses import difference
-from worker.pipeline.scan import read_scan
+from worker.cloud.formats.scan import read_scan
+from worker.cloud.poses import difference
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="looks for processes in /proc")
 

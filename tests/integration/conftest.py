@@ -11,9 +11,9 @@ import pytest
 import torch
 
 from service.catalog.catalog import open_catalog
-from service.embedded_redis import EmbeddedRedis
-from tests.integration.bench import Bench
-from tests.integration.house import House, Material, environment, made_material
+from service.up.embedded_redis import EmbeddedRedis
+from tests.support.bench import Bench
+from tests.support.house import House, Material, environment, made_material
 
 
 @pytest.fixture

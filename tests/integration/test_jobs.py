@@ -10,19 +10,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service.catalog import keys
+from service.catalog import blob_keys
 from service.catalog.jobs import Jobs
 from service.catalog.records import JobRecord, ScanRecord
 from service.catalog.steps import STEPS, JobKind
 from service.settings import Settings
-from tests.integration.house import MAP, MODEL, OTHER_CUT, SAME_CUT, SEEN_TO, House, Material, run
+from tests.support.house import MAP, MODEL, OTHER_CUT, SAME_CUT, SEEN_TO, House, Material, run
+from worker.cloud.formats.pcd import write_pcd
+from worker.cloud.formats.scan import read_scan
+from worker.cloud.poses import difference
 from worker.detectors.store import open_card
 from worker.errors import DetectorUnavailable, MapFailed, ScanError
 from worker.jobs.surveys import scoring
 from worker.pipeline.flow import NoScanAccepted
-from worker.pipeline.pcd import write_pcd
-from worker.pipeline.poses import difference
-from worker.pipeline.scan import read_scan
 
 
 @pytest.fixture
@@ -47,7 +47,7 @@ def run_until_killed(job: JobRecord, name: str) -> None:
 def description_key(house: House, model: str) -> str:
     """Of what this model's weights said of the map."""
     card = open_card(house.material.model_store, model)
-    return keys.map_description(house.catalog.maps.get(MAP).job_id, model, card.sha256)
+    return blob_keys.map_embedding(house.catalog.maps.get(MAP).job_id, model, card.sha256)
 
 
 def failed(house: House, job: JobRecord, code: str) -> str:
@@ -67,10 +67,14 @@ def test_a_map_is_ready_with_its_counts_scans_and_files(house: House) -> None:
     for outcome, scan in zip(found.scans, house.material.before, strict=True):
         assert outcome.accepted
         assert difference(np.array(outcome.map_from_scan), scan.world_from_sensor)[0] < 0.015
-        assert house.catalog.blobs.exists(keys.map_scan(house.catalog.maps.get(MAP).job_id, outcome.scan_id))
-    with house.catalog.blobs.local(keys.map_cloud(house.catalog.maps.get(MAP).job_id)) as path:
+        assert house.catalog.blobs.exists(
+            blob_keys.map_scan(house.catalog.maps.get(MAP).job_id, outcome.scan_id)
+        )
+    with house.catalog.blobs.local(blob_keys.map_cloud(house.catalog.maps.get(MAP).job_id)) as path:
         assert len(read_scan(path).points) == found.counts["points"]
-    listing = json.loads(house.catalog.blobs.get_bytes(keys.map_manifest(house.catalog.maps.get(MAP).job_id)))
+    listing = json.loads(
+        house.catalog.blobs.get_bytes(blob_keys.map_manifest(house.catalog.maps.get(MAP).job_id))
+    )
     assert listing["n_valid_patches"] == found.counts["tiles"]
     assert found.bounds is not None
     assert found.bounds.max == pytest.approx(listing["map_bounds"]["max"])
@@ -97,12 +101,12 @@ def test_a_survey_is_ready_with_a_state_for_every_tile_of_the_map(house: House) 
 
 def test_a_survey_leaves_a_cloud_a_picture_and_its_scan(house: House) -> None:
     survey, blobs = house.survey(house.done[0]), house.catalog.blobs
-    assert blobs.get_bytes(keys.survey_picture(survey.survey_id)).startswith(b"\x89PNG")
-    with blobs.local(keys.survey_cloud(survey.survey_id)) as path:
+    assert blobs.get_bytes(blob_keys.survey_picture(survey.survey_id)).startswith(b"\x89PNG")
+    with blobs.local(blob_keys.survey_cloud(survey.survey_id)) as path:
         cloud = read_scan(path)
     assert cloud.points[:, 0].max() < SEEN_TO + 0.1
     assert cloud.colors is not None
-    assert blobs.exists(keys.survey_scan(survey.survey_id, survey.scans[0].scan_id))
+    assert blobs.exists(blob_keys.survey_scan(survey.survey_id, survey.scans[0].scan_id))
 
 
 def test_a_threshold_of_0_finds_every_observed_tile_changed(house: House) -> None:
@@ -167,7 +171,7 @@ def test_each_step_of_a_map_may_run_twice(house: House) -> None:
     assert house.files() == files
     made, first = (
         {name.removeprefix(folder): found for name, found in files.items() if name.startswith(folder)}
-        for folder in (keys.map_folder(house.catalog.maps.get(name).job_id) for name in ("again", MAP))
+        for folder in (blob_keys.map_folder(house.catalog.maps.get(name).job_id) for name in ("again", MAP))
     )
     assert made == first != {}  # the same scans give the same map, to the byte
 
@@ -272,7 +276,7 @@ def test_a_foreign_scan_beside_a_good_one_is_listed_and_left_out(house: House) -
     survey = house.survey(job)
     assert [outcome.accepted for outcome in survey.scans] == [False, True]
     kept = [
-        house.catalog.blobs.exists(keys.survey_scan(survey.survey_id, outcome.scan_id))
+        house.catalog.blobs.exists(blob_keys.survey_scan(survey.survey_id, outcome.scan_id))
         for outcome in survey.scans
     ]
     assert kept == [False, True]

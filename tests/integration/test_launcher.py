@@ -16,10 +16,10 @@ import httpx
 import pytest
 from redis import Redis
 
-from service.children import WorkerPool
-from service.embedded_redis import LaunchFailed
-from service.launcher import environment_of, up
 from service.settings import Settings
+from service.up.children import WorkerPool
+from service.up.embedded_redis import LaunchFailed
+from service.up.launcher import environment_of, up
 
 LAUNCH = Path(__file__).parent / "launch.py"
 ROOT = Path(__file__).parents[2]
@@ -232,7 +232,7 @@ def test_a_dying_worker_is_started_again_and_each_time_later() -> None:
 
 
 def test_a_worker_that_ignores_the_request_is_killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("service.children.GRACE_S", -1.9)
+    monkeypatch.setattr("service.up.children.GRACE_S", -1.9)
     program = (sys.executable, "-c", STUBBORN, str(tmp_path / "up"))
     with WorkerPool(geometry=1, inference=0, environment=os.environ, program=program) as pool:
         until((tmp_path / "up").exists)

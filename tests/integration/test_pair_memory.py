@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.catalog import keys
+from service.catalog import blob_keys
 from service.catalog.blobs import Blobs
-from worker.jobs.pair_memory import KeptPairs
-from worker.pipeline.pairwise import PairResult
+from worker.jobs.pair_cache import KeptPairs
+from worker.pipeline.registration.scan_to_scan import PairResult
 
 JOB = "job-1"
 
@@ -46,8 +46,8 @@ def pair(target: int, source: int, *, rmse: float = 0.02) -> PairResult:
         inlier_rmse=rmse,
         overlap=0.8,
         agreement=0.95,
-        seen_through=0.001,
-        vouched=True,
+        free_space_violation=0.001,
+        consistent_with_prior=True,
         accepted=bool(np.isfinite(rmse)),
         information=np.diag(np.arange(1.0, 7.0)) * 1e5,
     )
@@ -58,7 +58,7 @@ def loaded(blobs: Blobs, job_id: str = JOB) -> dict[tuple[int, int], PairResult]
 
 
 def writes(blobs: Blobs) -> int:
-    return len(blobs.under(keys.map_work(JOB)))
+    return len(blobs.under(blob_keys.map_work(JOB)))
 
 
 def test_a_new_build_remembers_nothing(blobs: Blobs) -> None:
@@ -122,5 +122,5 @@ def test_what_another_release_wrote_is_left_aside(blobs: Blobs, clock: Clock) ->
     memory = KeptPairs(blobs, JOB, clock=clock)
     memory.save([pair(0, 1)])
     memory.flush()
-    blobs.put_bytes(keys.map_pairs(JOB, "old"), b'[{"target": 0, "source": 2}]')
+    blobs.put_bytes(blob_keys.map_pairs(JOB, "old"), b'[{"target": 0, "source": 2}]')
     assert list(loaded(blobs)) == [(0, 1)]

@@ -8,7 +8,7 @@ import time
 
 import pytest
 
-from tests.integration.bench import Bench, running, until
+from tests.support.bench import Bench, running, until
 
 
 def test_a_step_that_crashes_every_time_is_given_up_after_three_and_the_worker_goes_on(bench: Bench) -> None:

@@ -11,13 +11,13 @@ from pathlib import Path
 
 import pytest
 from fastapi.testclient import TestClient
-from samples import catalog_of, settings_in
 from sqlalchemy import select
 
 from service.api.app import create_app
 from service.catalog import tables
-from service.embedded_redis import EmbeddedRedis
-from tests.integration.bench import Bench, add_map, running, until
+from service.up.embedded_redis import EmbeddedRedis
+from tests.support.bench import Bench, add_map, running, until
+from tests.support.samples import catalog_of, settings_in
 
 STEPS = (("hold", "geometry"), ("finish", "geometry"))
 

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.catalog import keys
+from service.catalog import blob_keys
 from service.catalog.records import JobRecord, ModelRecord
-from tests.integration.house import MAP, MODEL, OTHER_CUT, House, run
+from tests.support.house import MAP, MODEL, OTHER_CUT, House, run
 from worker.detectors.card import Card
 from worker.detectors.spicd_net.detector import SpicdNet
 from worker.errors import DetectorUnavailable, TrainingFailed
@@ -19,7 +19,7 @@ from worker.jobs import tile_sets, training
 from worker.jobs.models import kept_detector
 from worker.jobs.step import Context
 from worker.pipeline import archive
-from worker.pipeline.placement import RegisteredScan
+from worker.pipeline.registration.results import RegisteredScan
 from worker.reporting import Reporter
 from worker.training.dataset import TileSet, load_tiles
 from worker.training.log import LOG
@@ -41,7 +41,7 @@ def made(house: House, job: JobRecord) -> ModelRecord:
 
 
 def packed(house: House, job: JobRecord) -> TileSet:
-    with house.catalog.blobs.local(keys.model_tiles(job.job_id)) as path:
+    with house.catalog.blobs.local(blob_keys.model_tiles(job.job_id)) as path:
         return load_tiles(path)
 
 
@@ -49,7 +49,7 @@ def test_the_training_set_is_the_map_seen_by_the_halves_of_its_scans(house: Hous
     job = asked(house)
     run(job, "pack")
     tiles = packed(house, job)
-    with house.catalog.blobs.local(keys.map_tiles(house.catalog.versions.ready(MAP, 1).job_id)) as path:
+    with house.catalog.blobs.local(blob_keys.map_tiles(house.catalog.versions.ready(MAP, 1).job_id)) as path:
         of_map = archive.load_tiles(path)
     assert tiles.centres == pytest.approx(of_map.grid.centers(of_map.indices))
     twice = [at for at, points in enumerate(tiles.points_b) if len(points)]
@@ -124,9 +124,9 @@ def test_a_model_is_trained_further_calibrated_and_named_by_a_survey(house: Hous
     assert (card.training["map_id"], card.training["base"]) == (MAP, MODEL)
     assert set(card.evaluation) == {"validation", MODEL, "pairs"}  # beside what it started from
     assert card.evaluation["validation"]["threshold"] == card.threshold
-    assert not house.catalog.blobs.under(keys.model_work(job.job_id))
+    assert not house.catalog.blobs.under(blob_keys.model_work(job.job_id))
     built_by = house.catalog.versions.ready(MAP, 1).job_id
-    assert house.catalog.blobs.exists(keys.map_description(built_by, "lobby-net/1", card.sha256))
+    assert house.catalog.blobs.exists(blob_keys.map_embedding(built_by, "lobby-net/1", card.sha256))
 
     survey = house.survey_of(house.add("later.pcd", house.material.after), model="lobby-net/1")
     run(survey)
@@ -146,7 +146,7 @@ def test_the_weights_are_the_bases_or_near_them_and_those_that_the_card_vouches_
     apart = float((ours.weights()[name] - base.weights()[name]).abs().max())
     kept = "kept" in Card.model_validate(made(house, job).card).training
     assert apart == 0 if kept else 0 < apart < 0.1
-    content = house.catalog.blobs.get_bytes(keys.model_weights(job.job_id))
+    content = house.catalog.blobs.get_bytes(blob_keys.model_weights(job.job_id))
     assert hashlib.sha256(content).hexdigest() == Card.model_validate(made(house, job).card).sha256
 
 
@@ -189,7 +189,7 @@ def test_a_dismissed_training_stops_at_its_next_step_and_leaves_nothing(
     run(job, "train")
     assert len(epochs) == 1
     assert made(house, job).status == "failed"
-    assert not house.catalog.blobs.under(keys.model_folder(job.job_id))
+    assert not house.catalog.blobs.under(blob_keys.model_folder(job.job_id))
 
 
 def test_a_map_of_one_scan_is_too_little_and_says_so(house: House) -> None:
@@ -220,5 +220,5 @@ def context(house: House, job: JobRecord) -> Context:
 
 def rows(house: House, job: JobRecord) -> list[str]:
     """The epochs in the log that was kept."""
-    text = house.catalog.blobs.get_bytes(keys.model_checkpoint(job.job_id, LOG)).decode()
+    text = house.catalog.blobs.get_bytes(blob_keys.model_checkpoint(job.job_id, LOG)).decode()
     return [line.split(",")[0] for line in text.splitlines()[1:]]

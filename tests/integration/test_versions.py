@@ -8,18 +8,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service.catalog import keys
+from service.catalog import blob_keys
 from service.catalog.records import JobRecord, ScanOutcome, ScanRecord, VersionRecord
-from tests.integration.house import MAP, House, run
+from tests.support.house import MAP, House, run
+from worker.cloud.formats.scan import read_scan
+from worker.cloud.poses import difference
+from worker.cloud.tiling import Tiles, inside_tiles, tile_id
+from worker.cloud.types import Indices, Points
 from worker.jobs import versions
 from worker.pipeline import archive
 from worker.pipeline.flow import NoScanAccepted
-from worker.pipeline.map_versions import without
-from worker.pipeline.placement import RegisteredScan
-from worker.pipeline.poses import difference
-from worker.pipeline.scan import read_scan
-from worker.pipeline.tiling import Tiles, inside_tiles, tile_id
-from worker.pipeline.values import Indices, Points
+from worker.pipeline.map_update import without
+from worker.pipeline.registration.results import RegisteredScan
 
 
 @pytest.fixture
@@ -44,7 +44,7 @@ def version(house: House, number: int) -> VersionRecord:
 
 def manifest(house: House, number: int) -> dict[str, Any]:
     found: dict[str, Any] = json.loads(
-        house.catalog.blobs.get_bytes(keys.map_manifest(version(house, number).job_id))
+        house.catalog.blobs.get_bytes(blob_keys.map_manifest(version(house, number).job_id))
     )
     return found
 
@@ -55,17 +55,17 @@ def counted(house: House, number: int) -> dict[str, int]:
 
 
 def tiles_of(house: House, job_id: str) -> Tiles:
-    with house.catalog.blobs.local(keys.map_tiles(job_id)) as path:
+    with house.catalog.blobs.local(blob_keys.map_tiles(job_id)) as path:
         return archive.load_tiles(path)
 
 
 def scan_of(house: House, job_id: str, scan: ScanOutcome) -> RegisteredScan:
-    with house.catalog.blobs.local(keys.map_scan(job_id, scan.scan_id)) as path:
+    with house.catalog.blobs.local(blob_keys.map_scan(job_id, scan.scan_id)) as path:
         return archive.load_scan(path)
 
 
 def cloud(house: House, job_id: str) -> Points:
-    with house.catalog.blobs.local(keys.map_cloud(job_id)) as path:
+    with house.catalog.blobs.local(blob_keys.map_cloud(job_id)) as path:
         return read_scan(path).points
 
 
@@ -144,7 +144,7 @@ def test_a_version_stands_by_itself_when_the_one_before_is_deleted(house: House,
     run(extend(house, further))
     gone = version(house, 1).job_id
     house.catalog.versions.delete(MAP, 1)
-    assert house.catalog.blobs.under(keys.map_folder(gone)) == []
+    assert house.catalog.blobs.under(blob_keys.map_folder(gone)) == []
     second = version(house, 2)
     assert all(len(scan_of(house, second.job_id, scan).points) > 0 for scan in second.scans)
     run(extend(house, house.add("again.pcd", house.material.before[0], seen_to=3.0)))
@@ -219,7 +219,7 @@ def test_a_build_that_is_killed_goes_on_from_its_pairs_and_leaves_none_behind(
     def killed(*_: Any) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("worker.jobs.pair_memory._INTERVAL_S", 0.0)
+    monkeypatch.setattr("worker.jobs.pair_cache._INTERVAL_S", 0.0)
     monkeypatch.setattr(versions, "build_map", build)
     scans = [house.catalog.scans.get(scan.scan_id) for scan in version(house, 1).scans]
     job = house.map_of(*scans, map_id="again")
@@ -227,11 +227,11 @@ def test_a_build_that_is_killed_goes_on_from_its_pairs_and_leaves_none_behind(
         patch.setattr(versions, "save_scans", killed)
         with pytest.raises(KeyboardInterrupt):
             run(job, "register")
-    assert house.catalog.blobs.under(keys.map_work(job.job_id)) != []
+    assert house.catalog.blobs.under(blob_keys.map_work(job.job_id)) != []
     run(job)
     assert remembered[0] == 0
     assert remembered[1] > 0
-    assert house.catalog.blobs.under(keys.map_work(job.job_id)) == []
+    assert house.catalog.blobs.under(blob_keys.map_work(job.job_id)) == []
     again, first = house.catalog.maps.ready("again"), version(house, 1)
     assert again.scans == first.scans
     assert again.counts == first.counts

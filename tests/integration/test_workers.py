@@ -13,9 +13,9 @@ from rq import Queue
 from rq.serializers import JSONSerializer
 
 from service.catalog.catalog import open_catalog
-from service.launcher import environment_of
 from service.settings import Settings
-from tests.integration.bench import ROOT, Bench, add_map, running, until
+from service.up.launcher import environment_of
+from tests.support.bench import ROOT, Bench, add_map, running, until
 from worker.rq_workers import GeometryWorker
 
 

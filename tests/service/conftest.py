@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 from fastapi.testclient import TestClient
-from samples import RememberingQueue, catalog_of, running, settings_in
 
 from service.catalog.catalog import Catalog, open_catalog
 from service.settings import Settings
+from tests.support.samples import RememberingQueue, catalog_of, running, settings_in
 
 
 @pytest.fixture

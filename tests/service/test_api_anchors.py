@@ -6,10 +6,10 @@ import itertools
 import json
 
 import pytest
-from samples import add_map, add_scan, add_survey, ply, tile
 
 from service.api.geodesy import to_wgs84
 from service.catalog.records import Anchor
+from tests.support.samples import add_map, add_scan, add_survey, ply, tile
 
 BERLIN = {"longitude": 13.4, "latitude": 52.5, "height": 76.25, "heading": 90.0}
 

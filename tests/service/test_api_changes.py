@@ -5,7 +5,9 @@ from __future__ import annotations
 from datetime import timedelta
 
 import pytest
-from samples import (
+
+from service.api.paging import encoded
+from tests.support.samples import (
     NOON,
     RememberingQueue,
     add_map,
@@ -16,8 +18,6 @@ from samples import (
     settings_in,
     tile,
 )
-
-from service.api.paging import encoded
 
 MARCH, APRIL, MAY = (NOON + timedelta(days=days) for days in (0, 31, 61))
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 import shutil
 
-from samples import add_map
 from sqlalchemy import text
 
 from service.api.problems import MEDIA_TYPE
+from tests.support.samples import add_map
 
 
 def test_the_cards_are_passed_on_as_they_are_newest_version_first(client, settings):

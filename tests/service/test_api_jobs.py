@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import pytest
-from samples import RememberingQueue, add_map, add_survey, catalog_of, running
 
 from service.catalog.records import Problem
+from tests.support.samples import RememberingQueue, add_map, add_survey, catalog_of, running
 
 
 def test_a_job_that_waits_is_an_ogc_status_document(client, catalog):

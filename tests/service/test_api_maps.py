@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 
 import pytest
-from samples import MODEL, add_map, add_scan, add_survey, ply
 
-from service.catalog import keys
+from service.catalog import blob_keys
+from tests.support.samples import MODEL, add_map, add_scan, add_survey, ply
 
 
 def test_a_map_of_known_scans_is_accepted_and_its_job_submitted(client, catalog, queue):
@@ -106,8 +106,8 @@ def test_a_taken_id_keeps_no_new_file_and_leaves_the_known_ones(client, catalog)
 
 def test_a_ready_map_shows_what_it_is_and_its_files(client, catalog):
     job_id = add_map(catalog)
-    catalog.blobs.put_bytes(keys.map_manifest(job_id), b'{"n_valid_patches": 4}')
-    catalog.blobs.put_bytes(keys.map_cloud(job_id), b"ply\n0123456789")
+    catalog.blobs.put_bytes(blob_keys.map_manifest(job_id), b'{"n_valid_patches": 4}')
+    catalog.blobs.put_bytes(blob_keys.map_cloud(job_id), b"ply\n0123456789")
     found = client.get("/maps/lobby").json()
     assert (found["status"], found["counts"]) == ("ready", {"tiles": 4})
     assert (found["version"], found["registration"]) == (1, {"scans": 1})

@@ -12,7 +12,8 @@ from pathlib import Path
 
 import httpx
 import pytest
-from samples import settings_in
+
+from tests.support.samples import settings_in
 
 PIECE = bytes(range(256)) * 4096  #: 1 MiB
 HEAD = b"ply\nformat binary_little_endian 1.0\n"
@@ -22,7 +23,7 @@ FORM = {"Content-Type": "multipart/form-data; boundary=edge"}
 
 SERVER = """
 import sys, uvicorn
-from samples import RememberingQueue
+from tests.support.samples import RememberingQueue
 from service.api.app import create_app
 from service.settings import Settings
 settings = Settings(data_dir=sys.argv[1], model_store=sys.argv[2])

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import pytest
-from samples import MODEL, add_map, add_scan, add_version
 
-from service.catalog import keys
+from service.catalog import blob_keys
 from service.catalog.records import Problem
 from service.errors import Conflict
+from tests.support.samples import MODEL, add_map, add_scan, add_version
 
 CARD = {"name": "lobby-net", "version": "1", "threshold": 0.3}
 
@@ -146,11 +146,11 @@ def test_a_model_goes_with_its_map(client, catalog, queue):
     add_map(catalog)
     done = add_model(catalog)
     running = add_model(catalog, ready=False)
-    catalog.blobs.put_bytes(keys.model_weights(done), b"weights")
+    catalog.blobs.put_bytes(blob_keys.model_weights(done), b"weights")
     assert client.delete("/maps/lobby").status_code == 204
     assert (running, "model") in queue.dismissed
     assert catalog.models.ready() == ()
-    assert not catalog.blobs.exists(keys.model_weights(done))
+    assert not catalog.blobs.exists(blob_keys.model_weights(done))
 
 
 def test_a_version_that_a_model_is_trained_on_stays(catalog):

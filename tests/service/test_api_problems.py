@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import pytest
-from samples import (
+
+from service.api.problems import MEDIA_TYPE, PROBLEMS
+from service.errors import ServiceError
+from tests.support.samples import (
     MODEL,
     RememberingQueue,
     add_map,
@@ -14,9 +17,6 @@ from samples import (
     running,
     settings_in,
 )
-
-from service.api.problems import MEDIA_TYPE, PROBLEMS
-from service.errors import ServiceError
 
 RAW = {"Content-Type": "application/octet-stream"}
 JSON = {"Content-Type": "application/json"}

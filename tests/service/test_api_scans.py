@@ -9,9 +9,9 @@ import time
 from pathlib import Path
 
 import pytest
-from samples import IDENTITY, add_map, ply, running
 
 from service.errors import QueueUnavailable
+from tests.support.samples import IDENTITY, add_map, ply, running
 
 RAW = {"Content-Type": "application/octet-stream"}
 POSE = [[0, -1, 0, 2.5], [1, 0, 0, 0], [0, 0, 1, 0.35], [0, 0, 0, 1]]

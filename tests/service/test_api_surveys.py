@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import pytest
-from samples import NOON, add_map, add_scan, add_survey, ply, tile
 
-from service.catalog import keys
+from service.catalog import blob_keys
+from tests.support.samples import NOON, add_map, add_scan, add_survey, ply, tile
 
 
 def test_a_survey_of_files_is_accepted_and_its_job_submitted(client, catalog, queue):
@@ -112,8 +112,8 @@ def test_the_files_of_a_survey_come_as_they_are(client, catalog):
     survey_id, _ = add_survey(catalog)
     missing = client.get(f"/surveys/{survey_id}/picture.png")
     assert missing.status_code == 404
-    catalog.blobs.put_bytes(keys.survey_cloud(survey_id), b"ply\n")
-    catalog.blobs.put_bytes(keys.survey_picture(survey_id), b"\x89PNG")
+    catalog.blobs.put_bytes(blob_keys.survey_cloud(survey_id), b"ply\n")
+    catalog.blobs.put_bytes(blob_keys.survey_picture(survey_id), b"\x89PNG")
     cloud, picture = (client.get(f"/surveys/{survey_id}/{name}") for name in ("cloud.ply", "picture.png"))
     assert (cloud.content, cloud.headers["content-type"]) == (b"ply\n", "application/octet-stream")
     assert (picture.content, picture.headers["content-type"]) == (b"\x89PNG", "image/png")

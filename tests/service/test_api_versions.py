@@ -5,10 +5,10 @@ from __future__ import annotations
 from datetime import timedelta
 
 import pytest
-from samples import NOON, add_map, add_scan, add_survey, add_version, ply, tile
 
-from service.catalog import keys
+from service.catalog import blob_keys
 from service.catalog.records import Problem, ScanOutcome
+from tests.support.samples import NOON, add_map, add_scan, add_survey, add_version, ply, tile
 
 PROBLEM = Problem(code="map_failed", detail="no scan holds a pose")
 
@@ -87,8 +87,8 @@ def test_a_map_stays_in_use_while_a_version_builds_and_shows_it_when_it_is_ready
     catalog.jobs.start(second)
     assert shown(client) == (1, "ready", {"tiles": 4})
     for job_id, content in ((first, b"ply one"), (second, b"ply two")):
-        catalog.blobs.put_bytes(keys.map_cloud(job_id), content)
-        catalog.blobs.put_bytes(keys.map_manifest(job_id), b'"%s"' % content)
+        catalog.blobs.put_bytes(blob_keys.map_cloud(job_id), content)
+        catalog.blobs.put_bytes(blob_keys.map_manifest(job_id), b'"%s"' % content)
     assert client.get("/maps/lobby/cloud.ply").content == b"ply one"
     assert client.get("/maps/lobby/versions/2/cloud.ply").status_code == 409
     catalog.jobs.succeed(second)
@@ -234,12 +234,12 @@ def test_a_deleted_version_takes_its_files_and_job_and_leaves_the_surveys_compar
     survey_id, _ = add_survey(catalog, [tile(1, 0)])
     second = add_version(catalog)
     for job_id in (first, second):
-        catalog.blobs.put_bytes(keys.map_cloud(job_id), b"ply")
-    catalog.blobs.put_bytes(keys.survey_cloud(survey_id), b"ply")
+        catalog.blobs.put_bytes(blob_keys.map_cloud(job_id), b"ply")
+    catalog.blobs.put_bytes(blob_keys.survey_cloud(survey_id), b"ply")
     assert client.delete("/maps/lobby/versions/1").status_code == 204
     for path in ("/maps/lobby/versions/1", "/maps/lobby/versions/1/cloud.ply", f"/jobs/{first}"):
         assert client.get(path).status_code == 404
-    assert not catalog.blobs.exists(keys.map_cloud(first))
+    assert not catalog.blobs.exists(blob_keys.map_cloud(first))
     assert client.get("/maps/lobby/cloud.ply").status_code == 200
     assert client.get(f"/surveys/{survey_id}").json()["map_version"] == 1
     assert client.get(f"/surveys/{survey_id}/cloud.ply").status_code == 200
@@ -275,10 +275,10 @@ def test_a_survey_stays_while_a_version_is_built_of_it(client, catalog):
 def test_a_deleted_map_takes_the_files_of_all_its_versions(client, catalog, queue):
     jobs = [add_map(catalog), add_version(catalog), add_version(catalog, ready=False)]
     for job_id in jobs:
-        catalog.blobs.put_bytes(keys.map_cloud(job_id), b"ply")
+        catalog.blobs.put_bytes(blob_keys.map_cloud(job_id), b"ply")
     assert client.delete("/maps/lobby").status_code == 204
     assert queue.dismissed == [(jobs[2], "map")]
-    assert not any(catalog.blobs.exists(keys.map_cloud(job_id)) for job_id in jobs)
+    assert not any(catalog.blobs.exists(blob_keys.map_cloud(job_id)) for job_id in jobs)
     assert client.get("/maps/lobby/versions").status_code == 404
     catalog.scans.delete(next(s.scan_id for s in catalog.scans.page().items if s.filename == "map-lobby.ply"))
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from service.catalog import keys
+from service.catalog import blob_keys
 from service.catalog.blobs import Blobs
 
 
@@ -90,8 +90,8 @@ def test_a_prefix_takes_its_blobs_and_no_others(either):
     either.put_bytes("maps/lobby/cloud.ply", b"x")
     either.put_bytes("maps/lobby/scans/a.npz", b"x")
     either.put_bytes("maps/lobby2/cloud.ply", b"x")
-    either.delete_prefix(keys.map_folder("lobby"))
-    either.delete_prefix(keys.map_folder("lobby"))
+    either.delete_prefix(blob_keys.map_folder("lobby"))
+    either.delete_prefix(blob_keys.map_folder("lobby"))
     assert not either.exists("maps/lobby/cloud.ply")
     assert not either.exists("maps/lobby/scans/a.npz")
     assert either.exists("maps/lobby2/cloud.ply")
@@ -123,8 +123,11 @@ def test_where_the_disk_knows_no_links_a_copy_is_written(blobs, monkeypatch):
 def test_the_keys_under_a_folder_are_its_own_and_no_others(either):
     for key in ("maps/one/work/pairs-b.json", "maps/one/work/pairs-a.json", "maps/one2/work/pairs-c.json"):
         either.put_bytes(key, b"[]")
-    assert either.under(keys.map_work("one")) == ["maps/one/work/pairs-a.json", "maps/one/work/pairs-b.json"]
-    assert either.under(keys.map_work("none")) == []
+    assert either.under(blob_keys.map_work("one")) == [
+        "maps/one/work/pairs-a.json",
+        "maps/one/work/pairs-b.json",
+    ]
+    assert either.under(blob_keys.map_work("none")) == []
 
 
 @pytest.mark.parametrize(
@@ -140,11 +143,11 @@ def test_the_keys_under_a_folder_are_its_own_and_no_others(either):
     ],
 )
 def test_a_file_name_becomes_one_harmless_part_of_a_key(given, kept):
-    assert keys.safe_name(given) == kept
+    assert blob_keys.safe_name(given) == kept
 
 
 def test_a_description_belongs_to_one_model():
-    key = keys.map_description("lobby", "spicd-net/1", "0123456789abcdef")
+    key = blob_keys.map_embedding("lobby", "spicd-net/1", "0123456789abcdef")
     assert key == "maps/lobby/description-spicd-net-1-0123456789ab.npz"
-    assert key != keys.map_description("lobby", "spicd-net/2", "0123456789abcdef")
-    assert key != keys.map_description("lobby", "spicd-net/1", "fedcba9876543210")
+    assert key != blob_keys.map_embedding("lobby", "spicd-net/2", "0123456789abcdef")
+    assert key != blob_keys.map_embedding("lobby", "spicd-net/1", "fedcba9876543210")

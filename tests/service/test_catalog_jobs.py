@@ -6,10 +6,10 @@ from concurrent.futures import ThreadPoolExecutor
 from threading import Barrier
 
 import pytest
-from samples import add_map, add_survey
 
 from service.catalog.records import Problem
 from service.errors import Conflict, NotFound
+from tests.support.samples import add_map, add_survey
 
 PROBLEM = Problem(code="registration_failed", detail="scan hall.pcd: fitness 0.12 is below 0.55")
 

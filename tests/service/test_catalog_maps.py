@@ -6,11 +6,11 @@ from datetime import timedelta
 
 import pytest
 from pydantic import ValidationError
-from samples import IDENTITY, MODEL, NOON, add_map, add_scan, add_survey, ply, tile
 
-from service.catalog import keys
+from service.catalog import blob_keys
 from service.catalog.records import Bounds, ScanOutcome, TileRecord
 from service.errors import BadRequest, Conflict, NotFound, NotReady
+from tests.support.samples import IDENTITY, MODEL, NOON, add_map, add_scan, add_survey, ply, tile
 
 
 def accepted(scan_id: str, fitness: float) -> ScanOutcome:
@@ -155,8 +155,8 @@ def test_a_deleted_map_takes_its_surveys_jobs_and_blobs_and_leaves_its_scans(cat
     built_by = add_map(catalog)
     add_map(catalog, "hall")
     survey_id, job_id = add_survey(catalog, [tile(0, 0)])
-    catalog.blobs.put_bytes(keys.map_cloud(built_by), b"ply")
-    catalog.blobs.put_bytes(keys.survey_cloud(survey_id), b"ply")
+    catalog.blobs.put_bytes(blob_keys.map_cloud(built_by), b"ply")
+    catalog.blobs.put_bytes(blob_keys.survey_cloud(survey_id), b"ply")
     catalog.maps.delete("lobby")
     for ask, key in (
         (catalog.maps.get, "lobby"),
@@ -166,8 +166,8 @@ def test_a_deleted_map_takes_its_surveys_jobs_and_blobs_and_leaves_its_scans(cat
         with pytest.raises(NotFound):
             ask(key)
     assert catalog.changes.of_survey(survey_id) == ()
-    assert not catalog.blobs.exists(keys.map_cloud(built_by))
-    assert not catalog.blobs.exists(keys.survey_cloud(survey_id))
+    assert not catalog.blobs.exists(blob_keys.map_cloud(built_by))
+    assert not catalog.blobs.exists(blob_keys.survey_cloud(survey_id))
     assert len(catalog.scans.page().items) == 3
     assert [found.map_id for found in catalog.maps.page().items] == ["hall"]
 
@@ -177,7 +177,7 @@ def test_a_late_step_of_a_deleted_map_touches_nothing_of_the_map_that_took_its_i
     catalog.maps.delete("lobby")
     new = add_map(catalog)
     before = catalog.maps.get("lobby")
-    assert keys.map_folder(old) != keys.map_folder(new)
+    assert blob_keys.map_folder(old) != blob_keys.map_folder(new)
     left_out = [ScanOutcome(scan_id=before.scans[0].scan_id, accepted=False, reason="late")]
     with pytest.raises(NotFound):
         catalog.versions.save_outcomes(old, left_out)

@@ -8,13 +8,13 @@ from typing import Any
 import pytest
 from alembic import command
 from alembic.config import Config
-from samples import add_map, add_survey, add_version, fresh_database, settings_in, tile
 from sqlalchemy import inspect, text
 
-from service.catalog import keys
+from service.catalog import blob_keys
 from service.catalog.catalog import open_catalog
 from service.catalog.database import Database
 from service.errors import NotFound
+from tests.support.samples import add_map, add_survey, add_version, fresh_database, settings_in, tile
 
 AT = "'2026-03-01 12:00:00+00:00'"
 OLD_ROWS = (
@@ -99,7 +99,7 @@ def test_on_the_way_back_a_map_keeps_the_version_that_it_shows(database, tmp_pat
     assert [found.version for found in again.versions.page("lobby").items] == [1]
     assert again.maps.ready("lobby").counts == shown["lobby"].counts
     assert again.maps.ready("lobby").bounds == shown["lobby"].bounds
-    assert keys.map_cloud(again.maps.ready("lobby").job_id) == keys.map_cloud(second)
+    assert blob_keys.map_cloud(again.maps.ready("lobby").job_id) == blob_keys.map_cloud(second)
     with pytest.raises(NotFound):
         again.versions.get("lobby", 2)
     again.close()

@@ -6,10 +6,10 @@ from concurrent.futures import ThreadPoolExecutor
 from threading import Barrier
 
 import pytest
-from samples import BOUNDS, IDENTITY, add_map, add_scan, add_survey, add_version, tile
 
 from service.catalog.records import Problem, ScanOutcome
 from service.errors import Conflict, NotFound, NotReady
+from tests.support.samples import BOUNDS, IDENTITY, add_map, add_scan, add_survey, add_version, tile
 
 SURE = ScanOutcome(
     scan_id="",

@@ -13,11 +13,11 @@ import httpx
 import pytest
 from rich.console import Console
 
-from service import launcher
 from service.cli import main, terminal
 from service.cli.terminal import Terminal
 from service.client import Client
 from service.settings import Settings
+from service.up import launcher
 
 Answer = Callable[[httpx.Request], httpx.Response]
 

@@ -13,14 +13,14 @@ from pathlib import Path
 import pytest
 from redis import Redis
 
-from service import embedded_redis
-from service.embedded_redis import DataFolderInUse, EmbeddedRedis, LaunchFailed, find_server
+from service.up import embedded_redis
+from service.up.embedded_redis import DataFolderInUse, EmbeddedRedis, LaunchFailed, find_server
 
 ROOT = Path(__file__).parents[2]
 HOLDER = """
 import sys, time
 from pathlib import Path
-from service.embedded_redis import EmbeddedRedis
+from service.up.embedded_redis import EmbeddedRedis
 server = EmbeddedRedis(Path(sys.argv[1]))
 server.start()
 print(server.pid, flush=True)

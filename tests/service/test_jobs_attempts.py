@@ -5,9 +5,9 @@ from __future__ import annotations
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
-from samples import add_map
 
 from service.catalog.attempts import Attempts
+from tests.support.samples import add_map
 
 HOW = "the process of step m1-register ended by signal SIGKILL"
 

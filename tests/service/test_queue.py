@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 from redis import Redis
 
-from service.embedded_redis import EmbeddedRedis
 from service.errors import QueueUnavailable
 from service.queue import JobQueue
+from service.up.embedded_redis import EmbeddedRedis
 
 
 @pytest.fixture(scope="module")

@@ -11,6 +11,7 @@ import pytest
 from rich.console import Console
 
 from tests.acceptance.conftest import make_untrained
+from worker.cloud.tiling import TileGrid
 from worker.demo.child import ServiceChild
 from worker.demo.failure import DemoFailed
 from worker.demo.placement import placement_line
@@ -18,9 +19,8 @@ from worker.demo.run import DemoSettings, run
 from worker.demo.show import show_judgement
 from worker.demo.story import OFFICE, Story, edits, tell
 from worker.demo.verdict import Verdict, grid_of, judge
-from worker.evaluation.scenes import small_office
-from worker.evaluation.truth import TileTruth
-from worker.pipeline.tiling import TileGrid
+from worker.simulation.scenes import small_office
+from worker.simulation.truth import TileTruth
 
 MANIFEST = {"tile_origin": [0.0, 0.0, 0.0], "tile_size": [1.5, 1.5, 1.0], "n_tiles_grid": [7, 6, 3]}
 

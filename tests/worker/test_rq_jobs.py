@@ -10,8 +10,8 @@ from redis import Redis
 from rq.exceptions import NoSuchJobError
 from rq.serializers import JSONSerializer
 
-from service.embedded_redis import EmbeddedRedis
 from service.queue import JobQueue
+from service.up.embedded_redis import EmbeddedRedis
 from worker.rq_jobs import StepJob
 
 

@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 
 from tests.acceptance.conftest import make_untrained
+from worker.benchmarks.plots import draw_curves
 from worker.cli import detect, main
-from worker.evaluation.scenes import rigid
-from worker.evaluation.training_curves import draw_curves
-from worker.pipeline.pcd import write_pcd
-from worker.pipeline.scan import read_scan
+from worker.cloud.formats.pcd import write_pcd
+from worker.cloud.formats.scan import read_scan
 from worker.progress import Progress
+from worker.simulation.scenes import rigid
 from worker.training.dataset import TileSet, load_tiles, save_tiles
 from worker.training.settings import PAPER, TrainSettings
 

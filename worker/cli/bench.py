@@ -29,8 +29,8 @@ def bench(
 ) -> None:
     """Seconds in each stage of a map and of a survey on a simulated corridor, and what the network costs."""
     # Not at the head of the file: torch and Open3D take seconds, which `--help` need not wait for.
-    from worker.evaluation.bench import BenchSettings, save  # noqa: PLC0415
-    from worker.evaluation.bench import bench as run  # noqa: PLC0415
+    from worker.benchmarks.speed import BenchSettings, save  # noqa: PLC0415
+    from worker.benchmarks.speed import bench as run  # noqa: PLC0415
 
     settings = BenchSettings(scans=scans, repeats=repeats, model=model, model_store=model_store)
     with terminal.progress_bar() as progress:

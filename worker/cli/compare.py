@@ -9,9 +9,6 @@ from pathlib import Path
 from typing import Any
 
 from worker.detectors.detector import Detector
-from worker.pipeline.changes import ChangeSet
-from worker.pipeline.export import tile_results, write_coloured_cloud
-from worker.pipeline.features import feature_collection
 from worker.pipeline.flow import (
     BuiltMap,
     LocatedSurvey,
@@ -20,9 +17,11 @@ from worker.pipeline.flow import (
     detect,
     locate_survey,
 )
-from worker.pipeline.picture import draw_picture
-from worker.pipeline.placement import Outcome, ScanFile
-from worker.progress import Progress, silent
+from worker.pipeline.registration.results import ScanFile, ScanResult
+from worker.pipeline.results.changes import ChangeSet
+from worker.pipeline.results.export import feature_collection, tile_results, write_coloured_cloud
+from worker.pipeline.results.picture import draw_picture
+from worker.progress import Progress, no_progress
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -40,7 +39,7 @@ def compare(
     detector: Detector,
     *,
     threshold: float | None = None,
-    progress: Progress = silent,
+    progress: Progress = no_progress,
 ) -> Comparison:
     """The whole method on files. Raises PipelineError, and OSError for a file that is not there."""
     settings = PipelineSettings.model_validate({}).for_model(detector.card.preprocessing)
@@ -91,7 +90,7 @@ def _titled(phase: str, progress: Progress) -> Progress:
     return lambda stage, share: progress(f"{phase}: {stage}", share)
 
 
-def _registration(outcome: Outcome) -> dict[str, Any]:
+def _registration(outcome: ScanResult) -> dict[str, Any]:
     placement = outcome.placement
     sure = None if placement is None else placement.uncertainty
     return {

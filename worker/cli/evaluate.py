@@ -48,9 +48,9 @@ def registration(
 ) -> None:
     """Build maps from simulated walks, with and without priors and strangers, and hold them against the truth."""
     # Not at the head of the file: Open3D and Matplotlib take seconds, which `--help` need not wait for.
-    from worker.evaluation.registration.benchmark import BenchmarkSettings, evaluate  # noqa: PLC0415
-    from worker.evaluation.registration.scenario import WalkSettings, kinds_named  # noqa: PLC0415
-    from worker.evaluation.registration.tables import tables  # noqa: PLC0415
+    from worker.benchmarks.registration.benchmark import BenchmarkSettings, evaluate  # noqa: PLC0415
+    from worker.benchmarks.registration.scenario import WalkSettings, kinds_named  # noqa: PLC0415
+    from worker.benchmarks.registration.tables import tables  # noqa: PLC0415
 
     settings = BenchmarkSettings(
         walk=WalkSettings(building=building, scans=scans, foreign=foreign, duration_s=standing),

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from worker.cli import terminal
-from worker.cli.as_given import as_given
+from worker.cli.command_line import as_given
 from worker.detectors.card import MODEL_STORE
 
 
@@ -51,11 +51,11 @@ def paper(
 ) -> None:
     """Repeat the fourteen experiments of the paper on a simulated corridor, its figures beside ours."""
     # Not at the head of the file: torch, Open3D and Matplotlib take seconds, which `--help` need not wait for.
-    from worker.evaluation.paper.benchmark import QUICK, PaperSettings, evaluate  # noqa: PLC0415
-    from worker.evaluation.paper.document import document  # noqa: PLC0415
-    from worker.evaluation.paper.report import write_report  # noqa: PLC0415
-    from worker.evaluation.paper.site import QUICK_SITE, SiteSettings  # noqa: PLC0415
-    from worker.evaluation.paper.tables import tables  # noqa: PLC0415
+    from worker.benchmarks.paper.benchmark import QUICK, PaperSettings, evaluate  # noqa: PLC0415
+    from worker.benchmarks.paper.document import document  # noqa: PLC0415
+    from worker.benchmarks.paper.report import write_report  # noqa: PLC0415
+    from worker.benchmarks.paper.site import QUICK_SITE, SiteSettings  # noqa: PLC0415
+    from worker.benchmarks.paper.tables import tables  # noqa: PLC0415
 
     settings = PaperSettings(
         site=replace(QUICK_SITE if quick else SiteSettings(), seed=seed, true_poses=true_poses),

@@ -26,7 +26,7 @@ def record(
 ) -> None:
     """Put the figures of the benchmarks on a model's card; refused where they were measured with other weights."""
     # Not at the head of the file: torch takes seconds, which `--help` need not wait for.
-    from worker.evaluation.card_figures import record_figures  # noqa: PLC0415
+    from worker.benchmarks.card_figures import record_figures  # noqa: PLC0415
 
     given = {name: path for name, path in (("paper", paper), ("revisit", revisit)) if path is not None}
     if not given:

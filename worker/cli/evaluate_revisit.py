@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from worker.cli import terminal
-from worker.cli.as_given import as_given
+from worker.cli.command_line import as_given
 from worker.detectors.card import MODEL_STORE
 
 
@@ -47,9 +47,9 @@ def revisit(
     Simulating and registering the visits takes minutes and is done once: another model on the same visits takes one.
     """
     # Not at the head of the file: torch, Open3D and Matplotlib take seconds, which `--help` need not wait for.
-    from worker.evaluation.revisit.benchmark import BenchmarkSettings, evaluate  # noqa: PLC0415
-    from worker.evaluation.revisit.plan import RevisitSettings, kinds_named  # noqa: PLC0415
-    from worker.evaluation.revisit.tables import tables  # noqa: PLC0415
+    from worker.benchmarks.revisit.benchmark import BenchmarkSettings, evaluate  # noqa: PLC0415
+    from worker.benchmarks.revisit.plan import RevisitSettings, kinds_named  # noqa: PLC0415
+    from worker.benchmarks.revisit.tables import tables  # noqa: PLC0415
 
     settings = BenchmarkSettings(
         out=out,

@@ -32,22 +32,21 @@ def register_files(
     # Not at the head of the file: Open3D takes a second, which `--help` need not wait for.
     import numpy as np  # noqa: PLC0415
 
-    from worker.pipeline.map_settings import MapSettings  # noqa: PLC0415
-    from worker.pipeline.placement import ScanFile  # noqa: PLC0415
-    from worker.pipeline.placing_settings import PlacingSettings  # noqa: PLC0415
-    from worker.pipeline.poses import difference  # noqa: PLC0415
-    from worker.pipeline.prepared import ScanRejected, prepare  # noqa: PLC0415
-    from worker.pipeline.registration_settings import RegistrationSettings  # noqa: PLC0415
-    from worker.pipeline.scan import read_scan  # noqa: PLC0415
-    from worker.pipeline.survey_placing import place_on_map  # noqa: PLC0415
+    from worker.cloud.formats.scan import read_scan  # noqa: PLC0415
+    from worker.cloud.poses import difference  # noqa: PLC0415
+    from worker.pipeline.mapping.settings import MapSettings, MultiScanSettings  # noqa: PLC0415
+    from worker.pipeline.mapping.survey_registration import register_survey_scans  # noqa: PLC0415
+    from worker.pipeline.registration.preprocessing import ScanRejected, prepare  # noqa: PLC0415
+    from worker.pipeline.registration.results import ScanFile  # noqa: PLC0415
+    from worker.pipeline.registration.settings import RegistrationSettings  # noqa: PLC0415
 
-    settings = PlacingSettings(
+    settings = MultiScanSettings(
         registration=RegistrationSettings(), mapping=MapSettings(), max_points=50_000_000
     )
     target = prepare(read_scan(reference), settings.registration).surface
     file = ScanFile(name=current.name, path=current, pose=None if start is None else np.loadtxt(start))
     begun = time.perf_counter()
-    (outcome,) = place_on_map([file], target, settings=settings)
+    (outcome,) = register_survey_scans([file], target, settings=settings)
     seconds = time.perf_counter() - begun
     found = outcome.placement
     if found is None:

@@ -75,8 +75,8 @@ def train(
     # Not at the head of the file: torch takes seconds, which `--help` need not wait for.
     import torch  # noqa: PLC0415
 
+    from worker.benchmarks.plots import draw_curves  # noqa: PLC0415
     from worker.detectors.store import resolve_device  # noqa: PLC0415
-    from worker.evaluation.training_curves import draw_curves  # noqa: PLC0415
     from worker.training.settings import PAPER, TrainSettings  # noqa: PLC0415
     from worker.training.trainer import train as run  # noqa: PLC0415
 
@@ -115,13 +115,13 @@ def train(
         _make_tiles(tiles, buildings, progress)
         best = run(settings, tiles, folder, progress, on_epoch=draw_curves)
     terminal.output().print(
-        f"{best}\n`python -m worker.evaluation.publish {best} {tiles}` makes a model of it", highlight=False
+        f"{best}\n`python -m worker.training.publish {best} {tiles}` makes a model of it", highlight=False
     )
 
 
 def _make_tiles(path: Path, buildings: dict[str, Any], progress: Progress) -> None:
     """Simulate a training set, unless there is one. Raises ValueError where buildings are asked of one that is."""
-    from worker.evaluation.training_data import TrainingSetSettings, build_training_set  # noqa: PLC0415
+    from worker.simulation.training_set import TrainingSetSettings, build_training_set  # noqa: PLC0415
     from worker.training.dataset import save_tiles  # noqa: PLC0415
 
     if not path.exists():

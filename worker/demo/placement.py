@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from worker.evaluation.sensor import SimulatedScan
-from worker.pipeline.poses import difference
-from worker.pipeline.values import Floats, Matrix4
+from worker.cloud.poses import difference
+from worker.cloud.types import Floats, Matrix4
+from worker.simulation.sensor import SimulatedScan
 
 
 def placement_line(visit: str, outcomes: Sequence[dict[str, Any]], scans: Sequence[SimulatedScan]) -> str:

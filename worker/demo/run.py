@@ -14,14 +14,14 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from service.client import Client, ClientError, Document
+from worker.cloud.formats.pcd import write_pcd
 from worker.demo.child import ServiceChild
 from worker.demo.failure import DemoFailed
 from worker.demo.placement import placement_line
 from worker.demo.show import show_files, show_judgement
 from worker.demo.story import Story, tell
 from worker.demo.verdict import Judgement, grid_of, judge
-from worker.evaluation.sensor import SimulatedScan
-from worker.pipeline.pcd import write_pcd
+from worker.simulation.sensor import SimulatedScan
 
 MAP_ID = "office"
 RESULTS = {

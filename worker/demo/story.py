@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-from worker.evaluation.scenes import Change, Mesh, Scene, small_office
-from worker.evaluation.scenes.furniture import crate
-from worker.evaluation.sensor import SimulatedScan
-from worker.evaluation.truth import TileTruth, changed_tiles
-from worker.evaluation.visits import visit
-from worker.pipeline.tiling import TileGrid
+from worker.cloud.tiling import TileGrid
+from worker.simulation.scenes import Change, Mesh, Scene, small_office
+from worker.simulation.scenes.furniture import crate
+from worker.simulation.sensor import SimulatedScan
+from worker.simulation.truth import TileTruth, changed_tiles
+from worker.simulation.visits import visit
 
 OFFICE = 2  #: seed of the building
 

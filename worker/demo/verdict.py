@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from worker.evaluation.truth import TileTruth
-from worker.pipeline.tiling import TileGrid
+from worker.cloud.tiling import TileGrid
+from worker.simulation.truth import TileTruth
 
 
 class Verdict(Enum):

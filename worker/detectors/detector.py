@@ -8,10 +8,10 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from worker.cloud.tiling import TilePairs, Tiles
+from worker.cloud.types import Arrays
 from worker.detectors.card import Card
-from worker.pipeline.tiling import TilePairs, Tiles
-from worker.pipeline.values import Arrays
-from worker.progress import Progress, silent
+from worker.progress import Progress, no_progress
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -44,12 +44,12 @@ class Detector(Protocol):
 
     card: Card
 
-    def describe(self, tiles: Tiles, *, progress: Progress = silent) -> Arrays:
+    def describe(self, tiles: Tiles, *, progress: Progress = no_progress) -> Arrays:
         """What can be known of the reference alone, computed once when the map is built; {} if nothing."""
         ...
 
     def score(
-        self, pairs: TilePairs, *, description: Arrays | None = None, progress: Progress = silent
+        self, pairs: TilePairs, *, description: Arrays | None = None, progress: Progress = no_progress
     ) -> TileScores:
         """Compare every observed pair; `description` is `describe(pairs.reference)` from the map, if kept."""
         ...

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import json
 
-from service.catalog import keys
+from service.catalog import blob_keys
 from service.catalog.records import Bounds
+from worker.cloud.formats.ply import write_ply
+from worker.cloud.types import Points
 from worker.detectors.card import Preprocessing
 from worker.jobs.models import card_of, kept_detector, pipeline_settings
 from worker.jobs.step import Context, put, step
 from worker.jobs.versions import make_version
 from worker.pipeline import archive
 from worker.pipeline.flow import BuiltMap
-from worker.pipeline.manifest import manifest, padded_patches
-from worker.pipeline.ply import write_ply
-from worker.pipeline.values import Points
+from worker.pipeline.results.manifest import manifest, padded_patches
 
 
 @step
@@ -36,7 +36,7 @@ def register_map(at: Context) -> None:
         },
         registration=made.registration(),
     )
-    at.catalog.blobs.delete_prefix(keys.map_work(at.job.job_id))
+    at.catalog.blobs.delete_prefix(blob_keys.map_work(at.job.job_id))
 
 
 @step
@@ -44,10 +44,10 @@ def describe_map(at: Context) -> None:
     """What the model can know of the reference alone; then the map is ready."""
     version = at.catalog.versions.of_job(at.job.job_id)
     detector = kept_detector(at, version.model)
-    with at.catalog.blobs.local(keys.map_tiles(at.job.job_id)) as path:
+    with at.catalog.blobs.local(blob_keys.map_tiles(at.job.job_id)) as path:
         tiles = archive.load_tiles(path)
     description = detector.describe(tiles, progress=lambda _, share: at.report("describing", share))
-    key = keys.map_description(at.job.job_id, version.model, detector.card.sha256)
+    key = blob_keys.map_embedding(at.job.job_id, version.model, detector.card.sha256)
     put(at, key, lambda path: archive.save_arrays(path, description))
     at.catalog.jobs.succeed(at.job.job_id)
 
@@ -56,9 +56,13 @@ def _put_map(at: Context, built: BuiltMap, needs: Preprocessing) -> None:
     """The map's files: cloud, reference, tiles with their patches, manifest."""
     job_id, reference, tiles = at.job.job_id, built.reference, built.tiles
     patches = padded_patches(tiles, size=needs.patch_points, seed=needs.seed)
-    put(at, keys.map_reference(job_id), lambda path: archive.save_reference(path, reference))
-    put(at, keys.map_tiles(job_id), lambda path: archive.save_tiles(path, tiles, patches=patches))
-    put(at, keys.map_cloud(job_id), lambda path: write_ply(path, reference.points, colors=reference.colors))
+    put(at, blob_keys.map_reference(job_id), lambda path: archive.save_reference(path, reference))
+    put(at, blob_keys.map_tiles(job_id), lambda path: archive.save_tiles(path, tiles, patches=patches))
+    put(
+        at,
+        blob_keys.map_cloud(job_id),
+        lambda path: write_ply(path, reference.points, colors=reference.colors),
+    )
     listing = manifest(
         reference.points,
         tiles,
@@ -66,7 +70,7 @@ def _put_map(at: Context, built: BuiltMap, needs: Preprocessing) -> None:
         min_points=needs.min_points,
         voxel_size=needs.voxel_size,
     )
-    at.catalog.blobs.put_bytes(keys.map_manifest(job_id), json.dumps(listing).encode())
+    at.catalog.blobs.put_bytes(blob_keys.map_manifest(job_id), json.dumps(listing).encode())
 
 
 def _bounds(points: Points) -> Bounds:

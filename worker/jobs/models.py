@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 from pathlib import Path
 
-from service.catalog import keys
+from service.catalog import blob_keys
 from service.catalog.blobs import Blobs
 from service.catalog.records import ModelRecord, VersionRecord
 from worker.detectors.card import Card
@@ -66,7 +66,7 @@ def _opened(model_store: Path, model: str, device: Device) -> Detector:
 def _opened_own(blob_url: str, job_id: str, card: str, device: Device) -> Detector:
     """By its job, for a name and number may come again once the map is deleted."""
     try:
-        content = Blobs(blob_url).get_bytes(keys.model_weights(job_id))
+        content = Blobs(blob_url).get_bytes(blob_keys.model_weights(job_id))
     except FileNotFoundError as missing:
         raise DetectorUnavailable(f"the weights of the model of job {job_id} are gone") from missing
     return make_detector(Card.model_validate_json(card), content, device)

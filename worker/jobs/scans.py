@@ -11,7 +11,7 @@ import numpy as np
 from service.catalog.records import ScanOutcome
 from worker.jobs.step import Context, put
 from worker.pipeline import archive
-from worker.pipeline.placement import Outcome, RegisteredScan, ScanFile, placed
+from worker.pipeline.registration.results import RegisteredScan, ScanFile, ScanResult, placed
 
 
 def scan_files(at: Context, scans: Sequence[ScanOutcome], stack: ExitStack) -> list[ScanFile]:
@@ -25,7 +25,7 @@ def scan_files(at: Context, scans: Sequence[ScanOutcome], stack: ExitStack) -> l
     return files
 
 
-def scan_outcomes(scans: Sequence[ScanOutcome], outcomes: Sequence[Outcome]) -> tuple[ScanOutcome, ...]:
+def scan_outcomes(scans: Sequence[ScanOutcome], outcomes: Sequence[ScanResult]) -> tuple[ScanOutcome, ...]:
     """What became of each scan, as it is recorded."""
     ids = [scan.scan_id for scan in scans]
     return tuple(_recorded(scan_id, outcome, ids) for scan_id, outcome in zip(ids, outcomes, strict=True))
@@ -35,7 +35,7 @@ def save_scans(
     at: Context,
     scans: Sequence[ScanOutcome],
     files: Sequence[ScanFile],
-    outcomes: Sequence[Outcome],
+    outcomes: Sequence[ScanResult],
     key_of: Callable[[str], str],
 ) -> None:
     """Keep the points of every accepted scan; one file is read at a time."""
@@ -52,7 +52,7 @@ def kept_scan(at: Context, key: str) -> RegisteredScan:
         return archive.load_scan(path)
 
 
-def _recorded(scan_id: str, outcome: Outcome, ids: Sequence[str]) -> ScanOutcome:
+def _recorded(scan_id: str, outcome: ScanResult, ids: Sequence[str]) -> ScanOutcome:
     found = outcome.placement
     if found is None:
         return ScanOutcome(

@@ -7,11 +7,11 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
+from worker.cloud.tiling import Tiles, TilingSettings, cut, pair_tiles
+from worker.cloud.types import Points
+from worker.cloud.voxels import Voxels
 from worker.errors import TrainingFailed
-from worker.pipeline.placement import RegisteredScan
-from worker.pipeline.tiling import Tiles, TilingSettings, cut, pair_tiles
-from worker.pipeline.values import Points
-from worker.pipeline.voxels import Voxels
+from worker.pipeline.registration.results import RegisteredScan
 from worker.training.dataset import TileSet, split_tiles
 
 #: Of the map's tiles, held out in one region; the first that will do. The paper's is the first.

@@ -10,23 +10,23 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from service.catalog import keys
+from service.catalog import blob_keys
 from service.catalog.records import ModelRecord, VersionRecord
 from worker.detectors.card import Card, Preprocessing
 from worker.detectors.detector import Detector
 from worker.detectors.spicd_net.detector import SpicdNet
 from worker.detectors.store import make_detector, resolve_device
 from worker.errors import Cancelled, TrainingFailed
-from worker.evaluation.publish import publish
 from worker.jobs.models import card_that_fits, kept_detector, pipeline_settings
 from worker.jobs.scans import kept_scan
 from worker.jobs.step import Context, put, step
 from worker.jobs.tile_sets import halves, held_out_share, training_set
 from worker.pipeline import archive
-from worker.pipeline.placement import RegisteredScan
+from worker.pipeline.registration.results import RegisteredScan
 from worker.training.dataset import load_tiles, save_tiles
 from worker.training.log import LOG
 from worker.training.pairs import PairSettings
+from worker.training.publish import publish
 from worker.training.settings import TrainSettings
 from worker.training.trainer import BEST, CHECKPOINT, train
 
@@ -45,23 +45,23 @@ def pack_tiles(at: Context) -> None:
     version = at.catalog.versions.get(model.map_id, model.map_version)
     card = card_that_fits(at, model.base or version.model, version.model)
     settings = pipeline_settings(at, version, card)
-    with at.catalog.blobs.local(keys.map_tiles(version.job_id)) as path:
+    with at.catalog.blobs.local(blob_keys.map_tiles(version.job_id)) as path:
         tiles = archive.load_tiles(path)
     visits = halves(_scans(at, version), voxel_size=card.preprocessing.voxel_size)
     source = f"version {version.version} of map {version.map_id}, its scans parted in two"
     packed = training_set(tiles, visits, settings=settings.tiling, source=source)
     held_out_share(packed, min_separation=SITE.pairs.min_separation)  # fails here, before the wait
-    put(at, keys.model_tiles(at.job.job_id), lambda path: save_tiles(packed, path))
+    put(at, blob_keys.model_tiles(at.job.job_id), lambda path: save_tiles(packed, path))
 
 
 @step
 def train_model(at: Context) -> None:
     """From nothing or from another model, for so many minutes; goes on from the last epoch that was kept."""
     model = at.catalog.models.of_job(at.job.job_id)
-    folder, work = at.scratch / "run", keys.model_work(at.job.job_id)
+    folder, work = at.scratch / "run", blob_keys.model_work(at.job.job_id)
     _fetch(at, folder)
     try:
-        with at.catalog.blobs.local(keys.model_tiles(at.job.job_id)) as tiles:
+        with at.catalog.blobs.local(blob_keys.model_tiles(at.job.job_id)) as tiles:
             train(
                 _settings(at, model, tiles),
                 tiles,
@@ -86,16 +86,16 @@ def finish_model(at: Context) -> None:
     folder, blobs = at.scratch / "run", at.catalog.blobs
     _fetch(at, folder)
     at.report("calibrating", 0.0)
-    with blobs.local(keys.model_tiles(at.job.job_id)) as tiles:
+    with blobs.local(blob_keys.model_tiles(at.job.job_id)) as tiles:
         made = _published(at, model, version, folder / BEST, tiles)
     card = Card.model_validate_json((made / "card.json").read_bytes()).model_copy(update={"licence": ""})
     weights = (made / str(card.weights)).read_bytes()
-    blobs.put_bytes(keys.model_weights(at.job.job_id), weights)
-    blobs.put_file(keys.model_log(at.job.job_id), folder / LOG)
+    blobs.put_bytes(blob_keys.model_weights(at.job.job_id), weights)
+    blobs.put_file(blob_keys.model_log(at.job.job_id), folder / LOG)
     _describe(at, make_detector(card, weights, at.settings.device), model, version)
     at.catalog.models.save_card(at.job.job_id, card.model_dump(mode="json"))
     at.catalog.jobs.succeed(at.job.job_id)
-    blobs.delete_prefix(keys.model_work(at.job.job_id))
+    blobs.delete_prefix(blob_keys.model_work(at.job.job_id))
 
 
 def _settings(at: Context, model: ModelRecord, tiles: Path) -> TrainSettings:
@@ -145,10 +145,10 @@ def _published(at: Context, model: ModelRecord, version: VersionRecord, best: Pa
 
 def _describe(at: Context, detector: Detector, model: ModelRecord, version: VersionRecord) -> None:
     """So that the first survey has half of the work, as with the map's own model."""
-    with at.catalog.blobs.local(keys.map_tiles(version.job_id)) as path:
+    with at.catalog.blobs.local(blob_keys.map_tiles(version.job_id)) as path:
         tiles = archive.load_tiles(path)
     description = detector.describe(tiles, progress=lambda _, share: at.report("describing", share))
-    key = keys.map_description(version.job_id, model.model, detector.card.sha256)
+    key = blob_keys.map_embedding(version.job_id, model.model, detector.card.sha256)
     put(at, key, lambda path: archive.save_arrays(path, description))
 
 
@@ -167,19 +167,19 @@ def _scans(at: Context, version: VersionRecord) -> Iterator[RegisteredScan]:
     accepted = [scan for scan in version.scans if scan.accepted]
     for done, scan in enumerate(accepted):
         at.report("packing", done / len(accepted))
-        yield kept_scan(at, keys.map_scan(version.job_id, scan.scan_id))
+        yield kept_scan(at, blob_keys.map_scan(version.job_id, scan.scan_id))
 
 
 def _keep(at: Context, folder: Path) -> None:
     for name in KEPT:
-        at.catalog.blobs.put_file(keys.model_checkpoint(at.job.job_id, name), folder / name)
+        at.catalog.blobs.put_file(blob_keys.model_checkpoint(at.job.job_id, name), folder / name)
 
 
 def _fetch(at: Context, folder: Path) -> None:
     """What an earlier attempt kept; copies, for a log is written to."""
     folder.mkdir(parents=True, exist_ok=True)
     for name in KEPT:
-        key = keys.model_checkpoint(at.job.job_id, name)
+        key = blob_keys.model_checkpoint(at.job.job_id, name)
         if at.catalog.blobs.exists(key):
             with at.catalog.blobs.local(key) as path:
                 shutil.copyfile(path, folder / name)

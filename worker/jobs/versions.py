@@ -10,15 +10,15 @@ from typing import Any
 
 import numpy as np
 
-from service.catalog import keys
+from service.catalog import blob_keys
 from service.catalog.records import ScanOutcome, VersionRecord
-from worker.jobs.pair_memory import KeptPairs
+from worker.cloud.types import Indices
+from worker.jobs.pair_cache import KeptPairs
 from worker.jobs.scans import kept_scan, save_scans, scan_files, scan_outcomes
 from worker.jobs.step import Context, put
 from worker.pipeline import archive
 from worker.pipeline.flow import BuiltMap, NoScanAccepted, NothingToTile, PipelineSettings, build_map
-from worker.pipeline.map_versions import KeptMap, extend_map, renew_map, without
-from worker.pipeline.values import Indices
+from worker.pipeline.map_update import KeptMap, extend_map, renew_map, without
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -64,7 +64,7 @@ def _extended(at: Context, version: VersionRecord, base: VersionRecord, settings
         with _recorded_anyway(at, further):
             built = extend_map(_kept_map(at, base), files, settings=settings, progress=at.report)
         for scan in older:
-            at.catalog.blobs.copy(keys.map_scan(base.job_id, scan.scan_id), _key_of(at)(scan.scan_id))
+            at.catalog.blobs.copy(blob_keys.map_scan(base.job_id, scan.scan_id), _key_of(at)(scan.scan_id))
         save_scans(at, further, files, built.outcomes, _key_of(at))
     return Made(built=built, outcomes=(*older, *scan_outcomes(further, built.outcomes)))
 
@@ -74,7 +74,7 @@ def _renewed(
 ) -> Made:
     older, seen = _kept(base), _further(version, base)
     kept, replaced = _kept_map(at, base), _changed(at, survey_id)
-    survey_keys = [keys.survey_scan(survey_id, scan.scan_id) for scan in seen]
+    survey_keys = [blob_keys.survey_scan(survey_id, scan.scan_id) for scan in seen]
     loads = [functools.partial(kept_scan, at, key) for key in survey_keys]
     built = renew_map(kept, loads, replaced=replaced, settings=settings, progress=at.report)
     for done, (scan, load) in enumerate(zip(older, kept.scans, strict=True)):
@@ -88,12 +88,13 @@ def _renewed(
 
 def _kept_map(at: Context, base: VersionRecord) -> KeptMap:
     blobs = at.catalog.blobs
-    with blobs.local(keys.map_reference(base.job_id)) as path:
+    with blobs.local(blob_keys.map_reference(base.job_id)) as path:
         reference = archive.load_reference(path)
-    with blobs.local(keys.map_tiles(base.job_id)) as path:
+    with blobs.local(blob_keys.map_tiles(base.job_id)) as path:
         grid = archive.load_tiles(path).grid
     scans = [
-        functools.partial(kept_scan, at, keys.map_scan(base.job_id, scan.scan_id)) for scan in _kept(base)
+        functools.partial(kept_scan, at, blob_keys.map_scan(base.job_id, scan.scan_id))
+        for scan in _kept(base)
     ]
     return KeptMap(reference=reference, grid=grid, scans=scans)
 
@@ -116,7 +117,7 @@ def _changed(at: Context, survey_id: str) -> Indices:
 
 
 def _key_of(at: Context) -> functools.partial[str]:
-    return functools.partial(keys.map_scan, at.job.job_id)
+    return functools.partial(blob_keys.map_scan, at.job.job_id)
 
 
 @contextmanager

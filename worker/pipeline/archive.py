@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
+from worker.cloud.tiling import TileGrid, TilePairs, Tiles, tile_id
+from worker.cloud.types import Arrays, Points
 from worker.detectors.detector import TileScores
-from worker.pipeline.mapping import CurrentMap, ReferenceMap
-from worker.pipeline.placement import RegisteredScan
-from worker.pipeline.tiling import TileGrid, TilePairs, Tiles, tile_id
-from worker.pipeline.values import Arrays, Points
+from worker.pipeline.mapping.fusion import CurrentMap, ReferenceMap
+from worker.pipeline.registration.results import RegisteredScan
 
 
 def save_arrays(path: Path, arrays: Arrays) -> None:

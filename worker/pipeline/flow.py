@@ -7,21 +7,7 @@ from dataclasses import dataclass
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from worker.detectors.card import Preprocessing
-from worker.detectors.detector import Detector
-from worker.errors import MapFailed, RegistrationFailed
-from worker.pipeline.changes import ChangeSet, decide
-from worker.pipeline.map_report import MapReport
-from worker.pipeline.map_settings import MapSettings
-from worker.pipeline.mapping import CurrentMap, ReferenceMap, current_map, fuse, reference_map
-from worker.pipeline.pair_memory import PairMemory
-from worker.pipeline.pairwise import PairResult
-from worker.pipeline.placement import Outcome, RegisteredScan, ScanFile, placed
-from worker.pipeline.placing import place_together
-from worker.pipeline.placing_settings import PlacingSettings
-from worker.pipeline.registration_settings import RegistrationSettings
-from worker.pipeline.survey_placing import place_on_map
-from worker.pipeline.tiling import (
+from worker.cloud.tiling import (
     TileGrid,
     TilePairs,
     Tiles,
@@ -31,9 +17,22 @@ from worker.pipeline.tiling import (
     grown,
     pair_tiles,
 )
-from worker.pipeline.values import Arrays
-from worker.pipeline.voxels import Voxels
-from worker.progress import Progress, silent
+from worker.cloud.types import Arrays
+from worker.cloud.voxels import Voxels
+from worker.detectors.card import Preprocessing
+from worker.detectors.detector import Detector
+from worker.errors import MapFailed, RegistrationFailed
+from worker.pipeline.mapping.fusion import CurrentMap, ReferenceMap, current_map, fuse, reference_map
+from worker.pipeline.mapping.map_registration import register_map_scans
+from worker.pipeline.mapping.pair_registration import PairCache
+from worker.pipeline.mapping.report import MapReport
+from worker.pipeline.mapping.settings import MapSettings, MultiScanSettings
+from worker.pipeline.mapping.survey_registration import register_survey_scans
+from worker.pipeline.registration.results import RegisteredScan, ScanFile, ScanResult, placed
+from worker.pipeline.registration.scan_to_scan import PairResult
+from worker.pipeline.registration.settings import RegistrationSettings
+from worker.pipeline.results.changes import ChangeSet, decide
+from worker.progress import Progress, no_progress
 
 
 class PipelineSettings(BaseModel):
@@ -58,9 +57,9 @@ class PipelineSettings(BaseModel):
         )
 
     @property
-    def placing(self) -> PlacingSettings:
+    def placing(self) -> MultiScanSettings:
         """What placing scans needs of these."""
-        return PlacingSettings(
+        return MultiScanSettings(
             registration=self.registration, mapping=self.mapping, max_points=self.max_scan_points
         )
 
@@ -71,7 +70,7 @@ class BuiltMap:
 
     reference: ReferenceMap
     tiles: Tiles
-    outcomes: tuple[Outcome, ...]  #: of the files, in their order
+    outcomes: tuple[ScanResult, ...]  #: of the files, in their order
     report: MapReport | None  #: None where nothing was registered anew
     kept: tuple[PairResult, ...] = ()  #: the registrations that the map rests on
     contradicted: tuple[PairResult, ...] = ()  #: accepted ones that loops do not close over
@@ -83,13 +82,13 @@ class LocatedSurvey:
 
     current: CurrentMap
     pairs: TilePairs
-    outcomes: tuple[Outcome, ...]
+    outcomes: tuple[ScanResult, ...]
 
 
 class NoScanAccepted(RegistrationFailed):
     """Every scan of a survey was left out; `outcomes` says why, scan by scan."""
 
-    def __init__(self, outcomes: Sequence[Outcome]) -> None:
+    def __init__(self, outcomes: Sequence[ScanResult]) -> None:
         self.outcomes = tuple(outcomes)
         reasons = "; ".join(str(outcome.reason) for outcome in outcomes)
         super().__init__(f"no scan could be registered to the map: {reasons}")
@@ -98,7 +97,7 @@ class NoScanAccepted(RegistrationFailed):
 class NothingToTile(MapFailed):
     """The fused map is too thin for a single tile; `outcomes` says what became of each scan."""
 
-    def __init__(self, outcomes: Sequence[Outcome], *, points: int, min_points: int) -> None:
+    def __init__(self, outcomes: Sequence[ScanResult], *, points: int, min_points: int) -> None:
         self.outcomes = tuple(outcomes)
         super().__init__(
             f"no tile holds {min_points} points of the fused map ({points} points in all); add scans"
@@ -109,16 +108,16 @@ def build_map(
     files: Sequence[ScanFile],
     *,
     settings: PipelineSettings,
-    pairs: PairMemory | None = None,
+    pairs: PairCache | None = None,
     processes: int | None = None,
-    progress: Progress = silent,
+    progress: Progress = no_progress,
 ) -> BuiltMap:
     """Stage 1: place the scans in one frame, fuse them, cut the map into tiles.
 
     `pairs` keeps registered pairs, so that a build that was killed goes on; `processes` is one a core if None.
     Raises ScanError where no file can be read, MapFailed where no scan holds a pose, and NothingToTile.
     """
-    placing = place_together(
+    placing = register_map_scans(
         files, settings=settings.placing, memory=pairs, processes=processes, progress=progress
     )
     fused = fused_scans(accepted_scans(files, placing.outcomes, settings), len(files), settings, progress)
@@ -139,13 +138,13 @@ def locate_survey(
     tiles: Tiles,
     *,
     settings: PipelineSettings,
-    progress: Progress = silent,
+    progress: Progress = no_progress,
 ) -> LocatedSurvey:
     """Stage 3, first half: place the scans on the map, fuse those accepted, pair the tiles.
 
     Raises ScanError where no file can be read, NoScanAccepted where none is left to compare.
     """
-    outcomes = place_on_map(files, reference.surface(), settings=settings.placing, progress=progress)
+    outcomes = register_survey_scans(files, reference.surface(), settings=settings.placing, progress=progress)
     if not any(outcome.placement for outcome in outcomes):
         raise NoScanAccepted(outcomes)
     progress("tiling", 0.0)
@@ -162,7 +161,7 @@ def detect(
     *,
     description: Arrays | None = None,
     threshold: float | None = None,
-    progress: Progress = silent,
+    progress: Progress = no_progress,
 ) -> ChangeSet:
     """Stage 3, second half: score the tiles, then decide; the threshold is the card's if None is given."""
     scores = detector.score(pairs, description=description, progress=progress)
@@ -170,7 +169,7 @@ def detect(
 
 
 def accepted_scans(
-    files: Sequence[ScanFile], outcomes: Sequence[Outcome], settings: PipelineSettings
+    files: Sequence[ScanFile], outcomes: Sequence[ScanResult], settings: PipelineSettings
 ) -> Iterator[RegisteredScan]:
     """The points of each accepted scan, read again: no two scans are held at once."""
     for file, outcome in zip(files, outcomes, strict=True):
@@ -193,7 +192,7 @@ def fused_scans(
 def tiled_map(
     fused: Voxels,
     grid: TileGrid | None,
-    outcomes: Sequence[Outcome],
+    outcomes: Sequence[ScanResult],
     settings: PipelineSettings,
     progress: Progress,
 ) -> tuple[ReferenceMap, Tiles]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from worker.pipeline.values import Points
+from worker.cloud.types import Points
 
 MIN_RETAINED = 64  #: points that a removal leaves
 ADD_VERTICAL = 0.25  #: share of the vertical shift that is kept: indoor things stand beside each other

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from worker.pipeline.values import Points
+from worker.cloud.types import Points
 from worker.training.anomalies import nuisance_sigma
 
 

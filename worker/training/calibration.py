@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from worker.pipeline.values import Points
+from worker.cloud.types import Points
 from worker.training.anomalies import OPERATIONS
 from worker.training.dataset import TileSet
 from worker.training.pairs import PairSettings, altered

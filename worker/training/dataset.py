@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from worker.pipeline.values import Points
+from worker.cloud.types import Points
 
 FORMAT = 2
 

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from worker.detectors.spicd_net.network import PairHead, SpicdNetwork
-from worker.progress import Progress, silent
+from worker.progress import Progress, no_progress
 from worker.training.dataset import TileSet
 from worker.training.kept_pairs import Drawn, PairPool, keep_pairs
 from worker.training.log import HEAD_LOG, EpochRow, append_row, by_class
@@ -37,7 +37,7 @@ def train_head(
     validation: TileSet,
     settings: TrainSettings,
     out: Path,
-    progress: Progress = silent,
+    progress: Progress = no_progress,
 ) -> HeadResult:
     """Train `network.head` in place for `settings.head_epochs`, and leave the best one; a log goes to the folder `out`.
 

@@ -14,12 +14,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from worker.cloud.patches import patch
+from worker.cloud.types import Points
 from worker.detectors.spicd_net.chamfer import STATISTICS, chamfer_statistics
 from worker.detectors.spicd_net.frozen import FrozenEncoder
 from worker.detectors.spicd_net.network import DESCRIPTOR, PointEncoder
-from worker.pipeline.patches import patch
-from worker.pipeline.values import Points
-from worker.progress import Progress, silent
+from worker.progress import Progress, no_progress
 from worker.training.dataset import TileSet
 from worker.training.pairs import CHANGED, DIFFERENT, UNCHANGED, PairSettings, changed
 
@@ -100,7 +100,12 @@ KINDS: dict[str, tuple[int, bool]] = {
 
 
 def keep_pairs(
-    encoder: PointEncoder, tiles: TileSet, settings: PairSettings, *, seed: int, progress: Progress = silent
+    encoder: PointEncoder,
+    tiles: TileSet,
+    settings: PairSettings,
+    *,
+    seed: int,
+    progress: Progress = no_progress,
 ) -> PairPool:
     """Encode every look of the set and compare those that make a pair. Raises ValueError without two tiles."""
     if len(tiles) < 2:

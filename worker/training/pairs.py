@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from worker.pipeline.patches import patch
-from worker.pipeline.values import Points
+from worker.cloud.patches import patch
+from worker.cloud.types import Points
 from worker.training.anomalies import OPERATIONS, Change, Half, Operation, shown
 from worker.training.augmentation import Augmentation, Nuisance, augmented, second_look, turned_alike
 from worker.training.dataset import Look, TileSet

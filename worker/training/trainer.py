@@ -15,7 +15,7 @@ from torch import Tensor
 from worker.detectors.spicd_net.chamfer import chamfer_statistics
 from worker.detectors.spicd_net.layers import PooledLinear
 from worker.detectors.spicd_net.network import PairOutput, SpicdNetwork
-from worker.progress import Progress, silent
+from worker.progress import Progress, no_progress
 from worker.training.dataset import TileSet, load_tiles, split_tiles
 from worker.training.head import train_head
 from worker.training.log import EpochRow, append_row, by_class, cut_log
@@ -33,7 +33,7 @@ def train(
     settings: TrainSettings,
     dataset: Path,
     out: Path,
-    progress: Progress = silent,
+    progress: Progress = no_progress,
     *,
     start: Mapping[str, Tensor] | None = None,
     on_epoch: Callable[[Path], None] | None = None,

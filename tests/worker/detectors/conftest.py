@@ -9,9 +9,9 @@ import pytest
 import torch
 from safetensors.torch import save
 
+from worker.cloud.tiling import TileGrid, TilePairs, Tiles
 from worker.detectors.card import Card, Preprocessing
 from worker.detectors.spicd_net.network import SpicdNetwork
-from worker.pipeline.tiling import TileGrid, TilePairs, Tiles
 
 
 @pytest.fixture(scope="session")

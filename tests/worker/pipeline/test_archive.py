@@ -6,15 +6,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-from rooms import scores_of
-from tilings import grid_of, in_tile, row_of
 
+from tests.support.rooms import scores_of
+from tests.support.tilings import grid_of, in_tile, row_of
+from worker.cloud.poses import exponential
+from worker.cloud.tiling import TilingSettings, cut, grown, pair_tiles
 from worker.pipeline import archive
-from worker.pipeline.manifest import manifest, padded_patches
-from worker.pipeline.mapping import CurrentMap, ReferenceMap
-from worker.pipeline.placement import RegisteredScan
-from worker.pipeline.poses import exponential
-from worker.pipeline.tiling import TilingSettings, cut, grown, pair_tiles
+from worker.pipeline.mapping.fusion import CurrentMap, ReferenceMap
+from worker.pipeline.registration.results import RegisteredScan
+from worker.pipeline.results.manifest import manifest, padded_patches
 
 RNG = np.random.default_rng(0)
 POINTS = RNG.normal(size=(7, 3)).astype(np.float32)

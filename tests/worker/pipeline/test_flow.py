@@ -7,16 +7,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from rooms import Room
-from tilings import row_of
-from visits import placement
 
+from tests.support.rooms import Room
+from tests.support.tilings import row_of
+from tests.support.walks import placement
+from worker.cloud.formats.pcd import write_pcd
+from worker.cloud.poses import difference, inverse, transformed
+from worker.cloud.tiling import TilePairs, Tiles
+from worker.cloud.types import Arrays, Floats
 from worker.detectors.card import Card, Preprocessing
 from worker.detectors.detector import TileScores
 from worker.errors import Cancelled, ScanError
-from worker.evaluation.scenes import random_room
-from worker.evaluation.visits import visit
-from worker.pipeline.changes import TileState
 from worker.pipeline.flow import (
     BuiltMap,
     LocatedSurvey,
@@ -27,13 +28,12 @@ from worker.pipeline.flow import (
     detect,
     locate_survey,
 )
-from worker.pipeline.pcd import write_pcd
-from worker.pipeline.placement import ScanFile
-from worker.pipeline.poses import difference, inverse, transformed
-from worker.pipeline.registration_settings import RegistrationSettings
-from worker.pipeline.tiling import TilePairs, Tiles
-from worker.pipeline.values import Arrays, Floats
-from worker.progress import Progress, silent
+from worker.pipeline.registration.results import ScanFile
+from worker.pipeline.registration.settings import RegistrationSettings
+from worker.pipeline.results.changes import TileState
+from worker.progress import Progress, no_progress
+from worker.simulation.scenes import random_room
+from worker.simulation.visits import visit
 
 NEEDS = Preprocessing(voxel_size=0.05, tile_size=(1.5, 1.5, 1.0), patch_points=4096, min_points=512, seed=42)
 SETTINGS = PipelineSettings(
@@ -57,11 +57,11 @@ class Counting:
     def __init__(self) -> None:
         self.descriptions: list[Arrays | None] = []
 
-    def describe(self, tiles: Tiles, *, progress: Progress = silent) -> Arrays:
+    def describe(self, tiles: Tiles, *, progress: Progress = no_progress) -> Arrays:
         return {}
 
     def score(
-        self, pairs: TilePairs, *, description: Arrays | None = None, progress: Progress = silent
+        self, pairs: TilePairs, *, description: Arrays | None = None, progress: Progress = no_progress
     ) -> TileScores:
         self.descriptions.append(description)
         progress("score", 1.0)

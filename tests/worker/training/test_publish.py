@@ -11,11 +11,11 @@ import torch
 from worker.detectors.spicd_net.detector import SpicdNet
 from worker.detectors.store import open_detector, read_card
 from worker.errors import DetectorUnavailable
-from worker.evaluation.publish import DEVIATIONS, change_scores, deviations, publish
 from worker.training.calibration import best_threshold, survey_pairs
 from worker.training.dataset import save_tiles, split_tiles
 from worker.training.log import LOG
 from worker.training.pairs import PairSettings
+from worker.training.publish import DEVIATIONS, change_scores, deviations, publish
 from worker.training.settings import PAPER, TrainSettings
 from worker.training.trainer import train
 

@@ -9,15 +9,15 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from worker.cloud.patches import Patch, patch
+from worker.cloud.tiling import TilePairs, Tiles
+from worker.cloud.types import Arrays, Points
 from worker.detectors.card import Card
 from worker.detectors.detector import TileScores
 from worker.detectors.spicd_net.chamfer import STATISTICS, chamfer_statistics
 from worker.detectors.spicd_net.frozen import FrozenEncoder
 from worker.detectors.spicd_net.network import DESCRIPTOR, SpicdNetwork
-from worker.pipeline.patches import Patch, patch
-from worker.pipeline.tiling import TilePairs, Tiles
-from worker.pipeline.values import Arrays, Points
-from worker.progress import Progress, silent
+from worker.progress import Progress, no_progress
 
 #: Tiles between two calls of `progress`, so how soon a dismissed job stops: some 40 ms on two cores.
 TILES_PER_REPORT = 8
@@ -52,7 +52,7 @@ class SpicdNet:
         """What `load` takes, to train further from."""
         return dict(self._network.state_dict())
 
-    def describe(self, tiles: Tiles, *, progress: Progress = silent) -> Arrays:
+    def describe(self, tiles: Tiles, *, progress: Progress = no_progress) -> Arrays:
         """`descriptors` (T, 1024) float32."""
         patches = self._patches(tiles, tiles.points, np.arange(len(tiles.points)))
         return {"descriptors": self._encoded(patches, progress, "describe", padded=False)}
@@ -62,7 +62,7 @@ class SpicdNet:
         pairs: TilePairs,
         *,
         description: Arrays | None = None,
-        progress: Progress = silent,
+        progress: Progress = no_progress,
         padded: bool = False,
     ) -> TileScores:
         """Compare every observed pair; rows of unobserved tiles are NaN.

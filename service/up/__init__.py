@@ -1,0 +1,1 @@
+"""`spicd up`: the service, its workers and its Redis as one command."""

@@ -1,0 +1,229 @@
+"""`spicd up`: Redis, the database, the API and the workers as one command, and their end as one.
+
+What runs is this process with the API in a thread, the embedded Redis, and the workers. All are children of this
+process and end with it, also when it is killed.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import logging
+import os
+import shutil
+import signal
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import uvicorn
+from fastapi import FastAPI
+
+from service.catalog.database import Database
+from service.queue import JobQueue
+from service.settings import Settings
+from service.up.children import WorkerPool
+from service.up.embedded_redis import EmbeddedRedis, LaunchFailed
+
+log = logging.getLogger("spicd")
+
+_LOOK_S = 0.2  #: between two looks at the children
+_API_STARTS_S = 30.0
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Running:
+    """What `spicd up` started, for a person's table and a program's ready file."""
+
+    url: str  #: of the API
+    docs: str  #: of its interactive documentation
+    data_dir: str
+    pid: int  #: of this process, which holds the API
+    redis_url: str | None  #: of the embedded Redis; another's address may hold a password and is not told
+    redis_pid: int | None
+    workers: list[dict[str, Any]]  #: `queue` and `pid` of each
+
+    def document(self) -> dict[str, Any]:
+        """As a JSON object."""
+        return asdict(self)
+
+    def write(self, path: Path) -> None:
+        """Write as JSON, aside and renamed: who finds the file finds all of it."""
+        aside = path.with_name(f"{path.name}.{os.getpid()}.part")
+        aside.write_text(json.dumps(self.document(), indent=2) + "\n")
+        aside.replace(path)
+
+
+def up(
+    settings: Settings,
+    *,
+    on_ready: Callable[[Running], None],
+    create_app: Callable[[Settings], FastAPI] | None = None,
+) -> None:
+    """Run the service until SIGINT, SIGTERM or SIGHUP; call from the main thread. Raises `LaunchFailed`."""
+    _require_worker_packages(settings)
+    with ExitStack() as stack:
+        stop = stack.enter_context(_Signals())
+        listening = stack.enter_context(_listen(settings.host, settings.port))
+        redis = None
+        if settings.redis_url is None:
+            redis = stack.enter_context(EmbeddedRedis(settings.data_dir / "redis"))
+            sweep_scratch(settings.scratch_dir())  # the folder is ours alone now
+            _release_claims(redis)
+        settings = _resolve(settings, redis, listening)
+        _migrate(settings)
+        pool = WorkerPool(
+            geometry=settings.geometry_workers,
+            inference=settings.inference_workers,
+            environment=environment_of(settings),
+        )
+        stack.enter_context(pool)
+        stop.then = pool.kill
+        api = stack.enter_context(_serve((create_app or _app)(settings), listening))
+        on_ready(_running(settings, redis, pool))
+        while not stop.asked:
+            pool.check()
+            if redis is not None and not redis.alive:
+                log.warning("the embedded Redis ended; starting it again")
+                redis.start()
+            if not api.is_alive():
+                raise LaunchFailed("the API ended by itself; the log says why")
+            time.sleep(_LOOK_S)
+
+
+def sweep_scratch(folder: Path) -> None:
+    """Remove what steps left that were killed; only while no worker runs on this folder."""
+    for left in folder.iterdir() if folder.is_dir() else ():
+        shutil.rmtree(left, ignore_errors=True)
+
+
+def _release_claims(redis: EmbeddedRedis) -> None:
+    """No worker of an earlier start is alive: they end with their launcher, and it with the server's lock."""
+    queue = JobQueue(redis.url)
+    queue.release_claims()
+    queue.close()
+
+
+def environment_of(settings: Settings) -> dict[str, str]:
+    """This process's environment with every setting spelled out, for the workers."""
+    values = settings.model_dump(mode="json", exclude_none=True)
+    return {**os.environ, **{f"SPICD_{name.upper()}": str(value) for name, value in values.items()}}
+
+
+class _Signals:
+    """Notes that the end was asked for; asked again, it calls `then`."""
+
+    def __init__(self) -> None:
+        self.asked = False
+        self.then: Callable[[], None] = lambda: None
+        self._before: dict[int, Any] = {}
+
+    def __enter__(self) -> _Signals:
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            self._before[number] = signal.signal(number, self._note)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+    def _note(self, *_: object) -> None:
+        if self.asked:
+            self.then()
+        self.asked = True
+
+
+@contextmanager
+def _listen(host: str, port: int) -> Iterator[socket.socket]:
+    """A bound socket: a port that is taken is told before anything else starts."""
+    try:
+        family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+        listening = socket.socket(family, kind, protocol)
+        listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listening.bind(address)
+    except OSError as error:
+        raise LaunchFailed(
+            f"cannot listen on {host} port {port} ({error.strerror}); name another port with --port, 0 takes a free one"
+        ) from error
+    with listening:
+        yield listening
+
+
+@contextmanager
+def _serve(app: FastAPI, listening: socket.socket) -> Iterator[threading.Thread]:
+    """The API in a thread, from its first answer on."""
+    config = uvicorn.Config(app, log_config=None, access_log=False, timeout_graceful_shutdown=2)
+    server = uvicorn.Server(config)
+    thread = threading.Thread(target=server.run, kwargs={"sockets": [listening]}, name="api", daemon=True)
+    thread.start()
+    until = time.monotonic() + _API_STARTS_S
+    while not server.started:
+        if not thread.is_alive() or time.monotonic() > until:
+            raise LaunchFailed("the API did not start; the log says why")
+        time.sleep(0.02)
+    try:
+        yield thread
+    finally:
+        server.should_exit = True
+        thread.join(5)
+
+
+def _app(settings: Settings) -> FastAPI:
+    """The service's own API; imported here, for tests of the launcher bring another."""
+    from service.api.app import create_app  # noqa: PLC0415
+
+    return create_app(settings)
+
+
+def _require_worker_packages(settings: Settings) -> None:
+    if settings.geometry_workers + settings.inference_workers == 0:
+        return
+    missing = [name for name in ("torch", "open3d") if importlib.util.find_spec(name) is None]
+    if missing:
+        raise LaunchFailed(
+            f"{' and '.join(missing)} not installed: pip install 'spicd[worker]', or start the API alone with "
+            "SPICD_GEOMETRY_WORKERS=0 SPICD_INFERENCE_WORKERS=0"
+        )
+
+
+def _resolve(settings: Settings, redis: EmbeddedRedis | None, listening: socket.socket) -> Settings:
+    """The settings with nothing left open, so that every process reads the same."""
+    return settings.model_copy(
+        update={
+            "port": listening.getsockname()[1],
+            "data_dir": settings.data_dir.absolute(),
+            "redis_url": redis.url if redis else settings.redis_url,
+            "database_url": settings.resolved_database_url(),
+            "blob_url": settings.resolved_blob_url(),
+        }
+    )
+
+
+def _migrate(settings: Settings) -> None:
+    """Once, before the API and the workers look at the tables."""
+    try:
+        database = Database(settings.resolved_database_url())
+        database.upgrade()
+        database.close()
+    except Exception as error:  # whatever the driver raises
+        raise LaunchFailed(f"the database cannot be opened: {' '.join(str(error).split())}") from error
+
+
+def _running(settings: Settings, redis: EmbeddedRedis | None, pool: WorkerPool) -> Running:
+    wildcard = {"0.0.0.0": "127.0.0.1", "::": "[::1]"}  # what a browser can open
+    host = wildcard.get(settings.host) or (f"[{settings.host}]" if ":" in settings.host else settings.host)
+    url = f"http://{host}:{settings.port}"
+    return Running(
+        url=url,
+        docs=f"{url}/docs",
+        data_dir=str(settings.data_dir),
+        pid=os.getpid(),
+        redis_url=redis.url if redis else None,
+        redis_pid=redis.pid if redis else None,
+        workers=[{"queue": worker.queue, "pid": worker.pid} for worker in pool.workers],
+    )

@@ -1,9 +1,0 @@
-from __future__ import annotations
-
-import pytest
-from rooms import Room, simulated_room
-
-
-@pytest.fixture(scope="session")
-def room() -> Room:
-    return simulated_room()

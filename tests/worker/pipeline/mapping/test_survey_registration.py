@@ -1,0 +1,276 @@
+"""Scans of a second visit on the map of the first; every pose is known."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.support.graphs import shifted
+from tests.support.rooms import Room
+from tests.support.walks import QUICK, corridor_points, hanging, never_falls, off, placement, placing, written
+from worker.cloud.formats.pcd import write_pcd
+from worker.cloud.voxels import Voxels
+from worker.errors import Cancelled, ScanError, ScanTooLarge
+from worker.pipeline.mapping.settings import MultiScanSettings
+from worker.pipeline.mapping.survey_registration import register_survey_scans
+from worker.pipeline.registration.icp import Surface
+from worker.pipeline.registration.preprocessing import surface_of
+from worker.pipeline.registration.results import ScanFile, ScanResult
+from worker.pipeline.registration.settings import RegistrationSettings
+from worker.progress import Progress, no_progress
+from worker.simulation.scenes import random_room
+from worker.simulation.visits import visit
+
+#: without any search, so that a prior has to do
+PRIORS_ONLY = placing(QUICK.model_copy(update={"search_resolutions": ()}))
+#: metres along x, between which this part of the room lies
+WEST, EAST = (-np.inf, 2.3), (3.0, np.inf)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("scans")
+
+
+@pytest.fixture(scope="module")
+def files(room: Room, folder: Path) -> tuple[ScanFile, ...]:
+    """Two scans of the second visit and one of the first; priors are off by 15 cm and 2 degrees."""
+    drift = shifted(0.12, -0.09, yaw=np.radians(2))
+    return tuple(
+        written(folder / f"now-{number}.pcd", scan, pose=scan.world_from_sensor @ drift)
+        for number, scan in enumerate((*room.after, room.before[2]))
+    )
+
+
+@pytest.fixture(scope="module")
+def west(room: Room) -> Surface:
+    """A map of the room's western part alone."""
+    scan = room.before[2]
+    points = scan.world_points[scan.world_points[:, 0] < WEST[1]]
+    voxels = Voxels.of(points, size=0.05, origin=scan.world_from_sensor[:3, 3])
+    return surface_of(voxels, RegistrationSettings())
+
+
+def place(
+    files: Sequence[ScanFile],
+    target: Surface,
+    settings: MultiScanSettings = PRIORS_ONLY,
+    *,
+    growing: bool = False,
+    progress: Progress = no_progress,
+) -> tuple[ScanResult, ...]:
+    return register_survey_scans(files, target, settings=settings, growing=growing, progress=progress)
+
+
+@pytest.fixture(scope="module")
+def together(
+    room: Room, files: tuple[ScanFile, ...]
+) -> tuple[tuple[ScanResult, ...], list[tuple[str, float]]]:
+    """All three placed at once, and what was told on the way."""
+    told: list[tuple[str, float]] = []
+    return place(files, room.target, progress=lambda *at: told.append(at)), told
+
+
+def stages(told: list[tuple[str, float]]) -> list[str]:
+    return list(dict.fromkeys(stage for stage, _ in told))
+
+
+def test_one_scan_stands_where_it_fits_the_map_and_tells_how_sure_that_is(
+    room: Room, files: tuple[ScanFile, ...]
+) -> None:
+    told: list[tuple[str, float]] = []
+    (outcome,) = place(files[:1], room.target, progress=lambda *at: told.append(at))
+    found = placement(outcome)
+    assert off(found.map_from_scan, room.after[0].world_from_sensor) < 0.012
+    assert found.sensor_origin == pytest.approx(found.map_from_scan[:3, 3])
+    assert found.uncertainty is not None
+    assert 0.003 < found.uncertainty.translation < 0.02
+    assert 0.0004 < found.uncertainty.rotation < 0.01
+    assert (outcome.fitness, outcome.inlier_rmse) == (found.fitness, found.inlier_rmse)
+    assert stages(told) == ["registering"]
+    assert told[-1] == ("registering", 1.0)
+
+
+def test_several_scans_are_refined_together_against_the_map(
+    room: Room, together: tuple[tuple[ScanResult, ...], list[tuple[str, float]]]
+) -> None:
+    outcomes, told = together
+    for outcome, scan in zip(outcomes, (*room.after, room.before[2]), strict=True):
+        found = placement(outcome)
+        assert off(found.map_from_scan, scan.world_from_sensor) < 0.012
+        assert found.uncertainty is not None
+        assert 0.003 < found.uncertainty.translation < 0.02
+        assert found.sensor_origin == pytest.approx(found.map_from_scan[:3, 3])
+    assert stages(told) == ["registering", "refining"]
+    for stage in ("registering", "refining"):
+        shares = [share for at, share in told if at == stage]
+        assert shares == sorted(shares)
+        assert shares[-1] == 1.0
+
+
+def test_scans_that_agree_move_each_other_by_millimetres_only(
+    room: Room,
+    files: tuple[ScanFile, ...],
+    together: tuple[tuple[ScanResult, ...], list[tuple[str, float]]],
+) -> None:
+    for outcome, file in list(zip(together[0], files, strict=True))[1:]:
+        (alone,) = place([file], room.target)
+        moved = off(placement(outcome).map_from_scan, placement(alone).map_from_scan)
+        assert 0 < moved < 0.006
+
+
+def test_a_scan_that_sees_a_board_where_the_others_saw_nothing_is_left_out_and_named(
+    room: Room, files: tuple[ScanFile, ...], folder: Path
+) -> None:
+    """A board of 1.8 m square: eight in a hundred of its points stand in what the others saw as free."""
+    scan = room.after[1]
+    odd = written(folder / "odd.pcd", scan, pose=scan.world_from_sensor, more=hanging(scan, size=1.8))
+    alone = place([odd], room.target)
+    assert alone[0].placement is not None  # the map alone would have it
+    told: list[tuple[str, float]] = []
+    outcomes = place([files[0], odd, files[2]], room.target, progress=lambda *at: told.append(at))
+    assert never_falls(told)
+    assert [outcome.placement is not None for outcome in outcomes] == [True, False, True]
+    assert outcomes[1].reason is not None
+    assert outcomes[1].reason.startswith("scan odd.pcd: it disagrees with the other scans")
+    assert outcomes[1].fitness is not None
+    assert outcomes[1].fitness > 0.3
+    without = place([files[0], files[2]], room.target)
+    for number, other in ((0, 0), (2, 1)):
+        a, b = placement(outcomes[number]), placement(without[other])
+        assert off(a.map_from_scan, b.map_from_scan) < 0.001
+
+
+def test_a_scan_that_the_others_would_have_elsewhere_is_left_out_and_named(folder: Path) -> None:
+    """A map of a bare corridor lets scans slide; the end walls that they saw say that one is a decimetre off."""
+    stays = {"min_constraint": 0.0, "coarse_distances": (), "max_iterations": 2}
+    lenient = placing(PRIORS_ONLY.registration.model_copy(update=stays))
+    bare = Voxels.of(corridor_points(ends=False, seed=9, half=8.0), size=0.05, origin=np.zeros(3))
+    target = surface_of(bare, lenient.registration)
+    files = []
+    for number, off_by in enumerate((0.0, 0.13, 0.0)):
+        path = folder / f"corridor-{number}.pcd"
+        write_pcd(path, corridor_points(ends=True, seed=number))
+        files.append(ScanFile(name=path.name, path=path, pose=shifted(off_by)))
+    outcomes = place(files, target, lenient)
+    assert [outcome.placement is not None for outcome in outcomes] == [True, False, True]
+    assert outcomes[1].reason is not None
+    assert outcomes[1].reason.startswith("scan corridor-1.pcd: it disagrees with the other scans")
+    assert any(f"would have it {centimetres} cm from" in outcomes[1].reason for centimetres in range(6, 13))
+    for outcome in (outcomes[0], outcomes[2]):
+        assert off(placement(outcome).map_from_scan, np.eye(4)) < 0.03
+
+
+def test_a_foreign_scan_is_left_out_and_moves_no_other(
+    room: Room, files: tuple[ScanFile, ...], folder: Path
+) -> None:
+    foreign = written(folder / "foreign.pcd", visit(random_room(11), 1, seed=5)[0])
+    outcomes = place([files[0], foreign, files[1]], room.target)
+    assert [outcome.placement is not None for outcome in outcomes] == [True, False, True]
+    assert outcomes[1].reason is not None
+    assert outcomes[1].reason.startswith("scan foreign.pcd: fitness 0.")
+    assert (outcomes[1].fitness is not None, outcomes[1].name) == (True, "foreign.pcd")
+    without = place(files[:2], room.target)
+    for number, other in ((0, 0), (2, 1)):
+        a, b = placement(outcomes[number]), placement(without[other])
+        assert a.map_from_scan.tolist() == b.map_from_scan.tolist()
+
+
+def test_a_scan_without_a_prior_is_searched(room: Room, folder: Path) -> None:
+    lost = written(folder / "lost.pcd", room.after[0])
+    (outcome,) = place([lost], room.target, placing(QUICK))
+    assert placement(outcome).searched
+    assert off(placement(outcome).map_from_scan, room.after[0].world_from_sensor) < 0.012
+
+
+def test_a_survey_without_any_place_has_a_reason_for_every_scan_and_no_placement(
+    room: Room, folder: Path
+) -> None:
+    out_of_place = [
+        written(folder / f"stranger-{number}.pcd", scan)
+        for number, scan in enumerate(visit(random_room(11), 2, seed=5))
+    ]
+    outcomes = place(out_of_place, room.target)
+    assert [outcome.placement for outcome in outcomes] == [None, None]
+    assert all(str(outcome.reason).startswith(f"scan {outcome.name}: ") for outcome in outcomes)
+
+
+# a map that is to grow
+
+
+def test_a_scan_that_touches_only_another_new_one_is_placed_where_the_map_is_to_grow(
+    room: Room, west: Surface, folder: Path
+) -> None:
+    """The map knows the west; one scan saw the whole room, the other its east alone."""
+    whole, east = room.before[1], room.before[0]
+    files = [
+        written(folder / "east.pcd", east, between=EAST, pose=east.world_from_sensor),
+        written(folder / "whole.pcd", whole, pose=whole.world_from_sensor),
+    ]
+    survey = place(files, west)
+    assert [outcome.placement is not None for outcome in survey] == [False, True]
+    told: list[tuple[str, float]] = []
+    grown = place(files, west, growing=True, progress=lambda *at: told.append(at))
+    assert never_falls(told)
+    for outcome, scan in zip(grown, (east, whole), strict=True):
+        assert off(placement(outcome).map_from_scan, scan.world_from_sensor) < 0.03
+
+
+def test_what_finds_no_place_in_the_grown_map_either_is_left_out(
+    room: Room, west: Surface, folder: Path
+) -> None:
+    whole = room.before[1]
+    foreign = written(folder / "foreign-2.pcd", visit(random_room(11), 1, seed=5)[0])
+    files = [foreign, written(folder / "whole-2.pcd", whole, pose=whole.world_from_sensor)]
+    outcomes = place(files, west, growing=True)
+    assert [outcome.placement is not None for outcome in outcomes] == [False, True]
+    assert str(outcomes[0].reason).startswith("scan foreign-2.pcd: ")
+
+
+# files
+
+
+@pytest.mark.parametrize("place_of_it", [0, 1])
+def test_a_file_that_is_no_scan_is_left_out_with_its_reason(
+    room: Room, files: tuple[ScanFile, ...], tmp_path: Path, place_of_it: int
+) -> None:
+    (tmp_path / "x").write_bytes(b"ply\nbut no more")
+    asked = [files[0]]
+    asked.insert(place_of_it, ScanFile(name="hall 3.ply", path=tmp_path / "x"))
+    outcomes = place(asked, room.target)
+    assert outcomes[place_of_it].placement is None
+    assert str(outcomes[place_of_it].reason).startswith("hall 3.ply: ")
+    assert placement(outcomes[1 - place_of_it]).fitness is not None
+
+
+def test_where_no_file_is_a_scan_the_first_is_named(room: Room, tmp_path: Path) -> None:
+    (tmp_path / "x").write_bytes(b"ply\nbut no more")
+    asked = [ScanFile(name=name, path=tmp_path / "x") for name in ("one.ply", "two.ply")]
+    with pytest.raises(ScanError, match=r"^one\.ply: "):
+        place(asked, room.target)
+
+
+def test_a_scan_of_more_points_than_the_limit_is_refused(room: Room, files: tuple[ScanFile, ...]) -> None:
+    few = MultiScanSettings(
+        registration=PRIORS_ONLY.registration, mapping=PRIORS_ONLY.mapping, max_points=1000
+    )
+    with pytest.raises(ScanTooLarge, match=r"^now-0\.pcd: "):
+        place(files[:1], room.target, few)
+
+
+@pytest.mark.parametrize("stage", ["registering", "refining"])
+def test_a_dismissal_stops_within_one_step(room: Room, files: tuple[ScanFile, ...], stage: str) -> None:
+    told: list[str] = []
+
+    def dismissed(at: str, share: float) -> None:
+        told.append(at)
+        if told.count(stage) == 2:
+            raise Cancelled("the job was dismissed")
+
+    with pytest.raises(Cancelled):
+        place(files[:2], room.target, progress=dismissed)
+    assert told.count(stage) == 2
+    assert told[-1] == stage

@@ -1,0 +1,75 @@
+"""On a floor of 2 x 2 m with a point every 5 cm."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from worker.cloud.poses import exponential
+from worker.pipeline.registration.icp import Surface
+from worker.pipeline.registration.verification import TwoWayInliers, agreement
+
+
+def floor(*, up: float = 1.0, oriented: bool = True, extra: np.ndarray | None = None) -> Surface:
+    x, y = np.meshgrid(np.arange(0, 2, 0.05), np.arange(0, 2, 0.05))
+    points = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
+    if extra is not None:
+        points = np.concatenate([points, extra])
+    return Surface.of(points, np.tile([0, 0, up], (len(points), 1)), np.full(len(points), oriented))
+
+
+def moved(x: float = 0.0, y: float = 0.0, z: float = 0.0) -> np.ndarray:
+    return exponential(np.array([0, 0, 0, x, y, z]))
+
+
+def compared(source: Surface, target: Surface, pose: np.ndarray | None = None) -> TwoWayInliers:
+    pose = np.eye(4) if pose is None else pose
+    return agreement(source, target, pose, reach=0.3, surface_distance=0.05)
+
+
+@pytest.mark.parametrize(
+    ("lift", "overlap", "on_surface"),
+    [(0.0, 1.0, 1.0), (0.04, 1.0, 1.0), (0.06, 1.0, 0.0), (-0.06, 1.0, 0.0), (0.31, 0.0, 0.0)],
+)
+def test_a_floor_lifted_off_the_map(lift: float, overlap: float, on_surface: float) -> None:
+    found = compared(floor(), floor(), moved(z=lift))
+    assert (found.overlap, found.forward, found.backward) == (overlap, on_surface, on_surface)
+
+
+def test_a_floor_shifted_by_half_its_length_agrees_where_both_have_something() -> None:
+    found = compared(floor(), floor(), moved(x=1.0))
+    assert found.overlap == pytest.approx((20 + 5.5) / 40, abs=0.026)  # half, and 30 cm beyond the edge
+    assert (found.forward, found.backward) == (1.0, 1.0)
+    assert found.score == found.overlap
+
+
+def test_the_other_side_of_a_floor_is_not_seen_by_the_map() -> None:
+    assert compared(floor(up=-1.0), floor()).overlap == 0.0
+
+
+def test_a_floor_seen_from_nowhere_known_agrees_with_both_sides() -> None:
+    assert compared(floor(up=-1.0, oriented=False), floor()).mutual == 1.0
+
+
+def test_a_board_in_the_scan_alone_disagrees_forward_and_in_the_map_alone_backward() -> None:
+    x, y = np.meshgrid(np.arange(0, 1, 0.05), np.arange(0, 1, 0.05))
+    board = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 0.2)])  # 400 points over 1600
+    scan_has_it = compared(floor(extra=board), floor())
+    assert (scan_has_it.forward, scan_has_it.backward) == (0.8, 1.0)
+    map_has_it = compared(floor(), floor(extra=board))
+    assert (map_has_it.forward, map_has_it.backward) == (1.0, 0.8)
+    assert scan_has_it.mutual == map_has_it.mutual == 0.8
+
+
+def test_the_pose_is_target_from_source() -> None:
+    """A quarter turn and a shift that lay the floor on a map three metres away; the inverse does not."""
+    away = floor()
+    away = Surface.of(away.points + np.array([[3.0, 0, 0]]), away.normals, away.oriented)
+    pose = exponential(np.array([0, 0, np.pi / 2, 4.95, 0, 0]))
+    assert compared(floor(), away, pose).score == 1.0
+    assert compared(away, floor(), pose).score == 0.0
+
+
+def test_score_is_agreement_times_overlap_and_the_worse_direction_counts() -> None:
+    found = TwoWayInliers(overlap=0.5, forward=0.9, backward=0.6)
+    assert (found.mutual, found.score) == (0.6, 0.3)

@@ -1,0 +1,88 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.support.rooms import scores_of
+from tests.support.tilings import row_of
+from worker.detectors.detector import TileScores
+from worker.pipeline.results.changes import TileState, decide
+
+NAN = (float("nan"),) * 3
+
+
+def _states(*rows: tuple[float, float, float], threshold: float, observed: list[bool]) -> list[TileState]:
+    pairs = row_of([600] * len(rows), [600] * len(rows), observed=observed)
+    return [TileState(s) for s in decide(pairs, scores_of(*rows), threshold=threshold).states]
+
+
+def _state(*row: float, threshold: float = 0.5, observed: bool = True) -> TileState:
+    no_change, change, other = row
+    return _states((no_change, change, other), threshold=threshold, observed=[observed])[0]
+
+
+@pytest.mark.parametrize(
+    ("score", "state"),
+    [(0.375, TileState.UNCHANGED), (0.5, TileState.UNCHANGED), (0.625, TileState.CHANGED)],
+)
+def test_a_tile_is_changed_above_the_threshold_and_not_at_it(score: float, state: TileState) -> None:
+    assert _state(1 - score, score, 0.0, threshold=0.5) is state
+
+
+def test_the_threshold_decides_and_not_the_larger_class() -> None:
+    assert _state(0.75, 0.25, 0.0, threshold=0.125) is TileState.CHANGED
+    assert _state(0.25, 0.75, 0.0, threshold=0.875) is TileState.UNCHANGED
+
+
+def test_a_tile_of_another_place_is_inconsistent_below_the_threshold() -> None:
+    assert _state(0.25, 0.25, 0.5, threshold=0.875) is TileState.INCONSISTENT
+
+
+def test_a_tile_of_another_place_is_changed_above_the_threshold() -> None:
+    assert _state(0.0, 0.375, 0.625, threshold=0.75) is TileState.CHANGED
+
+
+def test_what_counts_is_that_the_tile_is_not_as_it_was_as_another_thing_or_as_another_place() -> None:
+    changes = decide(row_of([600], [600], observed=[True]), scores_of((0.25, 0.375, 0.375)), threshold=0.5)
+    assert changes.scores.tolist() == [0.75]
+    assert TileState(changes.states[0]) is TileState.CHANGED
+
+
+@pytest.mark.parametrize("row", [NAN, (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)])
+def test_an_unobserved_tile_is_unobserved_whatever_it_scored(row: tuple[float, float, float]) -> None:
+    assert _state(*row, threshold=0.0, observed=False) is TileState.UNOBSERVED
+
+
+def test_what_a_detector_says_of_an_unobserved_tile_is_dropped() -> None:
+    pairs = row_of([600] * 2, [600] * 2, observed=[False, True])
+    changes = decide(pairs, scores_of((0.0, 1.0, 0.0), (1.0, 0.0, 0.0)), threshold=0.5)
+    assert np.isnan(changes.probabilities[0]).all()
+    assert changes.probabilities[1].tolist() == [1.0, 0.0, 0.0]
+    assert changes.probabilities.dtype == np.float32
+
+
+def test_nan_for_an_observed_tile_is_never_taken_for_no_change() -> None:
+    with pytest.raises(ValueError, match="1 of 1 observed tiles"):
+        _state(*NAN, observed=True)
+
+
+def test_a_threshold_of_1_is_never_passed() -> None:
+    assert _state(0.0, 1.0, 0.0, threshold=1.0) is TileState.UNCHANGED
+
+
+def test_each_tile_gets_its_own_state() -> None:
+    rows = [(0.0, 1.0, 0.0), NAN, (1.0, 0.0, 0.0), (0.25, 0.25, 0.5)]
+    found = _states(*rows, threshold=0.875, observed=[True, False, True, True])
+    assert found == [TileState.CHANGED, TileState.UNOBSERVED, TileState.UNCHANGED, TileState.INCONSISTENT]
+
+
+def test_counts_name_every_state_and_add_up_to_the_tiles() -> None:
+    pairs = row_of([600] * 3, [600] * 3, observed=[True, True, False])
+    changes = decide(pairs, scores_of((1, 0, 0), (1, 0, 0), NAN), threshold=0.5)
+    assert changes.counts() == {"unchanged": 2, "changed": 0, "inconsistent": 0, "unobserved": 1}
+
+
+def test_a_map_of_no_tile_has_no_state() -> None:
+    nothing = TileScores(probabilities=np.empty((0, 3), np.float32))
+    counts = decide(row_of([], [], observed=[]), nothing, threshold=0.5).counts()
+    assert counts == {"unchanged": 0, "changed": 0, "inconsistent": 0, "unobserved": 0}

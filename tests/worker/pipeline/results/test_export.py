@@ -1,0 +1,98 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import open3d as o3d
+import pytest
+
+from tests.support.tilings import ORIGIN, four_states, in_tile
+from worker.cloud.formats.scan import read_scan
+from worker.pipeline.mapping.fusion import CurrentMap
+from worker.pipeline.results.changes import TileState
+from worker.pipeline.results.export import NOT_IN_A_TILE, STATE_COLORS, tile_results, write_coloured_cloud
+
+OUTSIDE = np.add(ORIGIN, [(-0.1, 0.5, 0.5), (0.5, 0.5, 5.0)]).astype(np.float32)
+CLOUD = np.concatenate([*(in_tile(i, 0, 0, 1 + i) for i in range(4)), OUTSIDE])
+ROW = np.array([0, 1, 1, 2, 2, 2, 3, 3, 3, 3, -1, -1])  # the tile that holds each point of CLOUD
+
+
+@pytest.fixture
+def written(tmp_path: Path) -> Path:
+    path = tmp_path / "cloud.ply"
+    write_coloured_cloud(path, CurrentMap(points=CLOUD, colors=None), four_states())
+    return path
+
+
+def test_the_coloured_cloud_is_read_back_point_for_point(written: Path) -> None:
+    assert read_scan(written).points.tolist() == CLOUD.tolist()
+
+
+def test_each_point_has_the_colour_of_its_tile(written: Path) -> None:
+    colors = read_scan(written).colors
+    assert colors is not None
+    for row, state in enumerate(TileState):
+        assert {tuple(color) for color in colors[row == ROW].tolist()} == {STATE_COLORS[state]}
+    outside = {tuple(color) for color in colors[ROW == -1].tolist()}
+    assert len(outside) == 1
+    assert not outside & set(STATE_COLORS.values())
+
+
+def test_no_two_states_share_a_colour() -> None:
+    assert len(set(STATE_COLORS.values())) == len(TileState)
+
+
+def test_open3d_reads_state_and_score_of_each_point(written: Path) -> None:
+    cloud = o3d.t.io.read_point_cloud(str(written))
+    state, score = (cloud.point[name].numpy().ravel() for name in ("tile_state", "change_score"))
+    assert state.tolist() == [0, 1, 1, 2, 2, 2, 3, 3, 3, 3, NOT_IN_A_TILE, NOT_IN_A_TILE]
+    assert score[:6].tolist() == [0.25, 0.75, 0.75, 0.875, 0.875, 0.875]
+    assert np.isnan(score[6:]).all()
+    assert cloud.point.positions.numpy() == pytest.approx(CLOUD)
+
+
+def test_a_point_on_a_border_has_the_colour_of_the_upper_tile(tmp_path: Path) -> None:
+    border = np.add(ORIGIN, [(1.5, 0.5, 0.5)]).astype(np.float32)
+    write_coloured_cloud(tmp_path / "c.ply", CurrentMap(points=border, colors=None), four_states())
+    colors = read_scan(tmp_path / "c.ply").colors
+    assert colors is not None
+    assert tuple(colors[0].tolist()) == STATE_COLORS[TileState.CHANGED]
+
+
+def test_in_a_map_that_grew_below_its_origin_points_have_the_colours_of_their_own_tiles(
+    tmp_path: Path,
+) -> None:
+    known = four_states()
+    tiles = known.pairs.reference
+    grown = replace(tiles.grid, lowest=(-2, 0, 0))
+    pairs = replace(known.pairs, reference=replace(tiles, grid=grown, indices=tiles.indices - [2, 0, 0]))
+    cloud = np.concatenate([in_tile(i - 2, 0, 0, 1) for i in range(5)])  # the last one is of no tile
+    write_coloured_cloud(
+        tmp_path / "c.ply", CurrentMap(points=cloud, colors=None), replace(known, pairs=pairs)
+    )
+    state = o3d.t.io.read_point_cloud(str(tmp_path / "c.ply")).point["tile_state"].numpy().ravel()
+    assert state.tolist() == [0, 1, 2, 3, NOT_IN_A_TILE]
+
+
+def test_a_changed_tile_as_a_client_is_told_of_it() -> None:
+    result = tile_results(four_states())[1]
+    assert (result.tile_id, result.tile_index) == ("tile_001_000_000", (1, 0, 0))
+    assert (result.lower, result.upper) == ((11.5, -3.0, 0.5), (13.0, -1.5, 1.5))
+    assert (result.state, result.score, result.probabilities) == ("changed", 0.75, (0.25, 0.75, 0.0))
+    assert (result.n_reference, result.n_current) == (700, 710)
+
+
+def test_an_unobserved_tile_has_no_score_but_its_points_are_counted() -> None:
+    result = tile_results(four_states())[3]
+    assert (result.state, result.score, result.probabilities) == ("unobserved", None, None)
+    assert (result.n_reference, result.n_current) == (900, 3)
+
+
+def test_there_is_a_result_for_every_tile() -> None:
+    assert [result.state for result in tile_results(four_states())] == [
+        "unchanged",
+        "changed",
+        "inconsistent",
+        "unobserved",
+    ]

@@ -1,0 +1,95 @@
+"""A training set from one simulated room."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from worker.cloud.tiling import TilingSettings
+from worker.simulation.training_set import TrainingSetSettings, WalkSettings, build_training_set
+from worker.training.dataset import Look, TileSet
+
+WALKS = WalkSettings(
+    stops={"room": 4},
+    edits={"room": 6},
+    edited_visits=1,
+    rebuilds=2,
+    second_share=(0.75, 0.75),
+    tiling=TilingSettings(min_points=400),
+)
+ONE_ROOM = TrainingSetSettings(offices=0, corridors=0, rooms=1, walks=WALKS, seed=1001)
+
+
+@pytest.fixture(scope="module")
+def room() -> TileSet:
+    return build_training_set(ONE_ROOM, processes=1)
+
+
+def nearest(points: np.ndarray, others: np.ndarray) -> np.ndarray:
+    return np.linalg.norm(points[:, None] - others, axis=2).min(axis=1)
+
+
+def looks(room: TileSet, *, changed: bool, rebuilt: bool) -> list[Look]:
+    return [look for look in room.looks if (look.changed, look.rebuilt) == (changed, rebuilt)]
+
+
+def test_every_tile_was_seen_well_on_both_visits_and_lies_about_its_centre(room):
+    assert len(room) >= 5
+    for a, b in zip(room.points_a, room.points_b, strict=True):
+        assert len(a) >= 400
+        assert len(b) >= max(400, len(a) / 2)
+        for points in (a, b, *(look.points for look in room.looks)):
+            assert (np.abs(points) <= np.array([0.75, 0.75, 0.5]) + 1e-3).all()
+
+
+def test_the_two_visits_are_independent_but_of_the_same_place(room):
+    near = []
+    for a, b in zip(room.points_a, room.points_b, strict=True):
+        assert not set(map(tuple, a)) & set(map(tuple, b))
+        near.append(np.median(nearest(a[::5], b)))
+    assert np.median(near) < 0.05  # a voxel
+
+
+def test_a_look_after_edits_shows_a_surface_that_the_map_has_not_or_misses_one_that_it_has(room):
+    changed, beside = (looks(room, changed=which, rebuilt=False) for which in (True, False))
+    assert changed
+    assert beside
+    far = {which: [_far(room, look) for look in found] for which, found in ((1, changed), (0, beside))}
+    assert np.median(far[1]) > 2 * np.median(far[0])
+
+
+def test_a_rebuilt_map_keeps_most_points_to_the_bit_and_differs_where_a_change_was_made(room):
+    changed, untouched = (looks(room, changed=which, rebuilt=True) for which in (True, False))
+    assert changed
+    assert untouched
+    for look in (*changed, *untouched):
+        a = room.points_a[look.tile]
+        assert not np.array_equal(look.points, a)
+        assert np.median(nearest(look.points[::5], a)) < 0.01  # another visit's is some 2 cm
+    # A second registration moves a scan by millimetres, a change by centimetres.
+    assert max(_far(room, look) for look in changed) > 20
+    assert np.median([_far(room, look) for look in untouched]) < 5
+
+
+def test_without_further_visits_there_are_no_further_looks():
+    bare = WALKS.model_copy(update={"edited_visits": 0, "rebuilds": 0})
+    assert build_training_set(ONE_ROOM.model_copy(update={"walks": bare}), processes=1).looks == ()
+
+
+def test_the_same_seed_builds_the_same_set_in_two_processes_and_its_source_says_which(room):
+    two = ONE_ROOM.model_copy(update={"rooms": 2})
+    again = build_training_set(two, processes=2)
+    assert again.buildings.tolist() == sorted(again.buildings.tolist())
+    first = again.subset(again.buildings == 0)
+    assert np.array_equal(np.concatenate(room.points_b), np.concatenate(first.points_b))
+    assert [(look.tile, look.changed) for look in first.looks] == [
+        (look.tile, look.changed) for look in room.looks
+    ]
+    assert len(again) > len(room)
+    assert '"rooms":1' in room.source
+
+
+def _far(room: TileSet, look: Look) -> int:
+    """Points of either look that lie over 10 cm off the other."""
+    a = room.points_a[look.tile]
+    return int((nearest(look.points, a) > 0.1).sum() + (nearest(a, look.points) > 0.1).sum())

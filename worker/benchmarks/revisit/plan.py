@@ -1,0 +1,118 @@
+"""What is visited: buildings that no training set has, each mapped once and surveyed in several cases."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from worker.pipeline.flow import PipelineSettings
+from worker.simulation.scenes import (
+    ChangeKind,
+    Scene,
+    corridor,
+    corridor_with_loop,
+    random_room,
+    small_office,
+)
+
+Kind = Literal["room", "office", "corridor", "loop"]
+Case = Literal["changed", "sparse", "unchanged"]
+KINDS: tuple[Kind, ...] = get_args(Kind)
+CASES: tuple[Case, ...] = get_args(Case)
+
+MAKERS: Mapping[Kind, Callable[[int], Scene]] = {
+    "room": random_room,
+    "office": small_office,
+    "corridor": corridor,
+    "loop": corridor_with_loop,
+}
+TEST_SEED, VALIDATION_SEED = 700_000, 900_000  #: of the first building; training sets begin at 1000
+RECIPE = 1  #: raised when the same settings begin to give other visits: kept ones are then made anew
+
+
+class RevisitSettings(BaseModel):
+    """How the visits are made; with the seeds, all that they depend on."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    kinds: tuple[Kind, ...] = Field(KINDS, min_length=1, description="of buildings, taken in turn")
+    stops: dict[Kind, int] = Field(
+        {"room": 6, "office": 14, "corridor": 16, "loop": 24}, description="scans of the first visit"
+    )
+    edits: dict[Kind, int] = Field(
+        {"room": 3, "office": 6, "corridor": 6, "loop": 6},
+        description="pieces added, removed, moved, in turn",
+    )
+    sparse_share: float = Field(1 / 3, gt=0, le=1, description="of the stops, in the case of that name")
+    drift: tuple[float, float] = Field((0.25, 4.0), description="a prior is off by at most (metres, degrees)")
+    standing_s: float = Field(5.0, gt=0, description="seconds at each stop; about 20,000 points a second")
+    pipeline: PipelineSettings = PipelineSettings()
+
+    @property
+    def fingerprint(self) -> str:
+        """Equal for visits made alike."""
+        text = f"{RECIPE} {self.model_dump_json(exclude={'kinds'})}"
+        return hashlib.sha256(text.encode()).hexdigest()[:12]
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class SitePlan:
+    """A building and its first visit."""
+
+    kind: Kind
+    seed: int
+
+    @property
+    def name(self) -> str:
+        return f"{self.kind}-{self.seed}"
+
+    def scene(self) -> Scene:
+        """As the first visit finds it."""
+        return MAKERS[self.kind](self.seed)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class VisitPlan:
+    """A second visit."""
+
+    site: SitePlan
+    case: Case
+
+    @property
+    def name(self) -> str:
+        return f"{self.site.name}-{self.case}"
+
+    @property
+    def seed(self) -> int:
+        """Of poses, noise and edits; another one than the first visit's."""
+        return 10 * self.site.seed + 1 + CASES.index(self.case)
+
+
+def plan_visits(count: int, settings: RevisitSettings, *, first_seed: int) -> tuple[VisitPlan, ...]:
+    """`count` visits, site after site: kinds of buildings in turn, in each one visit of every case."""
+    plans = []
+    for number in range(count):
+        at, case = divmod(number, len(CASES))
+        site = SitePlan(kind=settings.kinds[at % len(settings.kinds)], seed=first_seed + at)
+        plans.append(VisitPlan(site=site, case=CASES[case]))
+    return tuple(plans)
+
+
+def edit_kinds(count: int) -> tuple[ChangeKind, ...]:
+    """`count` kinds of edits in turn."""
+    kinds: tuple[ChangeKind, ...] = ("add", "remove", "move")
+    return tuple(kinds[number % len(kinds)] for number in range(count))
+
+
+def kinds_named(words: str) -> tuple[Kind, ...]:
+    """From a list with commas, in the order given. Raises ValueError for another name."""
+    known = {str(kind): kind for kind in KINDS}
+    names = [word.strip() for word in words.split(",")]
+    unknown = [name for name in names if name not in known]
+    if unknown:
+        raise ValueError(f"no building {', '.join(unknown)}; there are {', '.join(KINDS)}")
+    return tuple(known[name] for name in names)

@@ -1,0 +1,227 @@
+"""Records: how one point lies in a file, and its positions and colours taken out of it.
+
+PCD and PLY both describe a point as a row of named, typed fields. Both readers turn their header into
+`Field`s; from there on the two formats are the same.
+"""
+
+from __future__ import annotations
+
+import mmap
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import islice
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worker.cloud.types import Colors, Matrix4
+from worker.errors import ScanError
+
+FARTHEST = 10_000.0  #: metres from the origin; there a float32 steps by 1 mm
+
+HEADER_LIMIT = 64 * 1024  #: bytes; a longer header is refused unread
+STRIDE_LIMIT = 64 * 1024  #: bytes of one point; SHOT, the widest descriptor in PCL, takes 1.4 kB
+
+_POSITION = ("x", "y", "z")
+_TRIPLES = (
+    ("red", "green", "blue"),
+    ("diffuse_red", "diffuse_green", "diffuse_blue"),
+    ("r", "g", "b"),
+)
+_PACKED = ("rgb", "rgba")
+
+Columns = dict[str, NDArray[Any]]  #: (N,) arrays by field name
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Field:
+    """One named value of a point, `count` numbers of one type."""
+
+    name: str
+    dtype: np.dtype[Any]  #: with the file's byte order
+    count: int = 1
+
+    @property
+    def size(self) -> int:
+        """Bytes in one point."""
+        return self.dtype.itemsize * self.count
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class RawCloud:
+    """What a file holds, before anything is dropped or checked for sense."""
+
+    columns: Columns  #: x, y, z (N,) float32 or float64, and the colour fields, each in the type of the file
+    sensor_pose: Matrix4  #: (4, 4) float64, scan_from_sensor
+
+
+def stride(fields: Sequence[Field]) -> int:
+    """Bytes of one point."""
+    return sum(field.size for field in fields)
+
+
+def chosen_fields(fields: Sequence[Field]) -> dict[str, int]:
+    """The fields that are read, name to index; the others are skipped over.
+
+    Raises ScanError when x, y or z is missing, doubled, or not one float or double, or a point is too wide.
+    """
+    if stride(fields) > STRIDE_LIMIT:
+        raise ScanError(
+            f"a point takes {stride(fields)} bytes, the limit is {STRIDE_LIMIT}; drop wide fields"
+        )
+    names = [field.name for field in fields]
+    for name in _POSITION:
+        if names.count(name) != 1:
+            raise ScanError(
+                f"{names.count(name)} fields are named {name!r}, one is needed; write x, y and z once"
+            )
+        field = fields[names.index(name)]
+        if field.count != 1 or field.dtype.kind != "f":
+            # Integers are some writer's private scale: reading them as metres would be a guess.
+            kind = f"{field.count} x {field.dtype.name}"
+            raise ScanError(f"field {name!r} is {kind}; write positions as one float or double in metres")
+    return {name: names.index(name) for name in (*_POSITION, *_color_names(fields))}
+
+
+def _color_names(fields: Sequence[Field]) -> tuple[str, ...]:
+    """The fields that colour a point, or none; a colour in any other type is ignored as any other field is."""
+    single = {f.name: f for f in fields if f.count == 1 and [g.name for g in fields].count(f.name) == 1}
+    for triple in _TRIPLES:
+        if all(name in single for name in triple):
+            kinds = {single[name].dtype.newbyteorder("=").str[1:] for name in triple}
+            return triple if len(kinds) == 1 and kinds <= {"u1", "f4", "f8"} else ()
+    return next(((name,) for name in _PACKED if name in single and single[name].dtype.itemsize == 4), ())
+
+
+def colors_of(columns: Columns) -> Colors | None:
+    """Colours (N, 3) uint8 out of the columns, or None.
+
+    A packed `rgb` is 0x00RRGGBB in four bytes, whatever type they are declared as (PCL, `PointXYZRGB`).
+    Floating colours are scaled from 0..1; others are not guessed at.
+    """
+    for name in _PACKED:
+        if name in columns:
+            packed = np.ascontiguousarray(columns[name]).astype(
+                columns[name].dtype.newbyteorder("="), copy=False
+            )
+            bits = packed.view(np.uint32)
+            return np.stack([(bits >> shift & 0xFF).astype(np.uint8) for shift in (16, 8, 0)], axis=1)
+    names = next((triple for triple in _TRIPLES if triple[0] in columns), None)
+    if names is None:
+        return None
+    colors: NDArray[Any] = np.stack([columns[name] for name in names], axis=1)
+    if colors.dtype == np.uint8:
+        return colors.astype(np.uint8, copy=False)
+    if not bool(np.all((colors >= 0) & (colors <= 1))):
+        return None
+    scaled: Colors = np.rint(colors * 255).astype(np.uint8)
+    return scaled
+
+
+def from_rows(fields: Sequence[Field], buffer: mmap.mmap, *, offset: int, n: int) -> Columns:
+    """Columns of `n` records that lie one after another; the caller has checked that they are there."""
+    starts = np.cumsum([0, *(field.size for field in fields)])
+    chosen = chosen_fields(fields)
+    record = np.dtype(
+        {
+            "names": list(chosen),
+            "formats": [fields[i].dtype for i in chosen.values()],
+            "offsets": [int(starts[i]) for i in chosen.values()],
+            "itemsize": stride(fields),
+        }
+    )
+    rows = np.frombuffer(buffer, record, count=n, offset=offset)
+    return {name: rows[name] for name in chosen}
+
+
+def from_blocks(fields: Sequence[Field], block: NDArray[np.uint8], *, n: int) -> Columns:
+    """Columns of `n` records stored field by field, as PCD's binary_compressed keeps them."""
+    starts = np.cumsum([0, *(field.size * n for field in fields)])
+    return {
+        name: np.frombuffer(block, fields[i].dtype, count=n, offset=int(starts[i]))
+        for name, i in chosen_fields(fields).items()
+    }
+
+
+LINE_LIMIT = 1024 * 1024  #: bytes of one line
+_NUMBERS_AT_ONCE = 1_000_000  #: decoded together, which bounds the memory of the columns nobody wants
+
+
+def from_text(fields: Sequence[Field], lines: Iterator[bytes], *, n: int, size: int) -> Columns:
+    """Columns of `n` lines of numbers; `size` is how many bytes are left in the file.
+
+    Raises ScanError for a missing line, a wrong number of columns, a word, or a value outside its type.
+    """
+    width = sum(field.count for field in fields)
+    if n * width * 2 - 1 > size:  # a number takes a digit and a separator
+        raise ScanError(
+            f"truncated: header declares {n} points of {width} numbers, file holds {size} bytes of them"
+        )
+    firsts = np.cumsum([0, *(field.count for field in fields)])
+    chosen = chosen_fields(fields)
+    columns = {name: np.empty(n, fields[i].dtype) for name, i in chosen.items()}
+    step = max(1, _NUMBERS_AT_ONCE // width)
+    for start in range(0, n, step):
+        rows = min(step, n - start)
+        chunk = list(islice(lines, rows))
+        numbers = _decode(chunk, width, start=start, n=n)
+        for name, i in chosen.items():
+            columns[name][start : start + len(chunk)] = _cast(numbers[:, firsts[i]], fields[i])
+        if len(chunk) < rows:
+            raise ScanError(
+                f"truncated: header declares {n} points, file holds {start + len(chunk)}; upload it again"
+            )
+    return columns
+
+
+def text_lines(buffer: mmap.mmap) -> Iterator[bytes]:
+    """Lines of `buffer` from where it stands, without the blank ones."""
+    for line in iter(buffer.readline, b""):
+        if len(line) > LINE_LIMIT:
+            raise ScanError(f"a line of {len(line)} bytes, the limit is {LINE_LIMIT}; write one point a line")
+        if not line.isspace():
+            yield line
+
+
+def _decode(chunk: list[bytes], width: int, *, start: int, n: int) -> NDArray[np.float64]:
+    if not chunk:
+        return np.empty((0, width))
+    try:
+        numbers = np.loadtxt(chunk, dtype=np.float64, comments=None, ndmin=2, encoding="latin-1")
+    except ValueError:
+        numbers = np.empty((0, 0))
+    if numbers.shape == (len(chunk), width):
+        return numbers
+    for row, line in enumerate(chunk, start=start + 1):
+        words = line.decode("latin-1").split()
+        if len(words) != width:
+            raise ScanError(
+                f"truncated or broken: point {row} of {n} has {len(words)} numbers instead of {width}"
+            )
+        for word in words:
+            if not _is_number(word):
+                raise ScanError(f"point {row} of {n} has {word[:40]!r} where a number must stand")
+    raise ScanError(f"points {start + 1} to {start + len(chunk)} of {n} are not lines of {width} numbers")
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return "_" not in word
+
+
+def _cast(values: NDArray[np.float64], field: Field) -> NDArray[Any]:
+    """Numbers read as float64 in the type that the header declares for them."""
+    if field.dtype.kind == "f":
+        # Positions stay as read until they are checked; only a declared float may overflow here, to inf.
+        with np.errstate(over="ignore"):
+            return values.astype(field.dtype)
+    limits = np.iinfo(field.dtype)
+    bad = ~((values >= limits.min) & (values <= limits.max) & (values == np.rint(values)))
+    if bad.any():
+        value = values[np.argmax(bad)]
+        raise ScanError(f"field {field.name!r} holds {value:g}, which no {field.dtype.name} can be")
+    return values.astype(field.dtype)

@@ -1,0 +1,287 @@
+"""The header of PCD, versions .5 to .7: lines of text up to `DATA`.
+
+Format: https://pointclouds.org/documentation/tutorials/pcd_file_format.html
+"""
+
+from __future__ import annotations
+
+import mmap
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worker.cloud.formats.fields import (
+    FARTHEST,
+    HEADER_LIMIT,
+    Columns,
+    Field,
+    RawCloud,
+    chosen_fields,
+    from_blocks,
+    from_rows,
+    from_text,
+    stride,
+    text_lines,
+)
+from worker.cloud.types import Colors, Matrix4, Points
+from worker.errors import ScanError, ScanTooLarge
+
+_KEYWORDS = (
+    "VERSION",
+    "FIELDS",
+    "COLUMNS",
+    "SIZE",
+    "TYPE",
+    "COUNT",
+    "WIDTH",
+    "HEIGHT",
+    "VIEWPOINT",
+    "POINTS",
+    "DATA",
+)
+_VERSIONS = (".5", ".6", ".7", "0.5", "0.6", "0.7")
+_TYPES = {f"{kind}{size}" for kind in "IU" for size in (1, 2, 4, 8)} | {"F4", "F8"}
+_NO_POSE = ["0", "0", "0", "1", "0", "0", "0"]
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class PcdHeader:
+    """What the header declares; nothing of it is trusted before it is held against the file's size."""
+
+    fields: tuple[Field, ...]
+    n: int  #: points
+    encoding: str  #: ascii, binary or binary_compressed
+    sensor_pose: Matrix4  #: (4, 4) float64, scan_from_sensor
+    size: int  #: bytes of the header itself
+
+
+def looks_like_pcd(head: bytes) -> bool:
+    """Whether a file that starts with `head` means to be PCD."""
+    return re.match(rb"\s*(#[^\n]*\.PCD|(VERSION|FIELDS|COLUMNS)\s)", head) is not None
+
+
+def parse_pcd_header(head: bytes) -> PcdHeader:
+    """Read the header out of a file's first bytes. Raises ScanError."""
+    entries, size = _entries(head)
+    names = entries.get("FIELDS") or entries.get("COLUMNS")
+    if not names:
+        raise ScanError("header has no FIELDS; write a PCD header of version 0.7")
+    version = " ".join(entries.get("VERSION", [".7"]))
+    if version not in _VERSIONS:
+        raise ScanError(f"PCD version {version[:40]!r} is none of .5 .6 .7")
+    encoding = " ".join(entries["DATA"])
+    if encoding not in ("ascii", "binary", "binary_compressed"):
+        raise ScanError(f"DATA {encoding[:40]!r} is none of ascii, binary, binary_compressed")
+    return PcdHeader(
+        fields=_fields(names, entries),
+        n=_n_points(entries),
+        encoding=encoding,
+        sensor_pose=_viewpoint(entries.get("VIEWPOINT", _NO_POSE)),
+        size=size,
+    )
+
+
+def _entries(head: bytes) -> tuple[dict[str, list[str]], int]:
+    """The header's lines by keyword, and how many bytes they take."""
+    entries: dict[str, list[str]] = {}
+    position = 0
+    while "DATA" not in entries:
+        end = head.find(b"\n", position)
+        if end < 0:
+            raise ScanError(f"no DATA line in the first {len(head)} bytes; the header is cut off or too long")
+        words = head[position:end].decode("latin-1").split()
+        position = end + 1
+        if not words or words[0].startswith("#"):
+            continue
+        if words[0] not in _KEYWORDS or words[0] in entries:
+            raise ScanError(f"header line {words[0][:40]!r} is unknown or stands twice")
+        entries[words[0]] = words[1:]
+    return entries, position
+
+
+def _fields(names: list[str], entries: dict[str, list[str]]) -> tuple[Field, ...]:
+    sizes, types = entries.get("SIZE", []), entries.get("TYPE", [])
+    counts = entries.get("COUNT", ["1"] * len(names))
+    if not len(names) == len(sizes) == len(types) == len(counts):
+        found = f"{len(names)} FIELDS, {len(sizes)} SIZE, {len(types)} TYPE, {len(counts)} COUNT"
+        raise ScanError(f"header lines disagree: {found}")
+    fields = []
+    for name, size, kind, count in zip(names, sizes, types, counts, strict=True):
+        if kind + size not in _TYPES:
+            raise ScanError(
+                f"field {name[:40]!r} has TYPE {kind[:8]} SIZE {size[:8]}, which PCD does not know"
+            )
+        fields.append(
+            Field(name=name, dtype=np.dtype(f"<{kind.lower()}{size}"), count=_number(count, "COUNT"))
+        )
+    return tuple(fields)
+
+
+def _n_points(entries: dict[str, list[str]]) -> int:
+    declared = {
+        key: _number(" ".join(entries[key]), key) for key in ("WIDTH", "HEIGHT", "POINTS") if key in entries
+    }
+    if "WIDTH" not in declared:
+        if "POINTS" not in declared:
+            raise ScanError("header has neither WIDTH nor POINTS")
+        return declared["POINTS"]
+    width, height = declared["WIDTH"], declared.get("HEIGHT", 1)
+    points = declared.get("POINTS", width * height)
+    if points != width * height:
+        raise ScanError(f"header declares POINTS {points}, but WIDTH x HEIGHT is {width} x {height}")
+    return points
+
+
+def _number(word: str, key: str) -> int:
+    if re.fullmatch("[0-9]{1,18}", word) is None:
+        raise ScanError(f"{key} {word[:40]!r} is not a whole number")
+    return int(word)
+
+
+def _viewpoint(words: list[str]) -> Matrix4:
+    """`tx ty tz qw qx qy qz` as scan_from_sensor."""
+    try:
+        numbers = np.array([float(word) for word in words])
+    except ValueError:
+        numbers = np.empty(0)
+    if numbers.shape != (7,) or not bool(np.all(np.abs(numbers) < FARTHEST)):
+        raise ScanError(
+            f"VIEWPOINT {' '.join(words)[:80]!r} is not tx ty tz qw qx qy qz in metres, within {FARTHEST:g} m"
+        )
+    length = float(np.linalg.norm(numbers[3:]))
+    if abs(length - 1) > 0.05:
+        raise ScanError(
+            f"VIEWPOINT's quaternion has length {length:.3g}, not 1; without a pose write 1 0 0 0"
+        )
+    w, x, y, z = numbers[3:] / length
+    pose = np.eye(4)
+    pose[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    pose[:3, 3] = numbers[:3]
+    return pose
+
+
+_LZF_GAIN = 88  #: the longest back reference of LZF makes 264 bytes out of 3
+
+
+def read_pcd(buffer: mmap.mmap, *, max_points: int) -> RawCloud:
+    """Decode a whole PCD file. Raises ScanError, ScanTooLarge."""
+    header = parse_pcd_header(buffer[:HEADER_LIMIT])
+    chosen_fields(header.fields)
+    if header.n > max_points:
+        raise ScanTooLarge(
+            f"header declares {header.n} points, the limit is {max_points}; split or thin the scan"
+        )
+    if header.encoding == "ascii":
+        columns = _ascii(header, buffer)
+    elif header.encoding == "binary":
+        columns = _binary(header, buffer)
+    else:
+        columns = _compressed(header, buffer)
+    return RawCloud(columns=columns, sensor_pose=header.sensor_pose)
+
+
+def _ascii(header: PcdHeader, buffer: mmap.mmap) -> Columns:
+    buffer.seek(header.size)
+    lines = text_lines(buffer)
+    columns = from_text(header.fields, lines, n=header.n, size=len(buffer) - header.size)
+    if next(lines, None) is not None:
+        raise ScanError(f"header declares {header.n} points, but more lines follow; correct POINTS")
+    return columns
+
+
+def _binary(header: PcdHeader, buffer: mmap.mmap) -> Columns:
+    width, held = stride(header.fields), len(buffer) - header.size
+    needed = header.n * width
+    if held < needed:
+        raise ScanError(
+            f"truncated: header declares {header.n} points ({needed} bytes), "
+            f"file holds {held // width} ({held} bytes); upload it again"
+        )
+    _refuse_leftovers(buffer, header.size + needed)
+    return from_rows(header.fields, buffer, offset=header.size, n=header.n)
+
+
+def _compressed(header: PcdHeader, buffer: mmap.mmap) -> Columns:
+    start, needed = header.size + 8, header.n * stride(header.fields)
+    if len(buffer) < start:
+        raise ScanError(
+            f"truncated: header declares {header.n} points, the file ends before the compressed data"
+        )
+    packed, plain = (int(v) for v in np.frombuffer(buffer, "<u4", count=2, offset=header.size))
+    if len(buffer) - start < packed:
+        raise ScanError(
+            f"truncated: {packed} bytes of compressed data for {header.n} points are declared, "
+            f"file holds {len(buffer) - start}; upload it again"
+        )
+    if plain != needed or plain > packed * _LZF_GAIN:
+        raise ScanError(
+            f"{packed} compressed bytes are said to hold {plain}, but {header.n} points take {needed} bytes"
+        )
+    _refuse_leftovers(buffer, start + packed)
+    return from_blocks(header.fields, _decompress(buffer[start : start + packed], plain), n=header.n)
+
+
+def _decompress(packed: bytes, size: int) -> NDArray[np.uint8]:
+    import imagecodecs  # noqa: PLC0415 - most scans are not compressed
+
+    plain = np.empty(size, np.uint8)
+    if size == 0:
+        return plain
+    try:
+        filled = len(imagecodecs.lzf_decode(packed, out=plain.data))
+    except imagecodecs.LzfError as error:
+        raise ScanError(f"compressed data is damaged ({error}); upload it again") from None
+    if filled != size:  # the decoder stops early without complaint
+        raise ScanError(f"compressed data is damaged: it gives {filled} bytes instead of {size}")
+    return plain
+
+
+def _refuse_leftovers(buffer: mmap.mmap, end: int) -> None:
+    """Old PCL pads the file to a page with zeros; anything else after the points means a wrong header."""
+    left = len(buffer) - end
+    if left and np.frombuffer(buffer, np.uint8, offset=end).any():
+        raise ScanError(f"{left} bytes follow after the declared points; correct POINTS or the fields")
+
+
+def write_pcd(
+    path: Path, points: Points, *, colors: Colors | None = None, sensor_pose: Matrix4 | None = None
+) -> None:
+    """Write binary PCD 0.7: float32 x y z, with colours a packed U4 `rgb`, and `sensor_pose` as VIEWPOINT.
+
+    `sensor_pose` is scan_from_sensor, rigid. The file appears whole or not at all.
+    """
+    fields = [("x", "<f4"), ("y", "<f4"), ("z", "<f4")] + ([] if colors is None else [("rgb", "<u4")])
+    rows = np.empty(len(points), np.dtype(fields))
+    rows["x"], rows["y"], rows["z"] = np.asarray(points, np.float32).T
+    if colors is not None:
+        red, green, blue = np.asarray(colors, np.uint32).T
+        rows["rgb"] = red << 16 | green << 8 | blue
+    header = (
+        "# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\n"
+        f"FIELDS {' '.join(name for name, _ in fields)}\n"
+        f"SIZE {' '.join(kind[2] for _, kind in fields)}\n"
+        f"TYPE {' '.join(kind[1].upper() for _, kind in fields)}\n"
+        f"COUNT {' '.join('1' for _ in fields)}\n"
+        f"WIDTH {len(rows)}\nHEIGHT 1\nVIEWPOINT {_viewpoint_words(np.eye(4) if sensor_pose is None else sensor_pose)}\n"
+        f"POINTS {len(rows)}\nDATA binary\n"
+    )
+    aside = path.with_name(path.name + ".tmp")
+    with aside.open("wb") as file:
+        file.write(header.encode("ascii"))
+        file.write(rows.tobytes())
+    aside.replace(path)
+
+
+def _viewpoint_words(pose: Matrix4) -> str:
+    """`tx ty tz qw qx qy qz` of a rigid pose."""
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415 - reading does not need it
+
+    x, y, z, w = Rotation.from_matrix(pose[:3, :3]).as_quat()
+    return " ".join(f"{value:.9g}" for value in (*pose[:3, 3], w, x, y, z))

@@ -1,0 +1,293 @@
+"""The header of PLY, version 1.0: which tables follow, and how a row of each is laid out.
+
+Format: Greg Turk, "The PLY Polygon File Format", 1994.
+"""
+
+from __future__ import annotations
+
+import mmap
+import re
+import struct
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worker.cloud.formats.fields import (
+    HEADER_LIMIT,
+    Columns,
+    Field,
+    RawCloud,
+    chosen_fields,
+    from_rows,
+    from_text,
+    stride,
+    text_lines,
+)
+from worker.cloud.types import Colors, Points
+from worker.errors import ScanError, ScanTooLarge
+
+SHORT_NAMES = {
+    "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4", "double": "f8",
+}  # fmt: skip
+_LONG_NAMES = {
+    "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4",
+    "float32": "f4", "float64": "f8",
+}  # fmt: skip
+_TYPES = SHORT_NAMES | _LONG_NAMES
+_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Property:
+    """One property of an element; a list when `length` is the type of its length."""
+
+    field: Field  #: its name and the type of each value
+    length: np.dtype[Any] | None
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Element:
+    """One table of the file."""
+
+    name: str
+    n: int  #: rows
+    properties: tuple[Property, ...]
+
+    @property
+    def smallest_row(self) -> int:
+        """Bytes of a row in binary, with every list empty."""
+        return sum(p.field.size if p.length is None else p.length.itemsize for p in self.properties)
+
+    @property
+    def has_lists(self) -> bool:
+        return any(p.length is not None for p in self.properties)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class PlyHeader:
+    """What the header declares; nothing of it is trusted before it is held against the file's size."""
+
+    encoding: str  #: ascii, binary_little_endian or binary_big_endian
+    elements: tuple[Element, ...]
+    size: int  #: bytes of the header itself
+
+    @property
+    def vertex(self) -> int:
+        """Index of the element that holds the points."""
+        return [element.name for element in self.elements].index("vertex")
+
+
+def looks_like_ply(head: bytes) -> bool:
+    """Whether a file that starts with `head` means to be PLY."""
+    return re.match(rb"ply[ \t]*\r?\n", head) is not None
+
+
+def parse_ply_header(head: bytes) -> PlyHeader:
+    """Read the header out of a file's first bytes. Raises ScanError."""
+    lines, size = _lines(head)
+    encoding = _format(lines[0] if lines else [])
+    elements: list[Element] = []
+    for words in lines[1:]:
+        match words:
+            case ["element", name, count] if re.fullmatch("[0-9]{1,18}", count):
+                if name in [element.name for element in elements]:
+                    raise ScanError(f"element {name[:40]!r} stands twice in the header")
+                elements.append(Element(name=name, n=int(count), properties=()))
+            case ["property", *rest] if elements:
+                last = elements.pop()
+                added = (*last.properties, _property(rest, _ORDERS[encoding]))
+                elements.append(Element(name=last.name, n=last.n, properties=added))
+            case _:
+                raise ScanError(f"header line {' '.join(words)[:80]!r} cannot be understood")
+    if "vertex" not in [element.name for element in elements]:
+        raise ScanError("header has no element 'vertex', so there are no points in it")
+    empty = [element.name for element in elements if element.n and not element.properties]
+    if empty:
+        raise ScanError(f"element {empty[0][:40]!r} has rows and no properties")
+    return PlyHeader(encoding=encoding, elements=tuple(elements), size=size)
+
+
+def _lines(head: bytes) -> tuple[list[list[str]], int]:
+    """The words of each line between `ply` and `end_header`, comments left out, and the header's bytes."""
+    lines: list[list[str]] = []
+    position = head.find(b"\n") + 1
+    while True:
+        end = head.find(b"\n", position)
+        if end < 0:
+            raise ScanError(
+                f"no end_header in the first {len(head)} bytes; the header is cut off or too long"
+            )
+        words = head[position:end].decode("latin-1").split()
+        position = end + 1
+        if words == ["end_header"]:
+            return lines, position
+        if words and words[0] not in ("comment", "obj_info"):
+            lines.append(words)
+
+
+def _format(words: list[str]) -> str:
+    match words:
+        case ["format", encoding, "1.0"] if encoding in _ORDERS:
+            return encoding
+    raise ScanError(f"second header line {' '.join(words)[:80]!r} is not a known 'format ... 1.0'")
+
+
+def _property(words: list[str], order: str) -> Property:
+    match words:
+        case ["list", length, kind, name] if _TYPES.get(length, "f")[0] != "f" and kind in _TYPES:
+            field = Field(name=name, dtype=np.dtype(order + _TYPES[kind]))
+            return Property(field=field, length=np.dtype(order + _TYPES[length]))
+        case [kind, name] if kind in _TYPES:
+            return Property(field=Field(name=name, dtype=np.dtype(order + _TYPES[kind])), length=None)
+    raise ScanError(f"property {' '.join(words)[:80]!r} has a type that PLY does not know")
+
+
+_LIST_ROWS_LIMIT = 5_000_000  #: rows with lists that are walked one by one in Python, about 0.5 us each
+
+
+def read_ply(buffer: mmap.mmap, *, max_points: int) -> RawCloud:
+    """Decode the vertices of a PLY file. Raises ScanError, ScanTooLarge."""
+    header = parse_ply_header(buffer[:HEADER_LIMIT])
+    vertex = header.elements[header.vertex]
+    if vertex.has_lists:
+        raise ScanError("element 'vertex' has a list property; write the points without lists")
+    chosen_fields([p.field for p in vertex.properties])
+    if vertex.n > max_points:
+        raise ScanTooLarge(
+            f"header declares {vertex.n} points, the limit is {max_points}; split or thin the scan"
+        )
+    read = _ascii if header.encoding == "ascii" else _binary
+    return RawCloud(columns=read(header, buffer), sensor_pose=np.eye(4))
+
+
+def _ascii(header: PlyHeader, buffer: mmap.mmap) -> Columns:
+    buffer.seek(header.size)
+    lines = text_lines(buffer)
+    for element in header.elements[: header.vertex]:  # one line a row, whatever is in it
+        found = sum(1 for _ in zip(range(element.n), lines, strict=False))
+        if found < element.n:
+            raise ScanError(
+                f"truncated: element {element.name!r} declares {element.n} rows, file holds {found}"
+            )
+    vertex = header.elements[header.vertex]
+    left = len(buffer) - buffer.tell()
+    columns = from_text([p.field for p in vertex.properties], lines, n=vertex.n, size=left)
+    if header.vertex == len(header.elements) - 1 and next(lines, None) is not None:
+        raise ScanError(f"header declares {vertex.n} points, but more lines follow; correct the count")
+    return columns
+
+
+def _binary(header: PlyHeader, buffer: mmap.mmap) -> Columns:
+    start = header.size
+    for element in header.elements[: header.vertex]:
+        start = _after(element, buffer, start)
+    vertex, later = header.elements[header.vertex], header.elements[header.vertex + 1 :]
+    fields = [p.field for p in vertex.properties]
+    needed, held = vertex.n * stride(fields), len(buffer) - start
+    if held < needed:
+        raise ScanError(
+            f"truncated: header declares {vertex.n} points ({needed} bytes), "
+            f"file holds {held // stride(fields)} ({held} bytes); upload it again"
+        )
+    rest = held - needed
+    if rest < sum(element.n * element.smallest_row for element in later):
+        raise ScanError(f"truncated: {rest} bytes after the points cannot hold {[e.name for e in later]}")
+    if not any(element.has_lists for element in later):
+        rest -= sum(element.n * element.smallest_row for element in later)
+        if rest and np.frombuffer(buffer, np.uint8, offset=len(buffer) - rest).any():
+            raise ScanError(f"{rest} bytes follow after the declared data; correct the count of points")
+    return from_rows(fields, buffer, offset=start, n=vertex.n)
+
+
+def _after(element: Element, buffer: mmap.mmap, start: int) -> int:
+    """Offset of the first byte behind `element`, every list walked by its own length."""
+    if start + element.n * element.smallest_row > len(buffer):
+        raise ScanError(
+            f"truncated: element {element.name!r} declares {element.n} rows, the file ends before them"
+        )
+    if not element.has_lists:
+        return start + element.n * element.smallest_row
+    if element.n > _LIST_ROWS_LIMIT:
+        raise ScanError(
+            f"element {element.name!r} has {element.n} rows of lists before the points, "
+            f"the limit is {_LIST_ROWS_LIMIT}; write the points first"
+        )
+    steps = list(_steps(element))
+    try:
+        for _ in range(element.n):
+            for skip, length, item in steps:
+                start += skip
+                if length is not None:
+                    (n_items,) = length.unpack_from(buffer, start)
+                    if n_items < 0:
+                        raise ScanError(f"element {element.name!r} has a list of {n_items} values")
+                    start += length.size + n_items * item
+    except struct.error:
+        start = len(buffer) + 1
+    if start > len(buffer):
+        raise ScanError(f"truncated: the lists of element {element.name!r} run over the end of the file")
+    return start
+
+
+def _steps(element: Element) -> Iterator[tuple[int, struct.Struct | None, int]]:
+    """How to cross a row: bytes to skip, then the length of a list (or None) and the bytes of its values."""
+    skip = 0
+    for p in element.properties:
+        if p.length is None:
+            skip += p.field.size
+        else:
+            order = ">" if p.length.str[0] == ">" else "<"
+            yield skip, struct.Struct(order + p.length.char), p.field.size
+            skip = 0
+    yield skip, None, 0
+
+
+def write_ply(
+    path: Path,
+    points: Points,
+    *,
+    colors: Colors | None = None,
+    scalars: Mapping[str, NDArray[Any]] | None = None,
+) -> None:
+    """Write binary little endian PLY: float x y z, uchar red green blue, then one property for each scalar (N,).
+
+    Scalars of bool or uint8 become uchar, other integers int, floats float. The file appears whole or not at all.
+    Raises ValueError for a scalar whose name is no word, whose length is not N or whose values do not fit.
+    """
+    columns: dict[str, NDArray[Any]] = dict(zip("xyz", np.asarray(points, "<f4").T, strict=True))
+    if colors is not None:
+        columns |= dict(zip(("red", "green", "blue"), np.asarray(colors, np.uint8).T, strict=True))
+    for name, values in (scalars or {}).items():
+        if name in columns or re.fullmatch("[A-Za-z_][A-Za-z0-9_]*", name) is None:
+            raise ValueError(f"scalar field {name!r} needs another name")
+        columns[name] = _scalar(name, np.asarray(values))
+    if any(column.shape != (len(points),) for column in columns.values()):
+        raise ValueError(f"columns of {[len(c) for c in columns.values()]} values for {len(points)} points")
+    words = {code: word for word, code in SHORT_NAMES.items()}
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}"]
+    header += [f"property {words[column.dtype.str[1:]]} {name}" for name, column in columns.items()]
+    rows = np.empty(len(points), np.dtype([(name, column.dtype) for name, column in columns.items()]))
+    for name, column in columns.items():
+        rows[name] = column
+    aside = path.with_name(path.name + ".tmp")
+    with aside.open("wb") as file:
+        file.write("\n".join([*header, "end_header", ""]).encode("ascii"))
+        file.write(rows.tobytes())
+    aside.replace(path)
+
+
+def _scalar(name: str, values: NDArray[Any]) -> NDArray[Any]:
+    if values.dtype.kind == "f":
+        return values.astype("<f4")
+    if values.dtype.kind == "b" or values.dtype == np.uint8:
+        return values.astype("u1")
+    limits = np.iinfo(np.int32)
+    if values.dtype.kind not in "iu" or (
+        values.size and not limits.min <= values.min() <= values.max() <= limits.max
+    ):
+        raise ValueError(f"scalar field {name!r} of {values.dtype} does not fit a PLY int")
+    return values.astype("<i4")

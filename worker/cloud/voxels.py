@@ -1,0 +1,123 @@
+"""Voxels: many points averaged to one in each cell of a regular grid (paper, Section 3.3.3).
+
+The grid is anchored at the frame's origin, not at the cloud's corner as Open3D does it, so that two maps in
+one frame are sampled by the same cells.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worker.cloud.types import Colors, Points
+from worker.errors import MapFailed
+
+_BITS = 21  # of a signed cell index; 2^20 cells of 5 cm reach 52 km from the origin
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Voxels:
+    """Running sums of the points in each cell; two can be merged without going back to the points."""
+
+    size: float  #: metres
+    keys: NDArray[np.int64]  #: (M,) packed cell indices, ascending
+    counts: NDArray[np.int64]  #: (M,) points summed
+    sums: NDArray[np.float64]  #: (M, 6) x y z, direction to the sensor; (M, 9) with red, green, blue behind
+
+    @classmethod
+    def of(
+        cls,
+        points: NDArray[Any],
+        *,
+        size: float,
+        origin: NDArray[Any] | None = None,
+        colors: Colors | None = None,
+    ) -> Voxels:
+        """Sort points (N, 3), metres, into cells of `size` metres; what is given beside them is averaged too.
+
+        `origin` (3,) is where they were seen from, in their frame. Raises MapFailed for a point that is farther
+        from the frame's origin than the cells can count.
+        """
+        keys = cls.keys_of(points, size=size)
+        columns = [points, _directions(points, origin)] + ([] if colors is None else [colors])
+        values = np.hstack(columns).astype(np.float64)
+        return _summed(size, keys, np.ones(len(keys), np.int64), values)
+
+    @staticmethod
+    def keys_of(points: NDArray[Any], *, size: float) -> NDArray[np.int64]:
+        """(N,) packed index of the cell that each point (N, 3) lies in; raises MapFailed as `of` does."""
+        cells = np.floor(points / size).astype(np.int64) + (1 << (_BITS - 1))
+        if len(cells) and (cells.min() < 0 or cells.max() >> _BITS):
+            farthest = float(np.abs(points).max()) / 1000
+            raise MapFailed(f"a point lies {farthest:.0f} km from the map's origin; check the pose priors")
+        keys: NDArray[np.int64] = (cells[:, 0] << (2 * _BITS)) | (cells[:, 1] << _BITS) | cells[:, 2]
+        return keys
+
+    def merged(self, other: Voxels) -> Voxels:
+        """Both together; colours are kept only where both have them."""
+        width = min(self.sums.shape[1], other.sums.shape[1])
+        return _summed(
+            self.size,
+            np.concatenate([self.keys, other.keys]),
+            np.concatenate([self.counts, other.counts]),
+            np.concatenate([self.sums[:, :width], other.sums[:, :width]]),
+        )
+
+    @property
+    def points(self) -> Points:
+        """(M, 3) float32, metres: the mean of each cell's points."""
+        return (self.sums[:, :3] / self.counts[:, None]).astype(np.float32)
+
+    @property
+    def views(self) -> NDArray[np.float64]:
+        """(M, 3) mean direction to the sensors that saw the cell; 0 where no origin was given."""
+        return self.sums[:, 3:6] / self.counts[:, None]
+
+    @property
+    def colors(self) -> Colors | None:
+        """(M, 3) uint8, or None where no colours were given."""
+        if self.sums.shape[1] == 6:
+            return None
+        return np.rint(self.sums[:, 6:] / self.counts[:, None]).astype(np.uint8)
+
+
+def _directions(points: NDArray[Any], origin: NDArray[Any] | None) -> NDArray[Any]:
+    if origin is None:
+        return np.zeros(points.shape)
+    away = origin - points
+    unit: NDArray[Any] = away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-9)
+    return unit
+
+
+def _summed(
+    size: float, keys: NDArray[np.int64], counts: NDArray[np.int64], values: NDArray[np.float64]
+) -> Voxels:
+    if not len(keys):
+        return Voxels(size=size, keys=keys, counts=counts, sums=values)
+    order = np.argsort(keys, kind="stable")
+    keys = keys[order]
+    starts = np.flatnonzero(np.r_[True, keys[1:] != keys[:-1]])
+    return Voxels(
+        size=size,
+        keys=keys[starts],
+        counts=np.add.reduceat(counts[order], starts),
+        sums=np.add.reduceat(values[order], starts, axis=0),
+    )
+
+
+def merged_in_order(parts: Sequence[Voxels]) -> Voxels:
+    """Merge all parts, summed in an order that depends on their places alone.
+
+    `worker.pipeline.mapping.fusion.fuse` merges by size, so that one changed scan may change how others are summed, and
+    the last bit of a mean with it. Here untouched voxels come out bit for bit the same. Raises ValueError for none.
+    """
+    if not parts:
+        raise ValueError("no scan to fuse")
+    if len(parts) == 1:
+        return parts[0]
+    middle = len(parts) // 2
+    return merged_in_order(parts[:middle]).merged(merged_in_order(parts[middle:]))

@@ -1,1 +1,0 @@
-"""Simulator, benchmark and figures."""

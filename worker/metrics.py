@@ -1,0 +1,260 @@
+"""Counts of tiles right and wrong, and the ratios made of them (paper, Section 4.3).
+
+A tile is flagged where its score is above the threshold (Section 3.9.4). A tile without a score (NaN) is never
+flagged: nobody was told of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worker.cloud.types import Bools, Floats
+
+Scores = NDArray[np.floating[Any]]
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Confusion:
+    """Tiles by what was said of them and what is true; two are pooled by `+` (micro-aggregation)."""
+
+    true_positives: int = 0
+    false_positives: int = 0
+    false_negatives: int = 0
+    true_negatives: int = 0
+    unobserved: int = 0  #: tiles left out of the four above
+    unobserved_changed: int = 0  #: of those, the truly changed
+
+    def __add__(self, other: Confusion) -> Confusion:
+        return Confusion(
+            true_positives=self.true_positives + other.true_positives,
+            false_positives=self.false_positives + other.false_positives,
+            false_negatives=self.false_negatives + other.false_negatives,
+            true_negatives=self.true_negatives + other.true_negatives,
+            unobserved=self.unobserved + other.unobserved,
+            unobserved_changed=self.unobserved_changed + other.unobserved_changed,
+        )
+
+    @property
+    def changed(self) -> int:
+        """Truly changed tiles among those counted."""
+        return self.true_positives + self.false_negatives
+
+    @property
+    def precision(self) -> float:
+        """NaN where nothing was flagged."""
+        return _ratio(self.true_positives, self.true_positives + self.false_positives)
+
+    @property
+    def recall(self) -> float:
+        """NaN where nothing changed."""
+        return _ratio(self.true_positives, self.changed)
+
+    @property
+    def f1(self) -> float:
+        """NaN where nothing changed and nothing was flagged."""
+        wrong = self.false_positives + self.false_negatives
+        return _ratio(2 * self.true_positives, 2 * self.true_positives + wrong)
+
+    @property
+    def accuracy(self) -> float:
+        """NaN without a tile."""
+        right = self.true_positives + self.true_negatives
+        return _ratio(right, right + self.false_positives + self.false_negatives)
+
+    @property
+    def false_positive_rate(self) -> float:
+        """NaN where everything changed."""
+        return _ratio(self.false_positives, self.false_positives + self.true_negatives)
+
+    def figures(self) -> dict[str, float | int | None]:
+        """All of the above, JSON-ready: None where a ratio has no meaning."""
+        ratios = {
+            "precision": self.precision,
+            "recall": self.recall,
+            "f1": self.f1,
+            "accuracy": self.accuracy,
+            "false_positive_rate": self.false_positive_rate,
+        }
+        return {
+            "true_positives": self.true_positives,
+            "false_positives": self.false_positives,
+            "false_negatives": self.false_negatives,
+            "true_negatives": self.true_negatives,
+            "unobserved": self.unobserved,
+            "unobserved_changed": self.unobserved_changed,
+            **{name: None if np.isnan(value) else round(value, 4) for name, value in ratios.items()},
+        }
+
+
+def confusion(scores: Scores, truth: Bools, threshold: float, observed: Bools | None = None) -> Confusion:
+    """Count tiles (T,): those not `observed` apart, all others by whether they are flagged and truly changed."""
+    seen = np.ones(len(truth), bool) if observed is None else observed
+    flagged = scores > threshold
+    return Confusion(
+        true_positives=int((flagged & truth & seen).sum()),
+        false_positives=int((flagged & ~truth & seen).sum()),
+        false_negatives=int((~flagged & truth & seen).sum()),
+        true_negatives=int((~flagged & ~truth & seen).sum()),
+        unobserved=int((~seen).sum()),
+        unobserved_changed=int((~seen & truth).sum()),
+    )
+
+
+def pooled(counts: Iterable[Confusion]) -> Confusion:
+    """All counts added up, so that figures are micro-aggregated (paper, Table 5, last row)."""
+    return sum(counts, Confusion())
+
+
+def _ratio(part: int, whole: int) -> float:
+    return part / whole if whole else float("nan")
+
+
+__all__ = [
+    "PAPER_SWEEP",
+    "Confusion",
+    "Operating",
+    "PrecisionRecall",
+    "Roc",
+    "Scores",
+    "Sweep",
+    "all_thresholds",
+    "best_f1",
+    "confusion",
+    "pooled",
+    "precision_recall",
+    "roc",
+    "sweep",
+]
+
+#: Thresholds that the paper sweeps (Section 3.9.3).
+PAPER_SWEEP: Floats = np.round(np.arange(0.10, 0.905, 0.01), 2)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Operating:
+    """A threshold, and what it does."""
+
+    threshold: float
+    counts: Confusion
+
+
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class Sweep:
+    """Counts at each of K thresholds."""
+
+    thresholds: Floats  #: (K,)
+    true_positives: NDArray[np.int64]  #: (K,)
+    false_positives: NDArray[np.int64]  #: (K,)
+    changed: int  #: truly changed tiles
+    unchanged: int
+
+    @property
+    def recall(self) -> Floats:
+        """(K,) NaN where nothing changed."""
+        return _ratios(self.true_positives, self.changed)
+
+    @property
+    def precision(self) -> Floats:
+        """(K,) NaN where nothing is flagged."""
+        return _ratios(self.true_positives, self.true_positives + self.false_positives)
+
+    @property
+    def f1(self) -> Floats:
+        """(K,) 0 where nothing is flagged; NaN where nothing changed either."""
+        return _ratios(2 * self.true_positives, self.true_positives + self.false_positives + self.changed)
+
+    @property
+    def false_positive_rate(self) -> Floats:
+        """(K,) NaN where everything changed."""
+        return _ratios(self.false_positives, self.unchanged)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class Roc:
+    """Receiver operating characteristic, from "nothing flagged" to "everything flagged"."""
+
+    false_positive_rate: Floats  #: (K,) ascending from 0 to 1
+    recall: Floats  #: (K,) ascending from 0 to 1
+    thresholds: Floats  #: (K,) descending
+    area: float  #: chance that a changed tile scores above an unchanged one, ties counting half
+
+
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class PrecisionRecall:
+    """Precision over recall, from the highest score down."""
+
+    recall: Floats  #: (K,) ascending to 1
+    precision: Floats  #: (K,)
+    thresholds: Floats  #: (K,) descending
+    average_precision: float  #: precision averaged over the steps of recall, without interpolation
+
+
+def sweep(scores: Scores, truth: Bools, thresholds: Floats = PAPER_SWEEP) -> Sweep:
+    """Counts of tiles (T,) at each threshold."""
+    changed, unchanged = (np.sort(scores[chosen & ~np.isnan(scores)]) for chosen in (truth, ~truth))
+    above = [len(part) - np.searchsorted(part, thresholds, side="right") for part in (changed, unchanged)]
+    return Sweep(
+        thresholds=thresholds,
+        true_positives=above[0].astype(np.int64),
+        false_positives=above[1].astype(np.int64),
+        changed=int(truth.sum()),
+        unchanged=int((~truth).sum()),
+    )
+
+
+def all_thresholds(scores: Scores) -> Floats:
+    """(K,) ascending: one below every score, then one in each gap, then the highest score; every cut there is."""
+    values = np.unique(scores[~np.isnan(scores)]).astype(np.float64)
+    if not len(values):
+        return np.zeros(1)
+    cuts: Floats = np.r_[values[0] - 1e-6, (values[:-1] + values[1:]) / 2, values[-1]]
+    return cuts
+
+
+def best_f1(scores: Scores, truth: Bools, thresholds: Floats | None = PAPER_SWEEP) -> Operating:
+    """The threshold with the highest F1 over tiles (T,), the middle one of equals; of every cut if None is given.
+
+    Raises ValueError where nothing changed: every threshold is then as good.
+    """
+    if not truth.any():
+        raise ValueError("a threshold cannot be chosen by F1 where no tile changed")
+    found = sweep(scores, truth, all_thresholds(scores) if thresholds is None else thresholds)
+    equals = np.flatnonzero(found.f1 >= found.f1.max() - 1e-12)
+    threshold = float(found.thresholds[equals[len(equals) // 2]])
+    return Operating(threshold=threshold, counts=confusion(scores, truth, threshold))
+
+
+def roc(scores: Scores, truth: Bools) -> Roc:
+    """Over every cut of the tiles (T,); those without a score are never flagged but by "everything"."""
+    found = sweep(scores, truth, all_thresholds(scores)[::-1])
+    rates = [np.r_[0.0, rate, 1.0] for rate in (found.false_positive_rate, found.recall)]
+    return Roc(
+        false_positive_rate=rates[0],
+        recall=rates[1],
+        thresholds=np.r_[np.inf, found.thresholds, -np.inf],
+        area=float((np.diff(rates[0]) * (rates[1][1:] + rates[1][:-1]) / 2).sum()),
+    )
+
+
+def precision_recall(scores: Scores, truth: Bools) -> PrecisionRecall:
+    """Over every cut of the tiles (T,) that flags something."""
+    found = sweep(scores, truth, all_thresholds(scores)[::-1])
+    flags = found.true_positives + found.false_positives > 0
+    recall, precision = found.recall[flags], found.precision[flags]
+    return PrecisionRecall(
+        recall=recall,
+        precision=precision,
+        thresholds=found.thresholds[flags],
+        average_precision=float((np.diff(recall, prepend=0.0) * precision).sum()),
+    )
+
+
+def _ratios(part: NDArray[np.int64], whole: NDArray[np.int64] | int) -> Floats:
+    total = np.broadcast_to(np.asarray(whole, np.float64), part.shape)
+    ratios: Floats = np.divide(part, total, out=np.full(part.shape, np.nan), where=total > 0)
+    return ratios

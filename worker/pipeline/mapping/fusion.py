@@ -1,0 +1,75 @@
+"""Maps: registered scans fused to one cloud at the voxel size (paper, Section 3.3.3)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from worker.cloud.types import Bools, Colors, Normals, Points
+from worker.cloud.voxels import Voxels
+from worker.errors import MapFailed
+from worker.pipeline.registration.icp import Surface
+from worker.pipeline.registration.preprocessing import surface_of
+from worker.pipeline.registration.results import RegisteredScan
+from worker.pipeline.registration.settings import RegistrationSettings
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ReferenceMap:
+    """What surveys are registered to and compared with."""
+
+    points: Points  #: (M, 3) float32, metres, map frame, one a voxel
+    normals: Normals  #: (M, 3) float32
+    oriented: Bools  #: (M,) whether the normal points to the side that was seen
+    colors: Colors | None  #: (M, 3) uint8
+    voxel_size: float  #: metres
+
+    def surface(self) -> Surface:
+        """The map as a target of ICP; builds a tree (about 10 ms for 100,000 points)."""
+        return Surface.of(self.points, self.normals, self.oriented)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class CurrentMap:
+    """What a survey saw, in the frame and at the spacing of the map."""
+
+    points: Points  #: (M, 3) float32, metres, map frame, one a voxel
+    colors: Colors | None  #: (M, 3) uint8
+
+
+def fuse(scans: Iterable[RegisteredScan], *, voxel_size: float) -> Voxels:
+    """Average the points of all scans in each voxel of the map frame; the points of one scan in memory at a time.
+
+    Raises MapFailed where there is no scan.
+    """
+    # Sums of like size are merged, as in a merge sort: each voxel is sorted log(scans) times, not once a scan.
+    stack: list[Voxels] = []
+    for scan in scans:
+        stack.append(scan.voxels(voxel_size))
+        while len(stack) > 1 and len(stack[-2].keys) < 2 * len(stack[-1].keys):
+            last = stack.pop()
+            stack[-1] = stack[-1].merged(last)
+    if not stack:
+        raise MapFailed("no scan is left to fuse; see the reasons listed with the scans")
+    while len(stack) > 1:
+        last = stack.pop()
+        stack[-1] = stack[-1].merged(last)
+    return stack[0]
+
+
+def reference_map(fused: Voxels, *, settings: RegistrationSettings) -> ReferenceMap:
+    """The fused cloud with the normals that surveys will need, computed once."""
+    surface = surface_of(fused, settings)
+    return ReferenceMap(
+        points=fused.points,
+        normals=surface.normals.astype("float32"),
+        oriented=surface.oriented,
+        colors=fused.colors,
+        voxel_size=fused.size,
+    )
+
+
+def current_map(scans: Iterable[RegisteredScan], *, voxel_size: float) -> CurrentMap:
+    """The survey's scans fused like the map was (paper, Section 3.9.1)."""
+    fused = fuse(scans, voxel_size=voxel_size)
+    return CurrentMap(points=fused.points, colors=fused.colors)

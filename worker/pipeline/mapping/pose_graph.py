@@ -1,0 +1,207 @@
+"""The pose graph: scans as nodes, accepted registrations as edges (paper, Section 3.3.2).
+
+Which component is the largest, which scan is the reference, and by which path every other one hangs on it. Triangles of
+registrations that close vouch for each other; a path goes over those that do.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse
+from numpy.typing import NDArray
+from scipy.sparse.csgraph import (
+    breadth_first_order,
+    connected_components,
+    dijkstra,
+    minimum_spanning_tree,
+)
+
+from worker.cloud.poses import difference, inverse
+from worker.cloud.types import Floats, Matrix4
+from worker.pipeline.mapping.pose_graph_optimization import Poses, optimised, residual
+from worker.pipeline.mapping.settings import MapSettings
+from worker.pipeline.registration.scan_to_scan import PairResult
+
+_HOP = 0.05  # cost of one more edge on a path
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Chains:
+    """Every scan of one component brought into the frame of its reference scan."""
+
+    reference: int
+    poses: dict[int, Matrix4]  #: reference_from_scan
+    paths: dict[int, tuple[int, ...]]  #: from the reference to the scan, both named
+
+
+def components(scans: Sequence[int], edges: Sequence[PairResult]) -> list[tuple[int, ...]]:
+    """Connected scans, the largest set first; of equal ones that with the lowest index."""
+    at = {scan: row for row, scan in enumerate(scans)}
+    graph = _matrix(at, edges, np.ones(len(edges)))
+    _, labels = connected_components(graph, directed=False)
+    sets = defaultdict(list)
+    for scan, label in zip(scans, labels, strict=True):
+        sets[label].append(scan)
+    return sorted((tuple(each) for each in sets.values()), key=lambda each: (-len(each), each[0]))
+
+
+def reference_of(scans: Sequence[int], edges: Sequence[PairResult]) -> int:
+    """The scan of highest degree, of those the one of highest mean fitness."""
+    fitness = defaultdict(list)
+    for edge in edges:
+        for scan in (edge.target, edge.source):
+            fitness[scan].append(edge.fitness)
+    return max(scans, key=lambda scan: (len(fitness[scan]), np.mean(fitness[scan] or [0.0]), -scan))
+
+
+def chained(scans: Sequence[int], edges: Sequence[PairResult], settings: MapSettings) -> Chains:
+    """Chain the registrations along shortest paths from the reference; an edge is short that can be relied on."""
+    reference = reference_of(scans, edges)
+    at = {scan: row for row, scan in enumerate(scans)}
+    graph = _matrix(at, edges, _HOP + _costs(edges, settings))
+    _, before = dijkstra(graph, directed=False, indices=at[reference], return_predecessors=True)
+    return _followed(scans, edges, reference, before)
+
+
+def most_reliable_tree(scans: Sequence[int], edges: Sequence[PairResult], settings: MapSettings) -> Chains:
+    """The same along the tree of the edges that can be relied on most: it takes a long way round a doubtful edge.
+
+    Paths are long, and errors grow along them: good for telling which of the other edges may be true.
+    """
+    reference = reference_of(scans, edges)
+    at = {scan: row for row, scan in enumerate(scans)}
+    tree = minimum_spanning_tree(_matrix(at, edges, 1e-9 + _costs(edges, settings)))
+    _, before = breadth_first_order(tree, at[reference], directed=False)
+    return _followed(scans, edges, reference, before)
+
+
+def _costs(edges: Sequence[PairResult], settings: MapSettings) -> Floats:
+    costs: Floats = -np.log(np.clip(reliability(edges, settings), 1e-6, 1.0))
+    return costs
+
+
+def _followed(
+    scans: Sequence[int], edges: Sequence[PairResult], reference: int, before: NDArray[np.int32]
+) -> Chains:
+    """Poses and paths from each scan's row to the row before it on the way to the reference."""
+    at = {scan: row for row, scan in enumerate(scans)}
+    between = {(edge.target, edge.source): edge.target_from_source for edge in edges}
+    between |= {(edge.source, edge.target): inverse(edge.target_from_source) for edge in edges}
+    paths: dict[int, tuple[int, ...]] = {reference: (reference,)}
+    poses = {reference: np.eye(4)}
+    for scan in scans:
+        waiting = [scan]
+        while waiting[-1] not in paths:
+            waiting.append(scans[int(before[at[waiting[-1]]])])
+        for parent, child in zip(waiting[:0:-1], waiting[-2::-1], strict=True):
+            paths[child] = (*paths[parent], child)
+            poses[child] = poses[parent] @ between[parent, child]
+    return Chains(reference=reference, poses=poses, paths=paths)
+
+
+def reliability(edges: Sequence[PairResult], settings: MapSettings) -> Floats:
+    """(E,) in 0..1: the confidence of each, times the share of triangles that close over it."""
+    closing, open_ = triangle_counts(edges, settings)
+    return np.array([edge.confidence for edge in edges]) * (closing + 1) / (closing + open_ + 2)
+
+
+def triangle_counts(edges: Sequence[PairResult], settings: MapSettings) -> tuple[Floats, Floats]:
+    """(E,) triangles over each edge that close within the limits of a loop, and that do not."""
+    number_of = {frozenset((edge.target, edge.source)): number for number, edge in enumerate(edges)}
+    near = defaultdict(set)
+    for edge in edges:
+        near[edge.target].add(edge.source)
+        near[edge.source].add(edge.target)
+    closing, open_ = np.zeros(len(edges)), np.zeros(len(edges))
+    for a, b, c in _triangles(near):
+        members = [number_of[frozenset(pair)] for pair in ((a, b), (b, c), (a, c))]
+        ab, bc, ac = (
+            _directed(edges[number], *pair)
+            for number, pair in zip(members, ((a, b), (b, c), (a, c)), strict=True)
+        )
+        metres, radians = difference(ac, ab @ bc)
+        closes = metres <= settings.loop_distance and radians <= settings.loop_angle
+        (closing if closes else open_)[members] += 1
+    return closing, open_
+
+
+def _triangles(near: dict[int, set[int]]) -> list[tuple[int, int, int]]:
+    return [
+        (a, b, c)
+        for a in sorted(near)
+        for b in sorted(near[a])
+        if b > a
+        for c in sorted(near[a] & near[b])
+        if c > b
+    ]
+
+
+def _directed(edge: PairResult, target: int, source: int) -> Matrix4:
+    del source
+    return edge.target_from_source if edge.target == target else inverse(edge.target_from_source)
+
+
+def _matrix(at: dict[int, int], edges: Sequence[PairResult], values: Floats) -> scipy.sparse.csr_array:
+    rows = [at[edge.target] for edge in edges]
+    columns = [at[edge.source] for edge in edges]
+    return scipy.sparse.csr_array((values, (rows, columns)), shape=(len(at), len(at)))
+
+
+#: Times the limits of a loop: errors add up along the tree, and a wrong registration is metres off.
+_PLAUSIBLE = 6.0
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Solution:
+    """The largest set of scans that registrations agree on, in the frame of its reference scan."""
+
+    reference: int
+    poses: dict[int, Matrix4]  #: reference_from_scan
+    paths: dict[int, tuple[int, ...]]  #: from the reference to the scan, both named
+    kept: tuple[PairResult, ...]  #: the registrations between these scans that agree
+    elsewhere: tuple[PairResult, ...]  #: accepted ones between scans of smaller sets
+    contradicted: tuple[PairResult, ...]  #: accepted ones that loops do not close over
+
+
+def solve_graph(scans: Sequence[int], pairs: Sequence[PairResult], settings: MapSettings) -> Solution:
+    """Chain the accepted registrations, optimise them robustly, throw out what is far from the rest, and repeat.
+
+    Ends when what is left is connected and agrees; a throw takes at least one edge, so it does end.
+    """
+    edges = [pair for pair in pairs if pair.accepted]
+    contradicted: list[PairResult] = []
+    while True:
+        members = components(scans, edges)[0]
+        inside = set(members)
+        within = [edge for edge in edges if edge.target in inside]
+        chains = chained(members, _plausible(members, within, settings), settings)
+        poses, _ = optimised(
+            chains.poses, _agreeing(chains.poses, within, settings), fixed=chains.reference, settings=settings
+        )
+        wrong = {id(edge) for edge in within if residual(poses, edge, settings) > 1}
+        if not wrong:
+            return Solution(
+                reference=chains.reference,
+                poses=poses,
+                paths=chains.paths,
+                kept=tuple(within),
+                elsewhere=tuple(edge for edge in edges if edge.target not in inside),
+                contradicted=tuple(contradicted),
+            )
+        contradicted += [edge for edge in within if id(edge) in wrong]
+        edges = [edge for edge in edges if id(edge) not in wrong]
+
+
+def _plausible(
+    members: Sequence[int], edges: Sequence[PairResult], settings: MapSettings
+) -> list[PairResult]:
+    """What may be true by the edges that can be relied on most."""
+    return _agreeing(most_reliable_tree(members, edges, settings).poses, edges, settings)
+
+
+def _agreeing(poses: Poses, edges: Sequence[PairResult], settings: MapSettings) -> list[PairResult]:
+    return [edge for edge in edges if residual(poses, edge, settings) <= _PLAUSIBLE]

@@ -1,0 +1,1 @@
+"""One scan to a target: coarse alignment, ICP, verification."""

@@ -1,0 +1,97 @@
+"""Placements: where each scan of a map or survey stands, how sure that is, or why it was left out.
+
+Points are not kept here: a map of 500 scans is built with one of them in memory at a time.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from worker.cloud.formats.scan import Scan, read_scan
+from worker.cloud.poses import inverse, transformed
+from worker.cloud.types import Colors, Floats, Matrix4, Points
+from worker.cloud.voxels import Voxels
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ScanFile:
+    """A scan, to be read when it is needed."""
+
+    name: str  #: what messages call it
+    path: Path
+    pose: Matrix4 | None = None  #: (4, 4) map_from_sensor as the client believes it, e.g. by odometry
+
+    def read(self, *, max_points: int) -> Scan:
+        """Raises ScanError, whose message names the file."""
+        return read_scan(self.path, name=self.name, max_points=max_points)
+
+    def start(self, sensor_pose: Matrix4) -> Matrix4 | None:
+        """map_from_scan as the prior has it, which speaks of the sensor; the file may know where that stood."""
+        if self.pose is None:
+            return None
+        map_from_scan: Matrix4 = self.pose @ inverse(sensor_pose)
+        return map_from_scan
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Uncertainty:
+    """One sigma of a pose in its worst direction."""
+
+    translation: float  #: metres, of the sensor's place
+    rotation: float  #: radians
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class RegistrationResult:
+    """A scan that was accepted."""
+
+    map_from_scan: Matrix4  #: (4, 4) rigid
+    sensor_origin: Floats | None  #: (3,) metres, map frame; None where the points contradict the file's
+    fitness: float | None  #: mean over its registrations, 0..1; None where there was nothing to fit to
+    inlier_rmse: float | None  #: metres, likewise
+    overlap: float  #: share of the scan that what it was registered to covers, 0..1
+    agreement: float  #: share of the overlap on a common surface, worse direction, 0..1
+    searched: bool  #: the given start did not do; the pose comes from a search without one
+    uncertainty: Uncertainty | None  #: None where there was nothing to fit to
+    path: tuple[int, ...] = ()  #: indices of the files from the map's reference scan to this one
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ScanResult:
+    """What became of one scan: placed, or left out with a reason."""
+
+    name: str
+    placement: RegistrationResult | None
+    reason: str | None = None
+    fitness: float | None = None  #: 0..1, the best reached; None where there was nothing to fit to
+    inlier_rmse: float | None = None  #: metres
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class RegisteredScan:
+    """The points of a scan that was accepted, with the place they were seen from."""
+
+    name: str
+    points: Points  #: (N, 3) float32, metres, map frame
+    colors: Colors | None  #: (N, 3) uint8
+    map_from_scan: Matrix4  #: (4, 4) rigid
+    sensor_origin: Floats | None  #: (3,) metres, map frame; None where the points contradict the file's
+
+    def voxels(self, size: float) -> Voxels:
+        """Its points in cells of `size` metres of the map frame."""
+        return Voxels.of(self.points, size=size, origin=self.sensor_origin, colors=self.colors)
+
+
+def placed(file: ScanFile, placement: RegistrationResult, *, max_points: int) -> RegisteredScan:
+    """Read the file again and put its points where they belong; raises ScanError."""
+    scan = file.read(max_points=max_points)
+    return RegisteredScan(
+        name=file.name,
+        points=transformed(scan.points, placement.map_from_scan).astype(np.float32),
+        colors=scan.colors,
+        map_from_scan=placement.map_from_scan,
+        sensor_origin=placement.sensor_origin,
+    )

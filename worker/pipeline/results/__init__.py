@@ -1,0 +1,1 @@
+"""What a survey leaves: states of tiles, coloured cloud, picture, manifest."""

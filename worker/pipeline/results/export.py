@@ -1,0 +1,175 @@
+"""Results for people and programs: the coloured cloud, and one row a tile."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worker.cloud.formats.ply import write_ply
+from worker.cloud.tiling import tile_id
+from worker.cloud.types import Colors, Points
+from worker.pipeline.mapping.fusion import CurrentMap
+from worker.pipeline.results.changes import ChangeSet, TileState
+
+#: Colour-blind-safe (Okabe and Ito, 2008): grey, vermilion, reddish purple, sky blue
+STATE_COLORS = {
+    TileState.UNCHANGED: (170, 170, 170),
+    TileState.CHANGED: (213, 94, 0),
+    TileState.INCONSISTENT: (204, 121, 167),
+    TileState.UNOBSERVED: (86, 180, 233),
+}
+NOT_IN_A_TILE = 255  #: value of `tile_state` for points outside every reference tile
+_NOT_IN_A_TILE_COLOR = (225, 225, 225)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class TileResult:
+    """One tile's answer, in plain numbers; metres, map frame."""
+
+    tile_id: str
+    tile_index: tuple[int, int, int]
+    lower: tuple[float, float, float]
+    upper: tuple[float, float, float]
+    state: str
+    score: float | None  #: probability of change; None where unobserved
+    probabilities: tuple[float, float, float] | None
+    n_reference: int
+    n_current: int
+
+
+def tile_results(changes: ChangeSet) -> list[TileResult]:
+    """Every tile of the reference, in the grid's order."""
+    tiles = changes.pairs.reference
+    lower = tiles.grid.lower(tiles.indices)
+    return [
+        _tile_result(changes, tile, lower[tile], lower[tile] + tiles.grid.size)
+        for tile in range(len(tiles.points))
+    ]
+
+
+def _tile_result(
+    changes: ChangeSet, tile: int, lower: NDArray[np.float64], upper: NDArray[np.float64]
+) -> TileResult:
+    index = changes.pairs.reference.indices[tile]
+    state = TileState(int(changes.states[tile]))
+    same, changed, other = (float(value) for value in changes.probabilities[tile])
+    scored = state is not TileState.UNOBSERVED
+    return TileResult(
+        tile_id=tile_id(index),
+        tile_index=(int(index[0]), int(index[1]), int(index[2])),
+        lower=_rounded(lower),
+        upper=_rounded(upper),
+        state=state.label,
+        score=float(changes.scores[tile]) if scored else None,
+        probabilities=(same, changed, other) if scored else None,
+        n_reference=len(changes.pairs.reference.points[tile]),
+        n_current=len(changes.pairs.current[tile]),
+    )
+
+
+def _rounded(corner: NDArray[np.float64]) -> tuple[float, float, float]:
+    x, y, z = (round(float(value), 6) for value in corner)
+    return x, y, z
+
+
+def write_coloured_cloud(path: Path, current: CurrentMap, changes: ChangeSet) -> None:
+    """The survey's fused cloud as PLY, each point in the colour of its tile's state.
+
+    Scalar fields: `change_score` (float; NaN where not scored) and `tile_state` (uchar; TileState, or 255
+    outside every reference tile).
+    """
+    tile = _tile_of_points(current.points, changes)
+    inside = tile >= 0
+    state = np.full(len(tile), NOT_IN_A_TILE, np.uint8)
+    state[inside] = changes.states[tile[inside]]
+    score = np.full(len(tile), np.nan, np.float32)
+    score[inside] = changes.scores[tile[inside]]
+    write_ply(
+        path,
+        current.points,
+        colors=_colors(state),
+        scalars={"change_score": score, "tile_state": state},
+    )
+
+
+def _tile_of_points(points: Points, changes: ChangeSet) -> NDArray[np.int64]:
+    """(N,) row of the tile that holds each point, -1 where none does."""
+    tiles = changes.pairs.reference
+    table = np.full(tiles.grid.shape, -1, np.int64)
+    table[tuple((tiles.indices - tiles.grid.lowest).T)] = np.arange(len(tiles.indices))
+    index = np.floor((points - tiles.grid.origin) / tiles.grid.size).astype(np.int64) - tiles.grid.lowest
+    inside = np.all((index >= 0) & (index < tiles.grid.shape), axis=1)
+    found = np.full(len(points), -1, np.int64)
+    found[inside] = table[tuple(index[inside].T)]
+    return found
+
+
+def _colors(state: NDArray[np.uint8]) -> Colors:
+    table = np.full((256, 3), _NOT_IN_A_TILE_COLOR, np.uint8)
+    for each, color in STATE_COLORS.items():
+        table[each] = color
+    return table[state]
+
+
+CONFORMS_TO = (
+    "http://www.opengis.net/spec/json-fg-1/1.0/conf/core",
+    "http://www.opengis.net/spec/json-fg-1/1.0/conf/prisms",
+)
+MAP_FRAME = "http://www.opengis.net/def/crs/OGC/0/Engineering3D"
+
+
+def feature_collection(
+    changes: ChangeSet, *, map_id: str, survey_id: str, model: str, captured_at: str | None = None
+) -> dict[str, Any]:
+    """Every tile of the map, JSON-ready. `captured_at` is RFC 3339; where it is unknown, `time` is null."""
+    properties = {
+        "map_id": map_id,
+        "survey_id": survey_id,
+        "model": model,
+        "captured_at": captured_at,
+        "threshold": changes.threshold,
+    }
+    features = [_feature(tile, properties) for tile in tile_results(changes)]
+    return {
+        "type": "FeatureCollection",
+        "conformsTo": list(CONFORMS_TO),
+        "featureType": "spicd-tile",
+        "coordRefSys": MAP_FRAME,
+        "numberMatched": len(features),
+        "numberReturned": len(features),
+        "links": [],
+        "features": features,
+    }
+
+
+def _feature(tile: TileResult, shared: dict[str, Any]) -> dict[str, Any]:
+    (x0, y0, z0), (x1, y1, z1) = tile.lower, tile.upper
+    footprint = [[x0, y0], [x1, y0], [x1, y1], [x0, y1], [x0, y0]]  # counter-clockwise, closed
+    captured_at = shared["captured_at"]
+    return {
+        "type": "Feature",
+        "id": f"{shared['survey_id']}.{tile.tile_id}",
+        "geometry": None,
+        "place": {
+            "type": "Prism",
+            "base": {"type": "Polygon", "coordinates": [footprint]},
+            "lower": z0,
+            "upper": z1,
+        },
+        "time": None if captured_at is None else {"timestamp": captured_at},
+        "properties": {
+            "tile_id": tile.tile_id,
+            "tile_index": list(tile.tile_index),
+            "center": [round((x0 + x1) / 2, 6), round((y0 + y1) / 2, 6), round((z0 + z1) / 2, 6)],
+            "state": tile.state,
+            "score": tile.score,
+            "probabilities": None if tile.probabilities is None else list(tile.probabilities),
+            "n_reference": tile.n_reference,
+            "n_current": tile.n_current,
+            **shared,
+        },
+    }

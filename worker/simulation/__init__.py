@@ -1,0 +1,1 @@
+"""Buildings, a sensor and visits whose truth is known; nothing in production imports it."""

@@ -1,0 +1,163 @@
+"""A spinning LiDAR with a rocking beam, after the Unitree L1: one scan of a scene (docs/simulator.md)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worker.cloud.types import Floats, Matrix4, Points
+from worker.simulation.scenes.scene import Scene
+
+TURN = 360.0  #: degrees
+LEAST_GAP = 0.03  #: metres between two surfaces that a beam can mix
+NOWHERE = 1000.0  #: metres, the range of a ray that meets nothing: beyond every limit, and finite
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class SensorModel:
+    """Rates and angles as the maker states them; noise as measured or assumed, see docs/simulator.md."""
+
+    points_per_second: float = 21_600.0
+    turns_per_second: float = 11.0  #: Hz, about the axis
+    lines_per_second: float = 180.0  #: Hz, sweeps of the mirror from edge to edge of the field
+    rate_jitter: float = 0.02  #: share, sigma of the turn between two lines
+    field_deg: float = 180.0  #: degrees swept by a line through the axis; 180 is 90 degrees to either side
+    axis_elevation_deg: float = (
+        30.0  #: degrees of the axis above the sensor's x, in which the field is centred
+    )
+    min_range: float = 0.05  #: metres
+    max_range: float = 15.0  #: metres
+    range_sigma: float = 0.015  #: metres, each point
+    bias_sigma: float = 0.005  #: metres, one draw a scan
+    range_step: float = 0.001  #: metres, ranges are rounded to this; 0 leaves them
+    angle_sigma_deg: float = 0.05  #: degrees, between the true and the reported direction, each of two angles
+    beam_deg: float = 0.15  #: degrees, radius of the beam: what it half covers mixes
+    mixing: float = 0.5  #: share of the points on an edge of depth that fall between both surfaces
+    mixing_depth: float = 0.6  #: metres, surfaces farther apart give two pulses, of which the first counts
+    certain_range: float = 4.0  #: metres, every return arrives up to here
+    faint_range: float = (
+        10.0  #: metres, `faint_share` of the returns arrives here; the fall is a straight line
+    )
+    faint_share: float = 0.2
+    loss: float = 0.06  #: share lost at random
+    grazing_deg: float = 75.0  #: degrees from the normal from which returns grow fewer, down to none at 90
+
+
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class SimulatedScan:
+    """What a standing sensor returned, and the truth about it."""
+
+    points: Points  #: (N, 3) float32, metres, sensor frame: x ahead, y left, z up
+    object_ids: NDArray[np.int32]  #: (N,) object that the middle of the beam met
+    origin: Floats  #: (3,) where the rays start, sensor frame: 0
+    world_from_sensor: Matrix4  #: (4, 4) the true pose
+    prior: (
+        Matrix4  #: (4, 4) world_from_sensor as the robot believes it; the true pose unless a visit drifts it
+    )
+
+    @property
+    def world_points(self) -> Points:
+        """(N, 3) float32, world frame, by the true pose."""
+        rotated = self.points @ self.world_from_sensor[:3, :3].T
+        return (rotated + self.world_from_sensor[:3, 3]).astype(np.float32)
+
+
+#: No noise and no loss: every ray that meets something within range comes back exact.
+PERFECT = SensorModel(
+    rate_jitter=0.0,
+    range_sigma=0.0,
+    bias_sigma=0.0,
+    range_step=0.0,
+    angle_sigma_deg=0.0,
+    mixing=0.0,
+    faint_share=1.0,
+    loss=0.0,
+    grazing_deg=90.0,
+)
+
+
+def scan(
+    scene: Scene,
+    world_from_sensor: Matrix4,
+    *,
+    duration_s: float = 5.0,
+    sensor: SensorModel,
+    rng: np.random.Generator,
+) -> SimulatedScan:
+    """Stand for `duration_s` seconds at a pose and measure. One cast of all rays; the same rng state, the same scan."""
+    reported = directions(sensor, duration_s, rng)  # (N, 3) sensor frame
+    fired = _perturbed(reported, sensor.angle_sigma_deg, rng)
+    edge = _perturbed(fired, sensor.beam_deg, rng)
+    both = np.concatenate([fired, edge]) @ world_from_sensor[:3, :3].T  # (2N, 3) world frame
+    hit = scene.caster.cast(world_from_sensor[:3, 3], both)
+    count = len(reported)
+    first, other = np.split(np.minimum(hit.ranges, NOWHERE), 2)
+    mixed = _mixed(first, other, hit.cosines[:count], sensor, rng)
+    kept = _returned(first, hit.cosines[:count], sensor, rng)
+    noisy = mixed + rng.normal(0.0, sensor.bias_sigma) + rng.normal(0.0, sensor.range_sigma, count)
+    if sensor.range_step > 0:
+        noisy = np.round(noisy / sensor.range_step) * sensor.range_step
+    kept &= (noisy >= sensor.min_range) & (noisy <= sensor.max_range)
+    return SimulatedScan(
+        points=(reported[kept] * noisy[kept, None]).astype(np.float32),
+        object_ids=hit.object_ids[:count][kept],
+        origin=np.zeros(3),
+        world_from_sensor=world_from_sensor,
+        prior=world_from_sensor,
+    )
+
+
+def directions(sensor: SensorModel, duration_s: float, rng: np.random.Generator) -> Floats:
+    """(N, 3) unit vectors, sensor frame, in the order in which they are fired.
+
+    A line sweeps the field through the axis while the head turns on; its phase and the turn to the next line
+    are jittered, so that no two scans, nor two lines, meet the same spots.
+    """
+    per_line = round(sensor.points_per_second / sensor.lines_per_second)
+    lines = max(1, round(duration_s * sensor.lines_per_second))
+    turn = TURN * sensor.turns_per_second / sensor.lines_per_second  # degrees the head moves on during a line
+    turns = turn * (1 + rng.normal(0.0, sensor.rate_jitter, lines))
+    start = rng.uniform(0, TURN) + np.cumsum(turns) - turns
+    share = (np.arange(per_line)[None, :] + rng.random((lines, 1))) / per_line  # (lines, per_line) 0..1
+    azimuth = np.radians(start[:, None] + turns[:, None] * share).ravel()
+    off_axis = np.radians((share - 0.5) * sensor.field_deg).ravel()
+    tilt = np.radians(sensor.axis_elevation_deg)
+    axis, side, up = np.array([[np.cos(tilt), 0, np.sin(tilt)], [0, 1, 0], [-np.sin(tilt), 0, np.cos(tilt)]])
+    around = np.cos(azimuth)[:, None] * side + np.sin(azimuth)[:, None] * up
+    rays: Floats = np.cos(off_axis)[:, None] * axis + np.sin(off_axis)[:, None] * around
+    return rays
+
+
+def _perturbed(rays: Floats, sigma_deg: float, rng: np.random.Generator) -> Floats:
+    """The rays tilted at random; what the noise adds along the ray is lost in the normalisation."""
+    tilted = rays + rng.normal(0.0, np.radians(sigma_deg), rays.shape)
+    unit: Floats = tilted / np.linalg.norm(tilted, axis=1, keepdims=True)
+    return unit
+
+
+def _mixed(
+    first: Floats, other: Floats, cosines: Floats, sensor: SensorModel, rng: np.random.Generator
+) -> Floats:
+    """(N,) ranges; where the beam straddles an edge, some lie between both surfaces."""
+    gap = np.abs(other - first)
+    # On one plane the range changes by about r * angle * tan(incidence) across the beam: that is no edge.
+    cosines = np.clip(cosines, 0.05, 1.0)
+    plane = first * np.radians(3 * sensor.beam_deg) * np.sqrt(1 - cosines**2) / cosines
+    edge = (gap > LEAST_GAP + plane) & (gap < sensor.mixing_depth) & (rng.random(len(first)) < sensor.mixing)
+    between = first + rng.random(len(first)) * (other - first)
+    return np.where(edge, between, first)
+
+
+def _returned(
+    ranges: Floats, cosines: Floats, sensor: SensorModel, rng: np.random.Generator
+) -> NDArray[np.bool_]:
+    """(N,) which rays come back at all."""
+    slope = (1 - sensor.faint_share) / (sensor.faint_range - sensor.certain_range)
+    far = np.clip(1 - slope * (ranges - sensor.certain_range), 0.0, 1.0)
+    grazing = np.cos(np.radians(sensor.grazing_deg))
+    flat = np.clip(cosines / grazing, 0.0, 1.0) if grazing > 1e-6 else 1.0
+    chance = far * flat * (1 - sensor.loss)
+    arrived: NDArray[np.bool_] = rng.random(len(ranges)) < chance
+    return arrived

@@ -1,0 +1,126 @@
+"""Which tiles truly changed between two scenes, from their surfaces: no scan and no noise is involved."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worker.cloud.tiling import TileGrid
+from worker.cloud.types import Bools, Floats, Indices, Matrix4
+from worker.simulation.scenes.mesh import Mesh
+from worker.simulation.scenes.scene import ChangeKind, Scene, SceneObject
+
+CELL = 0.05  #: metres, the voxel of the fused maps
+SAMPLES_PER_M2 = 4 / 0.025**2  #: four in each square of 2.5 cm, so that hardly a cell is missed
+FAR = 0.075  #: metres; a surface this near to one of the other visit is not new: one and a half voxels
+MIN_CELLS = (
+    40  #: changed cells that make a changed tile: 0.1 m2 of surface, a sheet of A3 paper less a margin
+)
+SEEN_WITHIN = 10.0  #: metres, beyond which hardly a return arrives
+KINDS: tuple[ChangeKind, ...] = ("add", "remove", "move")
+
+
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class TileTruth:
+    """The truth about every tile of a grid."""
+
+    grid: TileGrid
+    cells: NDArray[np.int32]  #: (I, J, K, 3) changed cells of 5 cm, by kind of change as in KINDS
+    min_cells: int
+
+    @property
+    def changed(self) -> Bools:
+        """(I, J, K) whether the tile truly changed."""
+        enough: Bools = self.cells.sum(axis=-1) >= self.min_cells
+        return enough
+
+    def of(self, indices: Indices) -> Bools:
+        """(T,) whether the tiles at these indices (T, 3) truly changed."""
+        wanted: Bools = self.changed[tuple(indices.T)]
+        return wanted
+
+    def kind(self, index: tuple[int, int, int]) -> ChangeKind | None:
+        """The kind with most changed cells in a tile; None if the tile did not change."""
+        return KINDS[int(self.cells[index].argmax())] if self.changed[index] else None
+
+
+def changed_tiles(
+    before: Scene,
+    after: Scene,
+    grid: TileGrid,
+    *,
+    min_cells: int = MIN_CELLS,
+    sensors_before: Sequence[Matrix4] = (),
+    sensors_after: Sequence[Matrix4] = (),
+) -> TileTruth:
+    """Count, in each tile, the cells with a surface that exists in one visit only.
+
+    An added object counts where it stands, a removed one where it stood, a moved one in both places. Surfaces
+    within 7.5 cm of the other visit's count as unchanged, so contact faces drop out by themselves, and what an
+    object hides or uncovers behind it does not count. With sensor poses (world_from_sensor) only surfaces count
+    that a straight line from one of them reaches, in the visit in which they exist.
+    """
+    cells = np.zeros((*grid.shape, len(KINDS)), dtype=np.int32)
+    old = {item.name: item for item in before.objects}
+    new = {item.name: item for item in after.objects}
+    edited = {name for name in old.keys() & new.keys() if not _same(old[name], new[name])}
+    for kind, gone in (("remove", old.keys() - new.keys()), ("move", edited)):
+        surfaces = [old[name].mesh for name in sorted(gone)]
+        _count(cells[..., KINDS.index(kind)], surfaces, before, after, sensors_before, grid)
+    for kind, come in (("add", new.keys() - old.keys()), ("move", edited)):
+        surfaces = [new[name].mesh for name in sorted(come)]
+        _count(cells[..., KINDS.index(kind)], surfaces, after, before, sensors_after, grid)
+    return TileTruth(grid=grid, cells=cells, min_cells=min_cells)
+
+
+def sampled(mesh: Mesh, rng: np.random.Generator) -> Floats:
+    """(N, 3) points uniformly on the surface."""
+    a, b, c = (mesh.vertices[mesh.triangles[:, corner]] for corner in range(3))
+    areas = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+    counts = rng.poisson(areas * SAMPLES_PER_M2)
+    u, v = np.sqrt(rng.random(counts.sum())), rng.random(counts.sum())
+    a, b, c = (np.repeat(corner, counts, axis=0) for corner in (a, b, c))
+    points: Floats = a * (1 - u)[:, None] + b * (u * (1 - v))[:, None] + c * (u * v)[:, None]
+    return points
+
+
+def _count(
+    cells: NDArray[np.int32],
+    surfaces: list[Mesh],
+    own: Scene,
+    other: Scene,
+    sensors: Sequence[Matrix4],
+    grid: TileGrid,
+) -> None:
+    """Add to `cells` (I, J, K) the cells of these surfaces that the other scene does not have."""
+    if not surfaces:
+        return
+    rng = np.random.default_rng(0)
+    points = np.concatenate([sampled(mesh, rng) for mesh in surfaces])
+    distance = other.caster.distances(points)
+    points = points[distance > FAR]
+    if len(sensors):
+        points = points[_reached(points, own, sensors)]
+    voxels = np.unique(np.floor((points - grid.origin) / CELL).astype(np.int64), axis=0)
+    centres = (voxels + 0.5) * CELL
+    tiles = np.floor(centres / grid.size).astype(np.int64)
+    inside = np.all((tiles >= 0) & (tiles < np.array(grid.shape)), axis=1)
+    np.add.at(cells, tuple(tiles[inside].T), 1)
+
+
+def _reached(points: Floats, scene: Scene, sensors: Sequence[Matrix4]) -> Bools:
+    """(N,) whether a straight line from any sensor ends on the point."""
+    reached = np.zeros(len(points), dtype=bool)
+    for world_from_sensor in sensors:
+        rays = points - world_from_sensor[:3, 3]
+        distance = np.linalg.norm(rays, axis=1)
+        hits = scene.caster.cast(world_from_sensor[:3, 3], rays / np.maximum(distance, 1e-9)[:, None])
+        reached |= (hits.ranges > distance - 0.02) & (distance < SEEN_WITHIN)
+    return reached
+
+
+def _same(a: SceneObject, b: SceneObject) -> bool:
+    return a.mesh.vertices.shape == b.mesh.vertices.shape and np.allclose(a.mesh.vertices, b.mesh.vertices)
