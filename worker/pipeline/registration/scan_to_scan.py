@@ -66,7 +66,7 @@ class PairResult:
         values = {name: getattr(self, name) for name in names}
         values["inlier_rmse"] = self.inlier_rmse if np.isfinite(self.inlier_rmse) else None
         return values | {
-            "vouched": self.consistent_with_prior,
+            "consistent_with_prior": self.consistent_with_prior,
             "accepted": self.accepted,
             "target_from_source": self.target_from_source.tolist(),
             "information": self.information.tolist(),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import AliasChoices, BaseModel, ConfigDict, Field
 
 
 class RegistrationSettings(BaseModel):
@@ -27,7 +27,11 @@ class RegistrationSettings(BaseModel):
     )
     search_seeds: int = Field(2, ge=1, description="draws at each resolution")
     min_inlier_ratio: float = Field(
-        0.8, ge=0, le=1, description="share of the overlap on a common surface, both ways"
+        0.8,
+        ge=0,
+        le=1,
+        validation_alias=AliasChoices("min_inlier_ratio", "min_agreement"),  # the API's name for it
+        description="share of the overlap on a common surface, in the worse of both directions",
     )
     min_inlier_ratio_without_prior: float = Field(
         0.85,

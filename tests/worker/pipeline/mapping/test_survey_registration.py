@@ -146,7 +146,7 @@ def test_a_scan_that_sees_a_board_where_the_others_saw_nothing_is_left_out_and_n
 
 def test_a_scan_that_the_others_would_have_elsewhere_is_left_out_and_named(folder: Path) -> None:
     """A map of a bare corridor lets scans slide; the end walls that they saw say that one is a decimetre off."""
-    stays = {"min_constraint": 0.0, "coarse_distances": (), "max_iterations": 2}
+    stays = {"min_eigenvalue": 0.0, "coarse_distances": (), "max_iterations": 2}
     lenient = placing(PRIORS_ONLY.registration.model_copy(update=stays))
     bare = Voxels.of(corridor_points(ends=False, seed=9, half=8.0), size=0.05, origin=np.zeros(3))
     target = surface_of(bare, lenient.registration)

@@ -40,7 +40,7 @@ def test_a_scan_that_fits_as_well_a_decimetre_away_is_left_out(office: Office) -
 
 def test_without_the_question_it_would_be_believed_a_decimetre_off(office: Office) -> None:
     target, scans = office
-    careless = SETTINGS.model_copy(update={"max_rival_distance": np.inf})
+    careless = SETTINGS.model_copy(update={"max_ambiguity_distance": np.inf})
     found = register(
         prepare(as_scan(scans[6].points), SETTINGS), target, start=scans[6].prior, settings=careless
     )

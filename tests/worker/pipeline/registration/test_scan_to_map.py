@@ -118,7 +118,7 @@ def test_a_scan_that_shares_only_a_floor_with_the_map_is_refused(room: Room) -> 
     floor = points[inner & (np.abs(points[:, 2]) < 0.04)]
     target = surface_of(Voxels.of(floor, size=0.05), SETTINGS)
     start = room.after[0].world_from_sensor
-    lenient = {"min_overlap_vouched": 0.05, "min_agreement": 0.5, "prior_distance": 99.0, "prior_angle": 3.2}
+    lenient = {"min_overlap_near_prior": 0.05, "min_inlier_ratio": 0.5, "prior_distance": 99.0, "prior_angle": 3.2}
     settings = SETTINGS.model_copy(update=lenient)
     with pytest.raises(ScanRejected, match="shares with the map leaves a motion free"):
         register(_ready(room.scan()), target, start=start, settings=settings)
@@ -208,7 +208,7 @@ def test_real_scans_of_different_places_are_rejected(shared_data: Path, current:
 
 
 def test_asking_for_more_agreement_is_heeded_with_and_without_a_prior(room: Room) -> None:
-    strict = SETTINGS.model_copy(update={"min_agreement": 1.0, "search_resolutions": ()})
+    strict = SETTINGS.model_copy(update={"min_inlier_ratio": 1.0, "search_resolutions": ()})
     for start in (None, room.after[0].world_from_sensor):
         with pytest.raises(ScanRejected, match="at least 1"):
             register(_ready(room.scan()), room.target, start=start, settings=strict)
