@@ -30,7 +30,7 @@ bench: $(INSTALLED) ## seconds in each stage on a simulated corridor, saved unde
 	$(BIN)/spicd-worker bench
 
 openapi: $(INSTALLED) ## write openapi/openapi.json anew
-	$(BIN)/python -m service.api.schema
+	$(BIN)/python -m service.api.openapi
 
 clean: ## remove the environment and everything made
 	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache *.egg-info build demo bench

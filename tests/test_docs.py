@@ -10,8 +10,8 @@ import pytest
 from pydantic_core import PydanticUndefined
 from rq.timeouts import JobTimeoutException
 
-from service.api.problems import PROBLEMS
-from service.catalog.attempts import WORKER_DIED
+from service.api.http.problems import PROBLEMS
+from service.catalog.jobs import WORKER_DIED
 from service.errors import ServiceError
 from service.settings import Settings
 from worker import rq_workers

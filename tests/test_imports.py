@@ -24,9 +24,22 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "service.settings": (),
     "service.logs": (),
     "service.client": (),
+    "service.tile_features": (),
     "service.catalog": ("service.errors", "service.settings"),
     "service.queue": ("service.catalog.steps", "service.errors"),
-    "service.api": ("service.catalog", "service.queue", "service.errors", "service.settings"),
+    "service.api.http": (
+        "service.catalog",
+        "service.errors",
+        "service.settings",
+    ),
+    "service.api": (
+        "service.api.http",
+        "service.catalog",
+        "service.tile_features",
+        "service.queue",
+        "service.errors",
+        "service.settings",
+    ),
     "service.up": (
         "service.api",
         "service.catalog",
@@ -126,6 +139,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
         "worker.progress",
     ),
     "worker.cli": (
+        "service.tile_features",
         "worker.demo",
         "worker.benchmarks",
         "worker.simulation",
@@ -151,7 +165,14 @@ ONLY_IN = {
 }
 
 #: The files of the worker that know the service; the demo and the rest are in ROOMS.
-KNOWS_THE_SERVICE = ("worker.__main__", "worker.jobs", "worker.rq_jobs", "worker.rq_workers", "worker.demo")
+KNOWS_THE_SERVICE = (
+    "worker.__main__",
+    "worker.jobs",
+    "worker.rq_jobs",
+    "worker.rq_workers",
+    "worker.demo",
+    "worker.cli.compare",
+)
 
 TRAINING_NEEDS = {"torch", "numpy"}
 OPTIONAL_FOR_TRAINING = {"fpsample", "scipy"}  #: imported in a `try`; there is a slower way without
@@ -208,6 +229,7 @@ def test_no_modules_import_each_other_in_a_circle(imports_at_start: Imports) -> 
         ("service/catalog/maps.py", "def f():\n    import torch"),
         ("service/cli/up.py", "import numpy.linalg"),
         ("service/catalog/maps.py", "from service.api import maps"),
+        ("service/api/http/paging.py", "def f():\n    from service.api import maps"),
         ("service/catalog/jobs.py", "from rq import Queue"),
         ("service/client.py", "from ..service import errors"),
         ("worker/pipeline/flow.py", "from service.catalog.jobs import Jobs"),

@@ -10,7 +10,6 @@ import sys
 
 from redis import Redis
 
-from service.catalog.attempts import Attempts
 from service.catalog.database import Database
 from service.catalog.jobs import Jobs
 from service.catalog.records import Problem
@@ -72,12 +71,12 @@ class CatalogRecords:
     def lost(self, job_id: str, how: str) -> bool:
         """Count an attempt; whether to start the step again."""
         with self._database() as database:
-            return Attempts(database).lose(job_id, how)
+            return Jobs(database).lose_attempt(job_id, how)
 
     def stopped(self, job_id: str) -> bool:
         """The step waits for another worker; whether the job still wants it."""
         with self._database() as database:
-            return Attempts(database).put_back(job_id)
+            return Jobs(database).put_back(job_id)
 
     def _database(self) -> contextlib.closing[Database]:
         return contextlib.closing(Database(self._url))

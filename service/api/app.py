@@ -9,15 +9,19 @@ from typing import Any
 
 from fastapi import FastAPI
 from fastapi.concurrency import run_in_threadpool
+from fastapi.openapi.utils import get_openapi
+from pydantic import BaseModel
+from pydantic.json_schema import JsonSchemaMode, models_json_schema
 
-from service.api import anchors, changes, health, jobs, maps, models, problems, scans, surveys, versions
-from service.api.bodies import INCOMING
-from service.api.cards import Cards
-from service.api.incoming import sweep
-from service.api.metrics import Metrics, MetricsMiddleware
-from service.api.schema import describe
-from service.api.services import Queue, Services
-from service.api.submission import resubmit
+from service.api import changes, health, jobs, maps, models, scans, surveys, versions
+from service.api.features import TileCollection
+from service.api.http import problems
+from service.api.http.bodies import INCOMING
+from service.api.http.cards import Cards
+from service.api.http.dependencies import Queue, Services
+from service.api.http.metrics import Metrics, MetricsMiddleware
+from service.api.http.submission import resubmit
+from service.api.http.uploads import sweep
 from service.catalog.catalog import open_catalog
 from service.queue import JobQueue
 from service.settings import Settings
@@ -30,12 +34,46 @@ Every error is a problem document (RFC 9457) with a stable `type`.
 """
 
 
+#: What FastAPI does not see, for it is read or written by hand: bodies of requests, problems, features.
+UNSEEN: dict[JsonSchemaMode, tuple[type[BaseModel], ...]] = {
+    "validation": (
+        scans.ScanRequest,
+        maps.MapRequest,
+        versions.VersionRequest,
+        maps.AnchorRequest,
+        surveys.SurveyRequest,
+        models.TrainingRequest,
+    ),
+    "serialization": (problems.ProblemDocument, TileCollection),
+}
+
+
 class Api(FastAPI):
     """FastAPI with our own description of itself."""
 
     def openapi(self) -> dict[str, Any]:
-        """The OpenAPI document."""
-        return describe(self)
+        """Return the OpenAPI document: what FastAPI derives, and the bodies that are read by hand."""
+        if self.openapi_schema is None:
+            document = get_openapi(
+                title=self.title,
+                version=self.version,
+                summary=self.summary,
+                description=self.description,
+                routes=self.routes,
+                tags=self.openapi_tags,
+            )
+            schemas = document.setdefault("components", {}).setdefault("schemas", {})
+            for mode, unseen in UNSEEN.items():
+                pairs = [(model, mode) for model in unseen]
+                _, derived = models_json_schema(pairs, ref_template="#/components/schemas/{model}")
+                schemas.update(derived["$defs"])
+            for replaced in (
+                "HTTPValidationError",
+                "ValidationError",
+            ):  # a bad value is answered with a problem
+                schemas.pop(replaced, None)
+            self.openapi_schema = document
+        return self.openapi_schema
 
 
 def create_app(settings: Settings, *, queue: Queue | None = None) -> FastAPI:
@@ -50,7 +88,7 @@ def create_app(settings: Settings, *, queue: Queue | None = None) -> FastAPI:
     app.state.metrics = Metrics()
     app.add_middleware(MetricsMiddleware, metrics=app.state.metrics)
     problems.add_handlers(app)
-    for part in (scans, maps, versions, anchors, surveys, changes, jobs, models, health):
+    for part in (scans, maps, versions, surveys, changes, jobs, models, health):
         app.include_router(part.router)
     return app
 
@@ -64,7 +102,7 @@ def _lifespan(settings: Settings, queue: Queue | None) -> Any:
         catalog = await run_in_threadpool(open_catalog, settings)
         await run_in_threadpool(sweep, settings.data_dir / INCOMING)
         app.state.services = Services(
-            settings=settings, catalog=catalog, queue=used, cards=Cards(settings.model_store)
+            settings=settings, catalog=catalog, queue=used, cards=Cards(settings.model_store, catalog.models)
         )
         await run_in_threadpool(resubmit, app.state.services)
         try:

@@ -13,15 +13,14 @@ from fastapi import Request as HttpRequest
 from pydantic import AfterValidator, Field
 
 from service.api import features
-from service.api.documents import Link, link
 from service.api.features import FeatureResponse, feature_response
-from service.api.paging import Cursor, change_cursor, change_position, next_link
-from service.api.problems import documented
-from service.api.requests import Request
-from service.api.services import Provided
-from service.api.values import Id, instant
-from service.catalog.changes import ChangeFilter
-from service.catalog.records import Bounds
+from service.api.http.dependencies import Provided
+from service.api.http.documents import Link, Request, link
+from service.api.http.fields import Id, instant
+from service.api.http.paging import Cursor, decoded, encoded, next_link
+from service.api.http.problems import documented
+from service.catalog.changes import ChangeFilter, ChangePosition
+from service.catalog.records import Bounds, rfc3339
 from service.errors import NotFound
 
 router = APIRouter(tags=["changes"])
@@ -64,7 +63,7 @@ def span_of(interval: str) -> Span:
     return since, until
 
 
-def sound(read: Callable[[str], object]) -> AfterValidator:
+def readable(read: Callable[[str], object]) -> AfterValidator:
     """A text that `read` can read; it stays a text, for a query parameter of many parts is taken for a list."""
 
     def check(text: str) -> str:
@@ -79,11 +78,11 @@ class ChangesRequest(Request):
 
     survey: Annotated[Id | None, Field(description="of this survey only")] = None
     bbox: Annotated[
-        Annotated[str, sound(bounds_of)] | None,
+        Annotated[str, readable(bounds_of)] | None,
         Field(description="map frame, metres; tiles whose box meets it", examples=["0,0,7.5,4.5"]),
     ] = None
     datetime: Annotated[
-        Annotated[str, sound(span_of)] | None,
+        Annotated[str, readable(span_of)] | None,
         Field(
             description="of the visit: RFC 3339 instant, or interval with `..` for an open end",
             examples=["2026-03-01T00:00:00Z/.."],
@@ -116,7 +115,7 @@ def get_changes(
     for nothing found is not the same as no change.
     """
     catalog = services.catalog
-    found = catalog.maps.ready(map_id)
+    anchor = catalog.maps.ready(map_id).anchor
     if asked.survey is not None and catalog.surveys.ready(asked.survey).map_id != map_id:
         raise NotFound(f"survey {asked.survey!r} is not of map {map_id!r}")
     since, until = (None, None) if asked.datetime is None else span_of(asked.datetime)
@@ -129,7 +128,7 @@ def get_changes(
             until=until,
             min_score=asked.min_score,
         ),
-        after=change_position(asked.cursor),
+        after=position_of(asked.cursor),
         limit=asked.limit,
     )
     links = [
@@ -137,5 +136,18 @@ def get_changes(
         link(request, f"/maps/{map_id}", "map"),
     ]
     if page.following is not None:
-        links.append(next_link(request, change_cursor(page.following), features.MEDIA_TYPE))
-    return feature_response(page.items, matched=page.matched, links=links, anchor=found.anchor)
+        links.append(next_link(request, cursor_of(page.following), features.MEDIA_TYPE))
+    return feature_response(page.items, matched=page.matched, links=links, anchor=anchor)
+
+
+def cursor_of(position: ChangePosition) -> str:
+    """Return the cursor behind a change."""
+    return encoded(rfc3339(position.captured_at), position.survey_id, position.score.hex(), position.tile_id)
+
+
+def position_of(cursor: str | None) -> ChangePosition | None:
+    """Return where to go on. Raises BadRequest."""
+    if cursor is None:
+        return None
+    captured_at, survey_id, score, tile_id = decoded(cursor, instant, str, float.fromhex, str)
+    return ChangePosition(captured_at=captured_at, survey_id=survey_id, score=score, tile_id=tile_id)

@@ -1,7 +1,6 @@
-"""Tiles as features: OGC Features and Geometries JSON 1.0 (JSON-FG, OGC 21-045r1), which is GeoJSON as well.
+"""Tiles as documents of the API: `service.tile_features`, checked, and with a footprint on the Earth.
 
-A tile is a Prism in the map's own frame: metres, z up. GeoJSON's `geometry` admits WGS 84 alone (RFC 7946, Section 4): it is
-the footprint at the height of the tile's floor where the map has a geo-anchor, and null where nobody said where it lies.
+The footprint lies at the height of the tile's floor where the map has a geo-anchor, and is null where nobody said where it lies.
 """
 
 from __future__ import annotations
@@ -12,19 +11,21 @@ from typing import Any, Literal
 from fastapi.responses import Response
 from pydantic import Field
 
-from service.api.documents import Document, Link
 from service.api.geodesy import ToWgs84, to_wgs84
-from service.catalog.clock import now, rfc3339
-from service.catalog.records import Anchor, ChangeRecord, TileState, Vector3
+from service.api.http.documents import Document, Link
+from service.catalog.records import Anchor, ChangeRecord, TileState, Vector3, rfc3339
+from service.catalog.tables import now
+from service.tile_features import (
+    CONFORMS_TO,
+    FEATURE_TYPE,
+    MAP_FRAME,
+    Ring,
+    footprint,
+    tile_collection,
+    tile_feature,
+)
 
 MEDIA_TYPE = "application/geo+json"
-CONFORMS_TO = (
-    "http://www.opengis.net/spec/json-fg-1/1.0/conf/core",
-    "http://www.opengis.net/spec/json-fg-1/1.0/conf/prisms",
-)
-FEATURE_TYPE = "spicd-tile"
-#: OGC's name for a local Cartesian frame of three axes in metres, z up (JSON-FG repository, core/crs).
-MAP_FRAME = "http://www.opengis.net/def/crs/OGC/0/Engineering3D"
 
 Position2 = tuple[float, float]
 
@@ -120,52 +121,26 @@ def feature_response(
 ) -> FeatureResponse:
     """A collection of tiles of a map that lies at `anchor`; `matched` counts those of every page."""
     convert = None if anchor is None else to_wgs84(anchor)
-    features = [feature(change, convert) for change in changes]
-    collection = TileCollection(
-        timeStamp=rfc3339(now()),
-        numberMatched=matched,
-        numberReturned=len(features),
-        links=list(links),
-        features=features,
-    )
-    return FeatureResponse(collection.model_dump_json())
+    collection = tile_collection((feature(change, convert) for change in changes), matched=matched)
+    collection |= {"timeStamp": rfc3339(now()), "links": list(links)}
+    return FeatureResponse(TileCollection.model_validate(collection).model_dump_json())
 
 
-def feature(change: ChangeRecord, convert: ToWgs84 | None) -> TileFeature:
-    """One tile of a survey; `convert` takes points of the map frame to the Earth."""
-    tile, captured_at = change.tile, rfc3339(change.captured_at)
-    (x0, y0, z0), (x1, y1, z1) = tile.bounds.min, tile.bounds.max
-    footprint = ((x0, y0), (x1, y0), (x1, y1), (x0, y1), (x0, y0))
-    return TileFeature(
-        id=f"{change.survey_id}.{tile.tile_id}",
-        geometry=None if convert is None else on_earth(footprint, z0, convert),
-        place=Prism(base=Polygon(coordinates=(footprint,)), lower=z0, upper=z1),
-        time=Time(timestamp=captured_at),
-        properties=TileProperties(
-            tile_id=tile.tile_id,
-            tile_index=tile.tile_index,
-            center=(round((x0 + x1) / 2, 6), round((y0 + y1) / 2, 6), round((z0 + z1) / 2, 6)),
-            state=tile.state,
-            score=tile.score,
-            probabilities=tile.probabilities,
-            threshold=change.threshold,
-            n_reference=tile.n_reference,
-            n_current=tile.n_current,
-            map_id=change.map_id,
-            map_version=change.map_version,
-            survey_id=change.survey_id,
-            model=change.model,
-            captured_at=captured_at,
-        ),
+def feature(change: ChangeRecord, convert: ToWgs84 | None) -> dict[str, Any]:
+    """Return one tile of a survey; `convert` takes points of the map frame to the Earth."""
+    tile, (lower, upper) = change.tile, (change.tile.bounds.min, change.tile.bounds.max)
+    survey = change.model_dump(exclude={"tile"}) | {"captured_at": rfc3339(change.captured_at)}
+    geometry = None if convert is None else on_earth(footprint(lower, upper), lower[2], convert)
+    return tile_feature(
+        **tile.model_dump(exclude={"bounds"}), lower=lower, upper=upper, survey=survey, geometry=geometry
     )
 
 
-def on_earth(footprint: Iterable[Position2], lower: float, convert: ToWgs84) -> Footprint:
-    """The footprint in WGS 84, to about a millimetre: 9 decimals of a degree are 0.1 mm."""
-    corners = (convert((x, y, lower)) for x, y in footprint)
-    return Footprint(
-        coordinates=(tuple((round(lon, 9), round(lat, 9), round(height, 3)) for lon, lat, height in corners),)
-    )
+def on_earth(ring: Ring, lower: float, convert: ToWgs84) -> dict[str, Any]:
+    """Return a ring at the height `lower` in WGS 84, to about a millimetre: 9 decimals of a degree are 0.1 mm."""
+    corners = (convert((x, y, lower)) for x, y in ring)
+    coordinates = [[round(lon, 9), round(lat, 9), round(height, 3)] for lon, lat, height in corners]
+    return {"type": "Polygon", "coordinates": [coordinates]}
 
 
 def documented() -> dict[int | str, dict[str, Any]]:

@@ -9,10 +9,10 @@ from typing import Literal
 from fastapi import APIRouter, Request, Response
 from prometheus_client import CONTENT_TYPE_LATEST, generate_latest
 
-from service.api.documents import Document
-from service.api.metrics import Metrics
-from service.api.problems import documented, response
-from service.api.services import Provided
+from service.api.http.dependencies import Provided
+from service.api.http.documents import Document
+from service.api.http.metrics import Metrics
+from service.api.http.problems import documented, response
 
 log = logging.getLogger(__name__)
 router = APIRouter(tags=["health"])
@@ -62,9 +62,9 @@ def ready(services: Provided) -> Ready | Response:
 @router.get("/metrics", summary="Metrics for Prometheus", response_class=Response)
 def metrics(request: Request, services: Provided) -> Response:
     """Requests by route, and jobs by state."""
-    found: Metrics = request.app.state.metrics
-    found.count_jobs(services.catalog.jobs.counts())
-    return Response(generate_latest(found.registry), media_type=CONTENT_TYPE_LATEST)
+    counted: Metrics = request.app.state.metrics
+    counted.count_jobs(services.catalog.jobs.counts())
+    return Response(generate_latest(counted.registry), media_type=CONTENT_TYPE_LATEST)
 
 
 def _check(name: str, ping: Callable[[], None]) -> Check:

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from datetime import datetime
+from typing import Annotated, Literal
 
 from fastapi import APIRouter, Path, Query, Request
+from pydantic import Field
 
-from service.api.documents import Document, JobDocument, Link, job_document
-from service.api.paging import PageRequest, list_links
-from service.api.problems import documented
-from service.api.services import Provided
-from service.api.submission import dismiss
-from service.api.values import Id
-from service.catalog.records import JobStatus
+from service.api.http.dependencies import Provided
+from service.api.http.documents import Document, Link, link
+from service.api.http.fields import Id
+from service.api.http.paging import PageRequest, list_links
+from service.api.http.problems import JobProblem, documented
+from service.api.http.submission import dismiss
+from service.api.models import model_path
+from service.catalog.records import JobRecord, JobStatus
+
+RESULTS = "http://www.opengis.net/def/rel/ogc/1.0/results"  #: OGC 18-062r2, Section 7.11
 
 router = APIRouter(tags=["jobs"])
 JobId = Annotated[Id, Path()]
@@ -23,6 +28,26 @@ class JobsRequest(PageRequest):
 
     status: JobStatus | None = None
     map_id: Id | None = None
+
+
+class JobDocument(Document):
+    """The status of a job (OGC API - Processes - Part 1, statusInfo), with what it works on."""
+
+    jobID: str = Field(examples=["job-5f0c"])  # noqa: N815 - the standard's name
+    processID: Literal["map", "survey", "model"]  # noqa: N815 - the standard's name
+    type: Literal["process"] = "process"
+    status: JobStatus
+    message: str = Field(description="the stage", examples=["registering"])
+    progress: int = Field(ge=0, le=100, examples=[40])
+    created: datetime
+    started: datetime | None
+    finished: datetime | None
+    updated: datetime
+    map_id: str
+    survey_id: str | None
+    model: str | None = Field(description="that a training makes", examples=[None])
+    problem: JobProblem
+    links: list[Link]
 
 
 class JobList(Document):
@@ -60,3 +85,17 @@ def dismiss_job(request: Request, services: Provided, job_id: JobId) -> JobDocum
     keeps its state, so it answers 409.
     """
     return job_document(dismiss(services, job_id), request)
+
+
+def job_document(record: JobRecord, request: Request) -> JobDocument:
+    """Return a job with its links: itself, and its result once there is one."""
+    links = [link(request, f"/jobs/{record.job_id}", "self")]
+    if record.status == "successful":
+        links.append(link(request, _result(record), RESULTS))
+    return JobDocument(jobID=record.job_id, processID=record.kind, links=links, **dict(record))
+
+
+def _result(record: JobRecord) -> str:
+    if record.model is not None:
+        return model_path(record.model)
+    return f"/maps/{record.map_id}" if record.survey_id is None else f"/surveys/{record.survey_id}"

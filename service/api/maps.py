@@ -1,29 +1,107 @@
-"""/maps: reference maps, built by a job."""
+"""/maps: reference maps, built by a job, and where they lie on the Earth."""
 
 from __future__ import annotations
 
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Path, Query, Request, Response
+from fastapi import APIRouter, Path, Query, Response
+from fastapi import Request as HttpRequest
 from fastapi.concurrency import run_in_threadpool
+from pydantic import BeforeValidator, Field
 
-from service.api import bodies, files
-from service.api.bodies import Body
-from service.api.documents import Document, Link, link
-from service.api.files import blob_response
-from service.api.map_documents import AcceptedMap, MapDocument, map_document
-from service.api.paging import PageRequest, list_links
-from service.api.problems import documented
-from service.api.requests import MapRequest, checked
-from service.api.schema import body_of
-from service.api.services import Provided, Services
-from service.api.submission import kept_scans, stop_if_open, submit
-from service.api.values import Id
+from service.api.http import bodies, files
+from service.api.http.bodies import Body
+from service.api.http.dependencies import Provided, Services
+from service.api.http.documents import Document, Link, Request, checked, link
+from service.api.http.fields import Id, Model, Text, from_text
+from service.api.http.files import blob_response
+from service.api.http.paging import PageRequest, list_links
+from service.api.http.problems import BODY, JobProblem, documented
+from service.api.http.submission import ScansRequest, kept_scans, monitor, stop_if_open, submit
 from service.catalog import blob_keys
-from service.catalog.records import JobRecord, MapRecord
+from service.catalog.records import Anchor, Built, JobRecord, MapRecord, MapStatus
 
 router = APIRouter(tags=["maps"])
 MapId = Annotated[Id, Path()]
+
+
+class RegistrationRequest(Request):
+    """Limits of the registration; what is left out keeps its default (paper, Table 1)."""
+
+    max_correspondence_distance: Annotated[float | None, Field(gt=0, le=1, description="metres")] = None
+    min_fitness: Annotated[float | None, Field(ge=0, le=1, description="inlier fraction")] = None
+    max_inlier_rmse: Annotated[float | None, Field(gt=0, le=1, description="metres")] = None
+    max_iterations: Annotated[int | None, Field(ge=1, le=1000, description="of ICP at each gate")] = None
+    min_overlap: Annotated[
+        float | None, Field(ge=0, le=1, description="share of the scan that the map covers")
+    ] = None
+    min_agreement: Annotated[
+        float | None, Field(ge=0, le=1, description="share of the overlap on a common surface")
+    ] = None
+
+
+class MapSettings(Request):
+    """What of a map can be set. Voxel and tile size belong to the model, and so to its card."""
+
+    registration: RegistrationRequest = RegistrationRequest()
+
+
+class AnchorRequest(Request):
+    """Where a map lies on the Earth: the origin of its frame in WGS 84, and how the frame is turned; z points up there."""
+
+    longitude: Annotated[float, Field(ge=-180, le=180, description="degrees, of the origin", examples=[13.4])]
+    latitude: Annotated[float, Field(ge=-90, le=90, description="degrees, of the origin", examples=[52.5])]
+    height: Annotated[
+        float,
+        Field(ge=-1000, le=10_000, description="metres above the ellipsoid, of the origin", examples=[76.2]),
+    ]
+    heading: Annotated[
+        float,
+        Field(
+            ge=0,
+            lt=360,
+            description="degrees, clockwise from true north to the map's x axis; 90: x points east, y north",
+            examples=[90],
+        ),
+    ]
+
+    def anchor(self) -> Anchor:
+        """As the catalog keeps it."""
+        return Anchor(**self.model_dump())
+
+
+class MapRequest(ScansRequest):
+    """A map of scans that were uploaded before, or come with the request."""
+
+    id: Annotated[Id | None, Field(description="left out: the service chooses one")] = None
+    name: Annotated[Text | None, Field(max_length=200, examples=["Lobby, ground floor"])] = None
+    settings: Annotated[MapSettings, BeforeValidator(from_text)] = MapSettings()
+    model: Annotated[Model | None, Field(description="left out: the service's default")] = None
+    anchor: Annotated[
+        Annotated[AnchorRequest, BeforeValidator(from_text)] | None,
+        Field(description="left out: nobody knows where on the Earth it lies"),
+    ] = None
+
+
+class BuiltDocument(Built, Document):
+    """What documents of maps and versions have in common."""
+
+    links: list[Link]
+
+
+class MapDocument(MapRecord, BuiltDocument):
+    """A reference map as its version in use: the newest that is ready, and the newest where none is."""
+
+    problem: JobProblem  # type: ignore[assignment]  # as RFC 9457 has it
+
+
+class AcceptedMap(Document):
+    """A map that is going to be built."""
+
+    map_id: str = Field(examples=["lobby"])
+    job_id: str = Field(examples=["job-5f0c"])
+    status: MapStatus
+    links: list[Link]
 
 
 class MapList(Document):
@@ -37,42 +115,30 @@ class MapList(Document):
     "/maps",
     status_code=202,
     summary="Build a map",
-    responses=documented(
-        "incomplete_body",
-        "not_found",
-        "conflict",
-        "too_large",
-        "wrong_media_type",
-        "bad_request",
-        "invalid_request",
-        "scan_unreadable",
-        "queue_unavailable",
-    ),
-    openapi_extra=body_of(json=MapRequest, form=MapRequest, file="scans"),
+    responses=documented(*BODY, "not_found", "conflict", "scan_unreadable", "queue_unavailable"),
+    openapi_extra=bodies.documented(json=MapRequest, form=MapRequest, file="scans"),
 )
-async def create_map(request: Request, response: Response, services: Provided) -> AcceptedMap:
+async def create_map(request: HttpRequest, response: Response, services: Provided) -> AcceptedMap:
     """From scans uploaded before (`scan_ids`) or sent here (`scans`); their poses, where given, set the frame of the map."""
     async with bodies.received(
         request, services.settings, takes=(bodies.JSON, bodies.FORM), files="scans"
     ) as body:
         wanted = checked(MapRequest, body.fields)
         record, job = await run_in_threadpool(_create, services, wanted, body)
-    monitor = link(request, f"/jobs/{job.job_id}", "monitor")
-    response.headers["Location"] = monitor.href
-    here = link(request, f"/maps/{record.map_id}", "self")
-    return AcceptedMap(map_id=record.map_id, job_id=job.job_id, status=record.status, links=[here, monitor])
+    links = [link(request, f"/maps/{record.map_id}", "self"), monitor(request, response, job)]
+    return AcceptedMap(map_id=record.map_id, job_id=job.job_id, status=record.status, links=links)
 
 
 @router.get("/maps", summary="List maps", responses=documented("invalid_request", "bad_request"))
-def list_maps(request: Request, services: Provided, asked: Annotated[PageRequest, Query()]) -> MapList:
+def list_maps(request: HttpRequest, services: Provided, asked: Annotated[PageRequest, Query()]) -> MapList:
     """Newest first."""
     page = services.catalog.maps.page(after=asked.after(), limit=asked.limit)
-    links = list_links(request, page, lambda found: (found.created, found.map_id))
-    return MapList(maps=[map_document(found, request) for found in page.items], links=links)
+    links = list_links(request, page, lambda record: (record.created, record.map_id))
+    return MapList(maps=[map_document(record, request) for record in page.items], links=links)
 
 
 @router.get("/maps/{map_id}", summary="Look at a map", responses=documented("not_found", "invalid_request"))
-def get_map(request: Request, services: Provided, map_id: MapId) -> MapDocument:
+def get_map(request: HttpRequest, services: Provided, map_id: MapId) -> MapDocument:
     """Its version in use: state, what became of each scan, and extent and counts once it is ready.
 
     A map stays `ready` while a newer version builds, and when that fails; see its versions.
@@ -89,7 +155,7 @@ def get_map(request: Request, services: Provided, map_id: MapId) -> MapDocument:
 def delete_map(services: Provided, map_id: MapId) -> None:
     """With its versions, surveys, jobs and files; jobs that still run are stopped first. Its scans stay."""
     services.catalog.maps.get(map_id)
-    for job in services.catalog.jobs.open_of(map_id):
+    for job in services.catalog.jobs.unfinished(map_id):
         stop_if_open(services, job.job_id)
     services.catalog.maps.delete(map_id)
 
@@ -105,9 +171,7 @@ def delete_map(services: Provided, map_id: MapId) -> None:
 )
 def get_manifest(services: Provided, map_id: MapId) -> Response:
     """Tile size, bounds, and every tile that is kept."""
-    found = services.catalog.maps.ready(map_id)
-    key = blob_keys.map_manifest(found.job_id)
-    return blob_response(services.catalog.blobs, key, media_type="application/json")
+    return manifest_response(services, services.catalog.maps.ready(map_id).job_id)
 
 
 @router.get(
@@ -121,25 +185,38 @@ def get_manifest(services: Provided, map_id: MapId) -> Response:
 )
 def get_map_cloud(services: Provided, map_id: MapId) -> Response:
     """The fused reference map, in metres."""
-    found = services.catalog.maps.ready(map_id)
-    return blob_response(
-        services.catalog.blobs,
-        blob_keys.map_cloud(found.job_id),
-        media_type=bodies.RAW,
-        filename=f"{map_id}.ply",
-    )
+    return cloud_response(services, services.catalog.maps.ready(map_id).job_id, f"{map_id}.ply")
+
+
+@router.put(
+    "/maps/{map_id}/anchor",
+    summary="Say where a map lies on the Earth",
+    responses=documented(*BODY, "not_found"),
+    openapi_extra=bodies.documented(json=AnchorRequest),
+)
+async def put_anchor(request: HttpRequest, services: Provided, map_id: MapId) -> MapDocument:
+    """From now on every feature of the map, old or new, carries its footprint in WGS 84 as `geometry`."""
+    async with bodies.received(request, services.settings, takes=(bodies.JSON,), files="") as body:
+        wanted = checked(AnchorRequest, body.fields)
+    record = await run_in_threadpool(services.catalog.maps.set_anchor, map_id, wanted.anchor())
+    return map_document(record, request)
+
+
+@router.delete(
+    "/maps/{map_id}/anchor",
+    status_code=204,
+    summary="Take a map off the Earth",
+    responses=documented("not_found", "invalid_request"),
+)
+def delete_anchor(services: Provided, map_id: MapId) -> None:
+    """Features have no `geometry` then; once more changes nothing."""
+    services.catalog.maps.set_anchor(map_id, None)
 
 
 def _create(services: Services, wanted: MapRequest, body: Body) -> tuple[MapRecord, JobRecord]:
     catalog = services.catalog
-    model = services.cards.check(wanted.model or services.settings.model)
-    with kept_scans(
-        catalog,
-        body.uploads,
-        wanted.scan_ids,
-        device_id=wanted.device_id,
-        captured_at=wanted.captured_at,
-    ) as scan_ids:
+    model = services.cards.check_released(wanted.model or services.settings.model)
+    with kept_scans(catalog, body, wanted) as scan_ids:
         record, job = catalog.maps.create(
             scan_ids=scan_ids,
             model=model,
@@ -150,3 +227,38 @@ def _create(services: Services, wanted: MapRequest, body: Body) -> tuple[MapReco
         )
         submit(services, job, forget=lambda: catalog.maps.delete(record.map_id))
     return record, job
+
+
+def map_document(record: MapRecord, request: HttpRequest) -> MapDocument:
+    """Return a map with its links."""
+    here = f"/maps/{record.map_id}"
+    links = [
+        link(request, here, "self"),
+        link(request, f"/jobs/{record.job_id}", "monitor"),
+        link(request, f"{here}/versions", "version-history"),
+    ]
+    if record.status == "ready":
+        links += [
+            *file_links(request, here),
+            link(request, f"{here}/changes", "changes", "application/geo+json"),
+        ]
+    return MapDocument(**dict(record), links=links)
+
+
+def file_links(request: HttpRequest, here: str) -> list[Link]:
+    """Return the links to the files of a map, or of a version of one, that lies at `here`."""
+    return [
+        link(request, f"{here}/manifest", "manifest"),
+        link(request, f"{here}/cloud.ply", "cloud", bodies.RAW),
+    ]
+
+
+def manifest_response(services: Services, job_id: str) -> Response:
+    """Answer with the tile manifest of the version that a job built."""
+    return blob_response(services.catalog.blobs, blob_keys.map_manifest(job_id), media_type=bodies.JSON)
+
+
+def cloud_response(services: Services, job_id: str, filename: str) -> Response:
+    """Answer with the cloud of the version that a job built."""
+    key = blob_keys.map_cloud(job_id)
+    return blob_response(services.catalog.blobs, key, media_type=bodies.RAW, filename=filename)

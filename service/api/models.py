@@ -9,14 +9,12 @@ from fastapi import Request as HttpRequest
 from fastapi.concurrency import run_in_threadpool
 from pydantic import Field
 
-from service.api import bodies, site_models
-from service.api.documents import Document, Link, link, model_path
-from service.api.problems import documented
-from service.api.requests import Request, TrainingRequest, checked
-from service.api.schema import body_of
-from service.api.services import Provided, Services
-from service.api.submission import submit
-from service.api.values import Id
+from service.api.http import bodies
+from service.api.http.dependencies import Provided, Services
+from service.api.http.documents import Document, Link, Request, checked, link
+from service.api.http.fields import Id, Model
+from service.api.http.problems import BODY, documented
+from service.api.http.submission import monitor, submit
 from service.catalog.models import name_for
 from service.catalog.records import JobRecord, ModelRecord, ModelStatus
 from service.errors import BadRequest, Conflict
@@ -24,6 +22,26 @@ from service.errors import BadRequest, Conflict
 router = APIRouter(tags=["models"])
 
 Part = Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]{1,64}$")]
+
+
+class TrainingRequest(Request):
+    """A model to train on a map, without any label."""
+
+    name: Annotated[
+        Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$")] | None,
+        Field(description="left out: the map's id and `-net`; versions are counted", examples=["lobby-net"]),
+    ] = None
+    base: Annotated[Model | None, Field(description="train this one further; left out: from nothing")] = None
+    minutes: Annotated[
+        float | None,
+        Field(
+            gt=0,
+            description="of training, at most; left out: `SPICD_TRAINING_MINUTES`; no more than `SPICD_MAX_TRAINING_MINUTES`",
+        ),
+    ] = None
+    epochs: Annotated[
+        int | None, Field(ge=1, le=1000, description="at most; left out: as many as the minutes allow")
+    ] = None
 
 
 class ModelList(Document):
@@ -55,18 +73,8 @@ class AcceptedModel(Document):
     "/maps/{map_id}/models",
     status_code=202,
     summary="Train a model on a map",
-    responses=documented(
-        "incomplete_body",
-        "not_found",
-        "not_ready",
-        "conflict",
-        "too_large",
-        "wrong_media_type",
-        "bad_request",
-        "invalid_request",
-        "queue_unavailable",
-    ),
-    openapi_extra=body_of(json=TrainingRequest),
+    responses=documented(*BODY, "not_found", "not_ready", "conflict", "queue_unavailable"),
+    openapi_extra=bodies.documented(json=TrainingRequest),
 )
 async def train_model(
     request: HttpRequest, response: Response, services: Provided, map_id: Annotated[Id, Path()]
@@ -78,8 +86,6 @@ async def train_model(
     async with bodies.received(request, services.settings, takes=(bodies.JSON,), files="") as body:
         wanted = checked(TrainingRequest, body.fields)
     record, job = await run_in_threadpool(_create, services, map_id, wanted)
-    monitor = link(request, f"/jobs/{job.job_id}", "monitor")
-    response.headers["Location"] = monitor.href
     return AcceptedModel(
         model=record.model,
         map_id=map_id,
@@ -87,14 +93,14 @@ async def train_model(
         minutes=record.minutes,
         job_id=job.job_id,
         status=record.status,
-        links=[link(request, model_path(record.model), "self"), monitor],
+        links=[link(request, model_path(record.model), "self"), monitor(request, response, job)],
     )
 
 
 @router.get("/models", summary="List models")
 def list_models(services: Provided) -> ModelList:
     """Every card: what a model is, how it was made and measured, and what it needs."""
-    return ModelList(models=site_models.all_cards(services), default=services.settings.model)
+    return ModelList(models=services.cards.all(), default=services.settings.model)
 
 
 @router.get(
@@ -106,7 +112,7 @@ def get_model(
     services: Provided, name: Annotated[Part, Path()], asked: Annotated[ModelRequest, Query()]
 ) -> dict[str, Any]:
     """The card of a model."""
-    return site_models.card_of(services, name, asked.version)
+    return services.cards.of(name, asked.version)
 
 
 def _create(services: Services, map_id: str, wanted: TrainingRequest) -> tuple[ModelRecord, JobRecord]:
@@ -116,14 +122,20 @@ def _create(services: Services, map_id: str, wanted: TrainingRequest) -> tuple[M
         raise BadRequest(f"a training of {minutes:g} minutes is asked for, at most {most:g} are given")
     catalog.maps.ready(map_id)
     name = wanted.name or name_for(map_id)
-    if any(card.get("name") == name for card in services.cards.all()):
+    if any(card.get("name") == name for card in services.cards.released()):
         raise Conflict(f"the name {name!r} is that of a model in the model store; choose another")
     record, job = catalog.models.create(
         map_id,
         name=name,
-        base=None if wanted.base is None else site_models.check(services, wanted.base),
+        base=None if wanted.base is None else services.cards.check(wanted.base),
         minutes=minutes,
         epochs=wanted.epochs,
     )
     submit(services, job, forget=lambda: catalog.models.take_back(job.job_id))
     return record, job
+
+
+def model_path(model: str) -> str:
+    """Return where the card of `name/version` is."""
+    name, version = model.split("/")
+    return f"/models/{name}?version={version}"

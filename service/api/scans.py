@@ -4,23 +4,50 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from fastapi import APIRouter, Path, Query, Request, Response
+from fastapi import APIRouter, Path, Query, Response
+from fastapi import Request as HttpRequest
 from fastapi.concurrency import run_in_threadpool
+from pydantic import Field
 
-from service.api import bodies
-from service.api.bodies import Body
-from service.api.documents import Document, Link, ScanDocument, scan_document
-from service.api.paging import PageRequest, list_links
-from service.api.problems import documented
-from service.api.requests import ScanQuery, ScanRequest, checked
-from service.api.schema import body_of
-from service.api.services import Provided
-from service.api.values import Id
+from service.api.http import bodies
+from service.api.http.bodies import Body
+from service.api.http.dependencies import Provided
+from service.api.http.documents import Document, Link, Request, checked
+from service.api.http.fields import DeviceId, Id, Instant, Pose, Text
+from service.api.http.paging import PageRequest, list_links
+from service.api.http.problems import BODY, documented
 from service.catalog.catalog import Catalog
 from service.catalog.records import ScanRecord
 from service.errors import BadRequest
 
 router = APIRouter(tags=["scans"])
+
+
+class ScanQuery(Request):
+    """What may be said of one scan beside its raw bytes; `ScanRequest` is the same, checked further."""
+
+    filename: Annotated[
+        str | None,
+        Field(max_length=255, description="shown again, and names the file in errors", examples=["hall.pcd"]),
+    ] = None
+    captured_at: Annotated[Instant | None, Field(description="RFC 3339")] = None
+    device_id: DeviceId | None = None
+    pose: Annotated[str | None, Field(description="JSON: 4x4 row-major, map_from_sensor")] = None
+
+
+class ScanRequest(Request):
+    """What may be said of one scan."""
+
+    filename: Annotated[Text | None, Field(max_length=255, examples=["hall.pcd"])] = None
+    captured_at: Annotated[Instant | None, Field(description="RFC 3339")] = None
+    device_id: DeviceId | None = None
+    pose: Annotated[
+        Pose | None, Field(description="4x4 row-major, map_from_sensor; a start for the registration")
+    ] = None
+
+
+class ScanDocument(ScanRecord, Document):
+    """One uploaded scan."""
 
 
 class ScanList(Document):
@@ -36,20 +63,12 @@ class ScanList(Document):
     summary="Upload a scan",
     responses={
         200: {"model": ScanDocument, "description": "The same bytes from the same device were here already"},
-        **documented(
-            "incomplete_body",
-            "conflict",
-            "too_large",
-            "wrong_media_type",
-            "bad_request",
-            "invalid_request",
-            "scan_unreadable",
-        ),
+        **documented(*BODY, "conflict", "scan_unreadable"),
     },
-    openapi_extra=body_of(raw=True, form=ScanRequest, file="file"),
+    openapi_extra=bodies.documented(raw=True, form=ScanRequest, file="file"),
 )
 async def upload_scan(
-    request: Request,
+    request: HttpRequest,
     response: Response,
     services: Provided,
     asked: Annotated[ScanQuery, Query()],
@@ -60,8 +79,8 @@ async def upload_scan(
     are one scan: sent again with another `pose` or `captured_at`, it is corrected while no map or survey rests on it,
     and refused (409) once one does.
     """
-    said = asked.model_dump(exclude_none=True)
-    checked(ScanRequest, said, place="query")  # before a long upload
+    query = asked.model_dump(exclude_none=True)
+    checked(ScanRequest, query, place="query")  # before a long upload
     async with bodies.received(
         request,
         services.settings,
@@ -69,19 +88,19 @@ async def upload_scan(
         files="file",
         filename=asked.filename,
     ) as body:
-        told = checked(ScanRequest, {**said, **body.fields})
-        record, is_new = await run_in_threadpool(_keep, services.catalog, body, told)
+        wanted = checked(ScanRequest, {**query, **body.fields})
+        record, is_new = await run_in_threadpool(_keep, services.catalog, body, wanted)
     response.status_code = 201 if is_new else 200
     response.headers["Location"] = f"{request.scope.get('root_path', '')}/scans/{record.scan_id}"
-    return scan_document(record)
+    return ScanDocument.of_row(record)
 
 
 @router.get("/scans", summary="List scans", responses=documented("invalid_request", "bad_request"))
-def list_scans(request: Request, services: Provided, asked: Annotated[PageRequest, Query()]) -> ScanList:
+def list_scans(request: HttpRequest, services: Provided, asked: Annotated[PageRequest, Query()]) -> ScanList:
     """Newest first."""
     page = services.catalog.scans.page(after=asked.after(), limit=asked.limit)
     links = list_links(request, page, lambda scan: (scan.created, scan.scan_id))
-    return ScanList(scans=[scan_document(scan) for scan in page.items], links=links)
+    return ScanList(scans=[ScanDocument.of_row(scan) for scan in page.items], links=links)
 
 
 @router.get(
@@ -89,7 +108,7 @@ def list_scans(request: Request, services: Provided, asked: Annotated[PageReques
 )
 def get_scan(services: Provided, scan_id: Annotated[Id, Path()]) -> ScanDocument:
     """What is known of one scan."""
-    return scan_document(services.catalog.scans.get(scan_id))
+    return ScanDocument.of_row(services.catalog.scans.get(scan_id))
 
 
 @router.delete(
@@ -103,20 +122,20 @@ def delete_scan(services: Provided, scan_id: Annotated[Id, Path()]) -> None:
     services.catalog.scans.delete(scan_id)
 
 
-def _keep(catalog: Catalog, body: Body, said: ScanRequest) -> tuple[ScanRecord, bool]:
+def _keep(catalog: Catalog, body: Body, wanted: ScanRequest) -> tuple[ScanRecord, bool]:
     if len(body.uploads) != 1:
         raise BadRequest(f"{len(body.uploads)} files in the form; send one, in the field 'file'")
     upload = body.uploads[0]
     record, is_new = catalog.scans.add(
         upload.path,
-        filename=said.filename or upload.filename,
+        filename=wanted.filename or upload.filename,
         format=upload.format,
         size=upload.size,
         sha256=upload.sha256,
-        device_id=said.device_id,
-        captured_at=said.captured_at,
-        pose=said.pose,
+        device_id=wanted.device_id,
+        captured_at=wanted.captured_at,
+        pose=wanted.pose,
     )
     if not is_new:
-        record = catalog.scans.correct(record.scan_id, captured_at=said.captured_at, pose=said.pose)
+        record = catalog.scans.correct(record.scan_id, captured_at=wanted.captured_at, pose=wanted.pose)
     return record, is_new

@@ -4,27 +4,56 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from fastapi import APIRouter, Path, Query, Request, Response
+from fastapi import APIRouter, Path, Query, Response
+from fastapi import Request as HttpRequest
 from fastapi.concurrency import run_in_threadpool
+from pydantic import Field
 
-from service.api import bodies, features, files, site_models
-from service.api.bodies import Body
-from service.api.documents import AcceptedSurvey, Document, Link, SurveyDocument, link, survey_document
+from service.api import features
 from service.api.features import FeatureResponse, feature_response
-from service.api.files import blob_response
-from service.api.paging import PageRequest, list_links
-from service.api.problems import documented
-from service.api.requests import SurveyRequest, checked
-from service.api.schema import body_of
-from service.api.services import Provided, Services
-from service.api.submission import kept_scans, stop_if_open, submit
-from service.api.values import Id
+from service.api.http import bodies, files
+from service.api.http.bodies import Body
+from service.api.http.dependencies import Provided, Services
+from service.api.http.documents import Document, Link, checked, link
+from service.api.http.fields import DeviceId, Id, Instant, Model
+from service.api.http.files import blob_response
+from service.api.http.paging import PageRequest, list_links
+from service.api.http.problems import BODY, JobProblem, documented
+from service.api.http.submission import ScansRequest, kept_scans, monitor, stop_if_open, submit
 from service.catalog import blob_keys
-from service.catalog.records import JobRecord, MapRecord, SurveyRecord
+from service.catalog.records import JobRecord, MapRecord, SurveyRecord, SurveyStatus
 
 router = APIRouter(tags=["surveys"])
 MapId = Annotated[Id, Path()]
 SurveyId = Annotated[Id, Path()]
+
+
+class SurveyRequest(ScansRequest):
+    """A visit to compare with a map, of scans that were uploaded before, or come with the request."""
+
+    captured_at: Annotated[Instant | None, Field(description="left out: the latest of its scans")] = None
+    device_id: DeviceId | None = None
+    model: Annotated[Model | None, Field(description="left out: the model of the map")] = None
+    threshold: Annotated[
+        float | None, Field(ge=0, le=1, description="probability of change; left out: the model's own")
+    ] = None
+
+
+class SurveyDocument(SurveyRecord, Document):
+    """A survey and what became of its scans."""
+
+    problem: JobProblem  # type: ignore[assignment]  # as RFC 9457 has it
+    links: list[Link]
+
+
+class AcceptedSurvey(Document):
+    """A survey that is going to be compared."""
+
+    survey_id: str = Field(examples=["survey-91c4"])
+    map_id: str = Field(examples=["lobby"])
+    job_id: str = Field(examples=["job-5f0c"])
+    status: SurveyStatus
+    links: list[Link]
 
 
 class SurveyList(Document):
@@ -38,21 +67,11 @@ class SurveyList(Document):
     "/maps/{map_id}/surveys",
     status_code=202,
     summary="Compare a visit with a map",
-    responses=documented(
-        "incomplete_body",
-        "not_found",
-        "not_ready",
-        "too_large",
-        "wrong_media_type",
-        "bad_request",
-        "invalid_request",
-        "scan_unreadable",
-        "queue_unavailable",
-    ),
-    openapi_extra=body_of(json=SurveyRequest, form=SurveyRequest, file="scans"),
+    responses=documented(*BODY, "not_found", "not_ready", "scan_unreadable", "queue_unavailable"),
+    openapi_extra=bodies.documented(json=SurveyRequest, form=SurveyRequest, file="scans"),
 )
 async def create_survey(
-    request: Request, response: Response, services: Provided, map_id: MapId
+    request: HttpRequest, response: Response, services: Provided, map_id: MapId
 ) -> AcceptedSurvey:
     """Of scans uploaded before (`scan_ids`) or sent here (`scans`), with the version of the map that is in use now."""
     reference = await run_in_threadpool(services.catalog.maps.ready, map_id)  # before a long upload
@@ -61,14 +80,12 @@ async def create_survey(
     ) as body:
         wanted = checked(SurveyRequest, body.fields)
         record, job = await run_in_threadpool(_create, services, reference, wanted, body)
-    monitor = link(request, f"/jobs/{job.job_id}", "monitor")
-    response.headers["Location"] = monitor.href
     return AcceptedSurvey(
         survey_id=record.survey_id,
         map_id=map_id,
         job_id=job.job_id,
         status=record.status,
-        links=[link(request, f"/surveys/{record.survey_id}", "self"), monitor],
+        links=[link(request, f"/surveys/{record.survey_id}", "self"), monitor(request, response, job)],
     )
 
 
@@ -78,19 +95,19 @@ async def create_survey(
     responses=documented("not_found", "invalid_request", "bad_request"),
 )
 def list_surveys(
-    request: Request, services: Provided, map_id: MapId, asked: Annotated[PageRequest, Query()]
+    request: HttpRequest, services: Provided, map_id: MapId, asked: Annotated[PageRequest, Query()]
 ) -> SurveyList:
     """Of one map, newest first."""
     services.catalog.maps.get(map_id)
     page = services.catalog.surveys.page(map_id, after=asked.after(), limit=asked.limit)
-    links = list_links(request, page, lambda found: (found.created, found.survey_id))
-    return SurveyList(surveys=[survey_document(found, request) for found in page.items], links=links)
+    links = list_links(request, page, lambda record: (record.created, record.survey_id))
+    return SurveyList(surveys=[survey_document(record, request) for record in page.items], links=links)
 
 
 @router.get(
     "/surveys/{survey_id}", summary="Look at a survey", responses=documented("not_found", "invalid_request")
 )
-def get_survey(request: Request, services: Provided, survey_id: SurveyId) -> SurveyDocument:
+def get_survey(request: HttpRequest, services: Provided, survey_id: SurveyId) -> SurveyDocument:
     """Its state, what became of each scan, and the tiles in each state once it is ready."""
     return survey_document(services.catalog.surveys.get(survey_id), request)
 
@@ -117,7 +134,7 @@ def delete_survey(services: Provided, survey_id: SurveyId) -> None:
     response_model=None,
     responses={**features.documented(), **documented("not_found", "not_ready", "invalid_request")},
 )
-def get_tiles(request: Request, services: Provided, survey_id: SurveyId) -> FeatureResponse:
+def get_tiles(request: HttpRequest, services: Provided, survey_id: SurveyId) -> FeatureResponse:
     """Unchanged, changed, inconsistent and unobserved tiles alike."""
     survey = services.catalog.surveys.ready(survey_id)
     anchor = services.catalog.maps.get(survey.map_id).anchor
@@ -165,14 +182,8 @@ def _create(
     services: Services, reference: MapRecord, wanted: SurveyRequest, body: Body
 ) -> tuple[SurveyRecord, JobRecord]:
     catalog = services.catalog
-    model = site_models.check(services, wanted.model or reference.model)
-    with kept_scans(
-        catalog,
-        body.uploads,
-        wanted.scan_ids,
-        device_id=wanted.device_id,
-        captured_at=wanted.captured_at,
-    ) as scan_ids:
+    model = services.cards.check(wanted.model or reference.model)
+    with kept_scans(catalog, body, wanted) as scan_ids:
         record, job = catalog.surveys.create(
             reference.map_id,
             scan_ids=scan_ids,
@@ -183,3 +194,20 @@ def _create(
         )
         submit(services, job, forget=lambda: catalog.surveys.delete(record.survey_id))
     return record, job
+
+
+def survey_document(record: SurveyRecord, request: HttpRequest) -> SurveyDocument:
+    """Return a survey with its links."""
+    here = f"/surveys/{record.survey_id}"
+    links = [
+        link(request, here, "self"),
+        link(request, f"/jobs/{record.job_id}", "monitor"),
+        link(request, f"/maps/{record.map_id}", "map"),
+    ]
+    if record.status == "ready":
+        links += [
+            link(request, f"{here}/tiles", "tiles", features.MEDIA_TYPE),
+            link(request, f"{here}/cloud.ply", "cloud", bodies.RAW),
+            link(request, f"{here}/picture.png", "preview", "image/png"),
+        ]
+    return SurveyDocument(**dict(record), links=links)

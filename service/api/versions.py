@@ -4,27 +4,48 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Path, Query, Request, Response
+from fastapi import APIRouter, Path, Query, Response
+from fastapi import Request as HttpRequest
 from fastapi.concurrency import run_in_threadpool
+from pydantic import Field
 
-from service.api import bodies, files
-from service.api.bodies import Body
-from service.api.documents import Document, Link, link
-from service.api.files import blob_response
-from service.api.map_documents import AcceptedVersion, VersionDocument, version_document
-from service.api.paging import PageRequest, list_links
-from service.api.problems import documented
-from service.api.requests import VersionRequest, checked
-from service.api.schema import body_of
-from service.api.services import Provided, Services
-from service.api.submission import kept_scans, submit
-from service.api.values import Id
-from service.catalog import blob_keys
-from service.catalog.records import JobRecord, VersionRecord
+from service.api.http import bodies, files
+from service.api.http.bodies import Body
+from service.api.http.dependencies import Provided, Services
+from service.api.http.documents import Document, Link, checked, link
+from service.api.http.fields import Id
+from service.api.http.paging import PageRequest, list_links
+from service.api.http.problems import BODY, JobProblem, documented
+from service.api.http.submission import ScansRequest, kept_scans, monitor, submit
+from service.api.maps import BuiltDocument, MapId, cloud_response, file_links, manifest_response
+from service.catalog.records import JobRecord, MapStatus, VersionRecord
 
 router = APIRouter(tags=["versions"])
-MapId = Annotated[Id, Path()]
 Number = Annotated[int, Path(ge=1, lt=1 << 31, examples=[1])]
+
+
+class VersionRequest(ScansRequest):
+    """A version of a map: of further scans, or of a survey that was accepted."""
+
+    survey_id: Annotated[
+        Id | None, Field(description="take over what this survey found changed; then without scans")
+    ] = None
+
+
+class VersionDocument(VersionRecord, BuiltDocument):
+    """One state of a map, and what it was made from."""
+
+    problem: JobProblem  # type: ignore[assignment]  # as RFC 9457 has it
+
+
+class AcceptedVersion(Document):
+    """A version of a map that is going to be built; the one in use stays in use until then."""
+
+    map_id: str = Field(examples=["lobby"])
+    version: int = Field(examples=[2])
+    job_id: str = Field(examples=["job-5f0c"])
+    status: MapStatus
+    links: list[Link]
 
 
 class VersionList(Document):
@@ -38,22 +59,11 @@ class VersionList(Document):
     "/maps/{map_id}/versions",
     status_code=202,
     summary="Build a new version of a map",
-    responses=documented(
-        "incomplete_body",
-        "not_found",
-        "not_ready",
-        "conflict",
-        "too_large",
-        "wrong_media_type",
-        "bad_request",
-        "invalid_request",
-        "scan_unreadable",
-        "queue_unavailable",
-    ),
-    openapi_extra=body_of(json=VersionRequest, form=VersionRequest, file="scans"),
+    responses=documented(*BODY, "not_found", "not_ready", "conflict", "scan_unreadable", "queue_unavailable"),
+    openapi_extra=bodies.documented(json=VersionRequest, form=VersionRequest, file="scans"),
 )
 async def create_version(
-    request: Request, response: Response, services: Provided, map_id: MapId
+    request: HttpRequest, response: Response, services: Provided, map_id: MapId
 ) -> AcceptedVersion:
     """From the version in use and further scans (`scan_ids`, or files in `scans`), or an accepted survey (`survey_id`).
 
@@ -66,15 +76,13 @@ async def create_version(
     ) as body:
         wanted = checked(VersionRequest, body.fields)
         record, job = await run_in_threadpool(_create, services, map_id, wanted, body)
-    monitor = link(request, f"/jobs/{job.job_id}", "monitor")
-    response.headers["Location"] = monitor.href
     here = link(request, f"/maps/{map_id}/versions/{record.version}", "self")
     return AcceptedVersion(
         map_id=map_id,
         version=record.version,
         job_id=job.job_id,
         status=record.status,
-        links=[here, monitor, link(request, f"/maps/{map_id}", "map")],
+        links=[here, monitor(request, response, job), link(request, f"/maps/{map_id}", "map")],
     )
 
 
@@ -84,12 +92,12 @@ async def create_version(
     responses=documented("not_found", "invalid_request", "bad_request"),
 )
 def list_versions(
-    request: Request, services: Provided, map_id: MapId, asked: Annotated[PageRequest, Query()]
+    request: HttpRequest, services: Provided, map_id: MapId, asked: Annotated[PageRequest, Query()]
 ) -> VersionList:
     """Newest first; the first in the list that is `ready` is the one in use."""
     page = services.catalog.versions.page(map_id, after=asked.after(), limit=asked.limit)
-    links = list_links(request, page, lambda found: (found.created, found.job_id))
-    return VersionList(versions=[version_document(found, request) for found in page.items], links=links)
+    links = list_links(request, page, lambda record: (record.created, record.job_id))
+    return VersionList(versions=[version_document(record, request) for record in page.items], links=links)
 
 
 @router.get(
@@ -97,7 +105,7 @@ def list_versions(
     summary="Look at a version of a map",
     responses=documented("not_found", "invalid_request"),
 )
-def get_version(request: Request, services: Provided, map_id: MapId, number: Number) -> VersionDocument:
+def get_version(request: HttpRequest, services: Provided, map_id: MapId, number: Number) -> VersionDocument:
     """Its state, what it was made from, what became of each scan, and its extent and counts once it is ready."""
     return version_document(services.catalog.versions.get(map_id, number), request)
 
@@ -127,9 +135,7 @@ def delete_version(services: Provided, map_id: MapId, number: Number) -> None:
 )
 def get_version_manifest(services: Provided, map_id: MapId, number: Number) -> Response:
     """Tile size, bounds, and every tile that is kept; a place has the same tile id in every version."""
-    found = services.catalog.versions.ready(map_id, number)
-    key = blob_keys.map_manifest(found.job_id)
-    return blob_response(services.catalog.blobs, key, media_type="application/json")
+    return manifest_response(services, services.catalog.versions.ready(map_id, number).job_id)
 
 
 @router.get(
@@ -143,26 +149,30 @@ def get_version_manifest(services: Provided, map_id: MapId, number: Number) -> R
 )
 def get_version_cloud(services: Provided, map_id: MapId, number: Number) -> Response:
     """The fused reference map, in metres."""
-    found = services.catalog.versions.ready(map_id, number)
-    return blob_response(
-        services.catalog.blobs,
-        blob_keys.map_cloud(found.job_id),
-        media_type=bodies.RAW,
-        filename=f"{map_id}-{number}.ply",
-    )
+    job_id = services.catalog.versions.ready(map_id, number).job_id
+    return cloud_response(services, job_id, f"{map_id}-{number}.ply")
 
 
 def _create(
     services: Services, map_id: str, wanted: VersionRequest, body: Body
 ) -> tuple[VersionRecord, JobRecord]:
     catalog = services.catalog
-    with kept_scans(
-        catalog,
-        body.uploads,
-        wanted.scan_ids,
-        device_id=wanted.device_id,
-        captured_at=wanted.captured_at,
-    ) as scan_ids:
+    with kept_scans(catalog, body, wanted) as scan_ids:
         record, job = catalog.versions.create(map_id, scan_ids=scan_ids, survey_id=wanted.survey_id)
         submit(services, job, forget=lambda: catalog.versions.take_back(job.job_id))
     return record, job
+
+
+def version_document(record: VersionRecord, request: HttpRequest) -> VersionDocument:
+    """Return a version of a map with its links."""
+    here = f"/maps/{record.map_id}/versions/{record.version}"
+    links = [
+        link(request, here, "self"),
+        link(request, f"/jobs/{record.job_id}", "monitor"),
+        link(request, f"/maps/{record.map_id}", "map"),
+    ]
+    if record.survey_id is not None:
+        links.append(link(request, f"/surveys/{record.survey_id}", "survey"))
+    if record.status == "ready":
+        links += file_links(request, here)
+    return VersionDocument(**dict(record), links=links)

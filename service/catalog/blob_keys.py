@@ -56,9 +56,10 @@ def map_tiles(job_id: str) -> str:
 
 
 def map_embedding(job_id: str, model: str, sha256: str | None) -> str:
-    """What one model computed of the reference alone; `model` is `name/version`, the digest that of its weights.
+    """The reference embedding of one model; `model` is `name/version`, the digest that of its weights.
 
-    Other weights under the same name find no description, rather than one that is not theirs.
+    Other weights under the same name find no embedding, rather than one that is not theirs. The key says `description`,
+    as releases before 0.2 wrote it.
     """
     made_by = f"{model.replace('/', '-')}-{(sha256 or 'none')[:12]}"
     return f"{map_folder(job_id)}description-{safe_name(made_by)}.npz"

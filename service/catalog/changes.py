@@ -10,8 +10,7 @@ from sqlalchemy import Select, and_, func, or_, select
 
 from service.catalog import tables
 from service.catalog.database import Database
-from service.catalog.records import Bounds, ChangeRecord
-from service.catalog.tiles import tile_record
+from service.catalog.records import Bounds, ChangeRecord, TileRecord
 
 _TILE, _SURVEY = tables.SurveyTile, tables.Survey
 
@@ -61,7 +60,7 @@ class Changes:
         count = select(func.count()).select_from(query.subquery())
         rows = query if after is None else query.where(_behind(after))
         rows = rows.order_by(
-            _SURVEY.captured_at.desc(), _SURVEY.id.desc(), _TILE.score.desc(), _TILE.tile_id.asc()
+            _SURVEY.captured_at.desc(), _SURVEY.survey_id.desc(), _TILE.score.desc(), _TILE.tile_id.asc()
         ).limit(limit + 1)
         with self._database.read() as session:
             matched = session.scalar(count) or 0
@@ -75,7 +74,7 @@ class Changes:
         """Every tile of a survey, unobserved ones too, in the order of the grid."""
         query = (
             select(_TILE, _SURVEY)
-            .join(_SURVEY, _SURVEY.id == _TILE.survey_id)
+            .join(_SURVEY, _SURVEY.survey_id == _TILE.survey_id)
             .where(_TILE.survey_id == survey_id)
             .order_by(_TILE.i, _TILE.j, _TILE.k)
         )
@@ -86,11 +85,11 @@ class Changes:
 def _matching(wanted: ChangeFilter) -> Select[tables.SurveyTile, tables.Survey]:
     query = (
         select(_TILE, _SURVEY)
-        .join(_SURVEY, _SURVEY.id == _TILE.survey_id)
+        .join(_SURVEY, _SURVEY.survey_id == _TILE.survey_id)
         .where(_SURVEY.map_id == wanted.map_id, _SURVEY.status == "ready", _TILE.state == "changed")
     )
     if wanted.survey_id is not None:
-        query = query.where(_SURVEY.id == wanted.survey_id)
+        query = query.where(_SURVEY.survey_id == wanted.survey_id)
     if wanted.since is not None:
         query = query.where(_SURVEY.captured_at >= wanted.since)
     if wanted.until is not None:
@@ -108,10 +107,10 @@ def _matching(wanted: ChangeFilter) -> Select[tables.SurveyTile, tables.Survey]:
 
 def _behind(after: ChangePosition) -> Any:
     same_time = _SURVEY.captured_at == after.captured_at
-    same_survey = and_(same_time, _SURVEY.id == after.survey_id)
+    same_survey = and_(same_time, _SURVEY.survey_id == after.survey_id)
     return or_(
         _SURVEY.captured_at < after.captured_at,
-        and_(same_time, _SURVEY.id < after.survey_id),
+        and_(same_time, _SURVEY.survey_id < after.survey_id),
         and_(same_survey, _TILE.score < after.score),
         and_(same_survey, _TILE.score == after.score, _TILE.tile_id > after.tile_id),
     )
@@ -128,10 +127,10 @@ def _position(last: ChangeRecord) -> ChangePosition:
 
 def _record(tile: tables.SurveyTile, survey: tables.Survey) -> ChangeRecord:
     return ChangeRecord(
-        tile=tile_record(tile),
+        tile=TileRecord.of_row(tile),
         map_id=survey.map_id,
         map_version=survey.map_version,
-        survey_id=survey.id,
+        survey_id=survey.survey_id,
         model=survey.model,
         threshold=survey.threshold,
         captured_at=survey.captured_at,

@@ -4,17 +4,26 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from alembic import command
 from alembic.config import Config
-from sqlalchemy import Connection, Engine, create_engine, event, make_url, text
-from sqlalchemy.orm import Session
+from alembic.migration import MigrationContext
+from alembic.script import ScriptDirectory
+from sqlalchemy import Connection, Engine, Select, create_engine, event, make_url, text, tuple_
+from sqlalchemy.orm import InstrumentedAttribute, Session
 from sqlalchemy.pool import NullPool
 
+from service.catalog.records import Page, Position
+
+R = TypeVar("R")
+T = TypeVar("T")
+
 BUSY_TIMEOUT_S = 30  #: how long a writer waits for another one
+FIRST_REVISION = "0005"  #: the tables of release 0.1, see migrations/versions
 _MIGRATION_LOCK = 0x53504943  #: any number that every process of ours agrees on ("SPIC")
 
 
@@ -38,6 +47,26 @@ class Database:
         with Session(self._writer) as session, session.begin():
             yield session
 
+    def page(
+        self,
+        query: Select[R],
+        created: InstrumentedAttribute[datetime],
+        key: InstrumentedAttribute[str],
+        record: Callable[[R], T],
+        *,
+        after: Position | None,
+        limit: int,
+    ) -> Page[T]:
+        """Return a page of the rows of `query` as records, newest first, by keyset: stable while rows are added."""
+        if after is not None:
+            query = query.where(tuple_(created, key) < after)
+        query = query.order_by(created.desc(), key.desc())
+        with self.read() as session:
+            records = [
+                record(row) for row in session.scalars(query.limit(limit + 1))
+            ]  # one more tells of a next page
+        return Page(items=records[:limit], more=len(records) > limit)
+
     def upgrade(self) -> None:
         """Bring the tables up to date; several processes may do so at once."""
         upgrade(self.engine)
@@ -52,13 +81,37 @@ class Database:
         self.engine.dispose()
 
 
+class WrongRevision(Exception):
+    """The database has tables that this release cannot bring up to date; `str()` says what to do."""
+
+
 def upgrade(engine: Engine) -> None:
-    """Run the migrations that are missing, one process at a time."""
+    """Run the migrations that are missing, one process at a time. Raises WrongRevision."""
     config = Config()
     config.set_main_option("script_location", "service.catalog:migrations")
-    with _migration_lock(engine), engine.connect() as connection:
-        config.attributes["connection"] = connection
-        command.upgrade(config, "head")
+    with _migration_lock(engine):
+        with engine.connect() as connection:
+            _check_revision(MigrationContext.configure(connection).get_current_revision(), config)
+        with engine.connect() as connection:
+            config.attributes["connection"] = connection
+            command.upgrade(config, "head")
+
+
+def _check_revision(revision: str | None, config: Config) -> None:
+    """Raise WrongRevision for a database of another release whose steps this one does not have."""
+    if revision is None or revision in {
+        step.revision for step in ScriptDirectory.from_config(config).walk_revisions()
+    }:
+        return
+    if revision < FIRST_REVISION:
+        raise WrongRevision(
+            f"its tables are at revision {revision}, from before release 0.1 was complete; open it once with the last "
+            "0.1 build, which brings it to revision 0005, or start with an empty data folder"
+        )
+    raise WrongRevision(
+        f"its tables are at revision {revision}, which a newer release made; install that release, or start with an "
+        "empty data folder"
+    )
 
 
 def _engine(url: str) -> Engine:

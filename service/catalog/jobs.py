@@ -1,6 +1,9 @@
 """Jobs: what a client follows. Every change of state is one guarded UPDATE, so a terminal state is never left.
 
 accepted -> running -> successful | failed | dismissed, and accepted -> failed | dismissed
+
+A step that ends without a result is started again, and not for ever: a crash may be the file's fault, and then every
+attempt ends so; or the machine's, and then the next one does not.
 """
 
 from __future__ import annotations
@@ -11,12 +14,14 @@ from sqlalchemy import CursorResult, func, select, update
 from sqlalchemy.orm import Session
 
 from service.catalog import tables
-from service.catalog.clock import new_id, now
 from service.catalog.database import Database
-from service.catalog.page import Page, Position, newest_first, page_of
-from service.catalog.records import TERMINAL, JobRecord, JobStatus, Problem
+from service.catalog.records import JobRecord, JobStatus, Page, Position, Problem
 from service.catalog.steps import JobKind
+from service.catalog.tables import new_id, now
 from service.errors import Conflict, NotFound
+
+MAX_ATTEMPTS = 3  #: of a whole job, whichever of its steps they are lost in
+WORKER_DIED = "worker_died"  #: code of the problem of a job that is given up
 
 _OPEN = tables.Job.status.in_(("accepted", "running"))
 
@@ -30,7 +35,7 @@ class Jobs:
     def get(self, job_id: str) -> JobRecord:
         """One job. Raises NotFound."""
         with self._database.read() as session:
-            return job_record(_row(session, job_id))
+            return JobRecord.of_row(_row(session, job_id))
 
     def page(
         self,
@@ -46,22 +51,16 @@ class Jobs:
             query = query.where(tables.Job.status == status)
         if map_id is not None:
             query = query.where(tables.Job.map_id == map_id)
-        query = newest_first(query, tables.Job.created, tables.Job.id, after=after, limit=limit)
-        with self._database.read() as session:
-            return page_of([job_record(row) for row in session.scalars(query)], limit)
+        created, key = tables.Job.created, tables.Job.job_id
+        return self._database.page(query, created, key, JobRecord.of_row, after=after, limit=limit)
 
-    def open_of(self, map_id: str) -> tuple[JobRecord, ...]:
-        """The jobs of a map and of its surveys that have not ended."""
-        query = select(tables.Job).where(tables.Job.map_id == map_id, _OPEN)
+    def unfinished(self, map_id: str | None = None) -> tuple[JobRecord, ...]:
+        """Return the jobs that wait or run, of one map and its surveys or of all, in the order they were asked for."""
+        query = select(tables.Job).where(_OPEN).order_by(tables.Job.created, tables.Job.job_id)
+        if map_id is not None:
+            query = query.where(tables.Job.map_id == map_id)
         with self._database.read() as session:
-            return tuple(job_record(row) for row in session.scalars(query))
-
-    def unfinished(self) -> tuple[JobRecord, ...]:
-        """The jobs that wait or run, in the order they were asked for."""
-        query = select(tables.Job).where(_OPEN)
-        with self._database.read() as session:
-            rows = session.scalars(query.order_by(tables.Job.created, tables.Job.id))
-            return tuple(job_record(row) for row in rows)
+            return tuple(JobRecord.of_row(row) for row in session.scalars(query))
 
     def counts(self) -> dict[str, int]:
         """How many jobs are in each state; states without a job are left out."""
@@ -71,9 +70,7 @@ class Jobs:
 
     def start(self, job_id: str) -> bool:
         """The job runs from now on; False when it has ended or gone, and the step has nothing to do."""
-        instant = now()
-        started = func.coalesce(tables.Job.started, instant)
-        return self._advance(job_id, status="running", started=started, updated=instant)
+        return self._advance(job_id, **_started())
 
     def report(self, job_id: str, *, message: str, progress: float) -> bool:
         """Say the stage and the share (0..1) of the whole job; False when the work should stop.
@@ -89,7 +86,7 @@ class Jobs:
     def is_dismissed(self, job_id: str) -> bool:
         """Whether the work should stop: the job was dismissed, or deleted with its map."""
         with self._database.read() as session:
-            status = session.scalar(select(tables.Job.status).where(tables.Job.id == job_id))
+            status = session.scalar(select(tables.Job.status).where(tables.Job.job_id == job_id))
         return status is None or status == "dismissed"
 
     def succeed(self, job_id: str) -> bool:
@@ -104,10 +101,38 @@ class Jobs:
         """Stop the job for good; once more changes nothing. Raises NotFound, and Conflict when it ended by itself."""
         problem = Problem(code="dismissed", detail="the job was dismissed")
         dismissed = self._end(job_id, "dismissed", message=problem.detail, problem=problem.model_dump())
-        found = self.get(job_id)
-        if not dismissed and found.status != "dismissed":
-            raise Conflict(f"job {job_id!r} is already {found.status}; delete its map or survey instead")
-        return found
+        job = self.get(job_id)
+        if not dismissed and job.status != "dismissed":
+            raise Conflict(f"job {job_id!r} is already {job.status}; delete its map or survey instead")
+        return job
+
+    def lose_attempt(self, job_id: str, reason: str) -> bool:
+        """Count an attempt that ended without a result; `reason` is the first half of a sentence.
+
+        True when the step shall be started again. False when this was the last attempt, and the job failed with
+        `WORKER_DIED`; and when the job had ended or gone before.
+        """
+        lost = tables.Job.attempts + 1
+        with self._database.write() as session:
+            statement = update(tables.Job).where(tables.Job.job_id == job_id, _OPEN)
+            attempts = session.scalar(statement.values(attempts=lost).returning(tables.Job.attempts))
+            if attempts is None:
+                return False
+            if attempts < MAX_ATTEMPTS:
+                message = f"started again ({attempts + 1} of {MAX_ATTEMPTS}): {reason}"
+                return _changed(session, job_id, _started(message))
+        detail = f"{reason}; given up after {attempts} attempts, look at the worker's log and memory"
+        self.fail(job_id, Problem(code=WORKER_DIED, detail=detail))
+        return False
+
+    def put_back(self, job_id: str) -> bool:
+        """Note that a step was stopped with its worker, which counts for no attempt.
+
+        False when the job had ended or gone, and the step is not wanted any more.
+        """
+        return self._advance(
+            job_id, **_started("stopped with its worker; goes on with the next that is free")
+        )
 
     def _advance(self, job_id: str, **values: Any) -> bool:
         with self._database.write() as session:
@@ -134,7 +159,7 @@ def new_job(
     """A job that waits; the caller records it in the transaction of its map, survey or model."""
     instant = now()
     return tables.Job(
-        id=new_id("job"),
+        job_id=new_id("job"),
         kind=kind,
         map_id=map_id,
         survey_id=survey_id,
@@ -147,28 +172,11 @@ def new_job(
     )
 
 
-def is_terminal(status: JobStatus) -> bool:
-    """Whether a job in this state stays in it."""
-    return status in TERMINAL
-
-
-def job_record(row: tables.Job) -> JobRecord:
-    """The record of a row."""
-    return JobRecord(
-        job_id=row.id,
-        kind=row.kind,
-        map_id=row.map_id,
-        survey_id=row.survey_id,
-        model=row.model,
-        status=row.status,
-        message=row.message,
-        progress=row.progress,
-        problem=None if row.problem is None else Problem.model_validate(row.problem),
-        created=row.created,
-        started=row.started,
-        finished=row.finished,
-        updated=row.updated,
-    )
+def _started(message: str | None = None) -> dict[str, object]:
+    """Return the columns of a job that runs, from this instant on or from an earlier one."""
+    instant = now()
+    columns = {"status": "running", "started": func.coalesce(tables.Job.started, instant), "updated": instant}
+    return columns if message is None else {**columns, "message": message}
 
 
 def _subject(session: Session, job: tables.Job) -> tables.MapVersion | tables.Survey | tables.Model | None:
@@ -176,8 +184,8 @@ def _subject(session: Session, job: tables.Job) -> tables.MapVersion | tables.Su
     if job.survey_id is not None:
         return session.get(tables.Survey, job.survey_id)
     if job.kind == "model":
-        return session.get(tables.Model, job.id)
-    return session.get(tables.MapVersion, job.id)
+        return session.get(tables.Model, job.job_id)
+    return session.get(tables.MapVersion, job.job_id)
 
 
 def _row(session: Session, job_id: str) -> tables.Job:
@@ -188,5 +196,5 @@ def _row(session: Session, job_id: str) -> tables.Job:
 
 
 def _changed(session: Session, job_id: str, values: dict[str, Any]) -> bool:
-    statement = update(tables.Job).where(tables.Job.id == job_id, _OPEN).values(values)
+    statement = update(tables.Job).where(tables.Job.job_id == job_id, _OPEN).values(values)
     return cast("CursorResult[Any]", session.execute(statement)).rowcount == 1

@@ -11,11 +11,11 @@ from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
 from service.catalog import tables
-from service.catalog.clock import now
 from service.catalog.database import Database
-from service.catalog.jobs import job_record, new_job
+from service.catalog.jobs import new_job
 from service.catalog.records import JobRecord, ModelRecord
-from service.catalog.version_rows import current_row, map_row
+from service.catalog.tables import Model, now
+from service.catalog.versions import lock_map, version_in_use
 from service.errors import Conflict, NotFound
 
 
@@ -41,16 +41,16 @@ class Models:
         name = name or name_for(map_id)
         try:
             with self._database.write() as session:
-                map_row(session, map_id, lock=True)  # nobody deletes the version meanwhile
-                version = current_row(session, map_id)
+                lock_map(session, map_id)  # nobody deletes the version meanwhile
+                version = version_in_use(session, map_id)
                 number = _next_number(session, name)
                 job = new_job("model", map_id, model=f"{name}/{number}")
-                row = tables.Model(
-                    job_id=job.id,
+                row = Model(
+                    job_id=job.job_id,
                     map_id=map_id,
-                    map_version=version.number,
+                    map_version=version.version,
                     name=name,
-                    number=number,
+                    version=number,
                     status="training",
                     base=base,
                     minutes=minutes,
@@ -60,31 +60,31 @@ class Models:
                 )
                 session.add_all([row, job])
                 session.flush()
-                return _record(row), job_record(job)
+                return ModelRecord.of_row(row), JobRecord.of_row(job)
         except IntegrityError as error:
             raise Conflict(f"another training took the name {name!r} just now; try again") from error
 
     def find(self, name: str, version: int | None = None) -> ModelRecord | None:
         """One model in whatever state, by default the newest that is ready, else the newest; None if there is none."""
-        query = select(tables.Model).where(tables.Model.name == name)
+        query = select(Model).where(Model.name == name)
         if version is not None:
-            query = query.where(tables.Model.number == version)
-        query = query.order_by(tables.Model.status != "ready", tables.Model.number.desc()).limit(1)
+            query = query.where(Model.version == version)
+        query = query.order_by(Model.status != "ready", Model.version.desc()).limit(1)
         with self._database.read() as session:
             row = session.scalar(query)
-            return None if row is None else _record(row)
+            return None if row is None else ModelRecord.of_row(row)
 
     def of_job(self, job_id: str) -> ModelRecord:
         """The model that a job trains. Raises NotFound, also where it was deleted since."""
         with self._database.read() as session:
-            return _record(_row(session, job_id))
+            return ModelRecord.of_row(_row(session, job_id))
 
     def ready(self) -> tuple[ModelRecord, ...]:
         """Every model that can score, by name, the newest of each first."""
-        query = select(tables.Model).where(tables.Model.status == "ready")
+        query = select(Model).where(Model.status == "ready")
         with self._database.read() as session:
-            rows = session.scalars(query.order_by(tables.Model.name, tables.Model.number.desc()))
-            return tuple(_record(row) for row in rows)
+            rows = session.scalars(query.order_by(Model.name, Model.version.desc()))
+            return tuple(ModelRecord.of_row(row) for row in rows)
 
     def save_card(self, job_id: str, card: Mapping[str, Any]) -> None:
         """Record what was made, replacing an earlier run's card; `jobs.succeed` makes it ready. Raises NotFound."""
@@ -96,7 +96,7 @@ class Models:
     def take_back(self, job_id: str) -> None:
         """Forget a model whose job never reached the queue."""
         with self._database.write() as session:
-            session.execute(delete(tables.Job).where(tables.Job.id == job_id))
+            session.execute(delete(tables.Job).where(tables.Job.job_id == job_id))
             session.delete(_row(session, job_id))
 
 
@@ -106,28 +106,11 @@ def name_for(map_id: str) -> str:
 
 
 def _next_number(session: Session, name: str) -> int:
-    return 1 + (session.scalar(select(func.max(tables.Model.number)).where(tables.Model.name == name)) or 0)
+    return 1 + (session.scalar(select(func.max(Model.version)).where(Model.name == name)) or 0)
 
 
-def _row(session: Session, job_id: str) -> tables.Model:
-    row = session.get(tables.Model, job_id)
+def _row(session: Session, job_id: str) -> Model:
+    row = session.get(Model, job_id)
     if row is None:
         raise NotFound(f"job {job_id!r} trains no model, or it was deleted since")
     return row
-
-
-def _record(row: tables.Model) -> ModelRecord:
-    return ModelRecord(
-        name=row.name,
-        version=row.number,
-        status=row.status,
-        map_id=row.map_id,
-        map_version=row.map_version,
-        base=row.base,
-        minutes=row.minutes,
-        epochs=row.epochs,
-        card=row.card,
-        job_id=row.job_id,
-        created=row.created,
-        updated=row.updated,
-    )

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from datetime import UTC
-from typing import Annotated, Any, Literal, Self
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Annotated, Any, Generic, Literal, Self, TypeVar
 
 from pydantic import AfterValidator, AwareDatetime, BaseModel, ConfigDict, Field, model_validator
 
@@ -20,7 +22,22 @@ Row4 = tuple[float, float, float, float]
 Matrix = tuple[Row4, Row4, Row4, Row4]  #: (4, 4) row-major, rigid, target_from_source
 Utc = Annotated[AwareDatetime, AfterValidator(lambda instant: instant.astimezone(UTC))]
 
-TERMINAL: frozenset[JobStatus] = frozenset({"successful", "failed", "dismissed"})
+Position = tuple[datetime, str]  #: where a page of a list ended: `created` and id of its last row
+
+T = TypeVar("T")
+
+
+def rfc3339(instant: datetime) -> str:
+    """Write an instant as `2026-03-01T12:00:00.250000Z`; the fraction only where there is one."""
+    return instant.astimezone(UTC).isoformat().replace("+00:00", "Z")
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Page(Generic[T]):
+    """Some rows of a longer list."""
+
+    items: Sequence[T]
+    more: bool  #: whether a further page has anything
 
 
 class Record(BaseModel):
@@ -28,9 +45,14 @@ class Record(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
+    @classmethod
+    def of_row(cls, row: object) -> Self:
+        """Return the record of a row of tables.py, whose attributes bear the same names."""
+        return cls.model_validate(row, from_attributes=True)
+
 
 class Problem(Record):
-    """Why a job failed, as data; api/problems.py turns it into RFC 9457."""
+    """Why a job failed, as data; api/http/problems.py turns it into RFC 9457."""
 
     code: str  #: stable, from the error trees of service/errors.py and worker/errors.py
     detail: str  #: one sentence with the numbers
@@ -50,15 +72,15 @@ class Problem(Record):
 class ScanRecord(Record):
     """One uploaded file, unread."""
 
-    scan_id: str
-    filename: str  #: as the client named it
+    scan_id: str = Field(examples=["scan-2b1f"])
+    filename: str = Field(examples=["hall.pcd"])  #: as the client named it
     format: ScanFormat  #: by the first bytes of the file
-    size: int  #: bytes
+    size: int = Field(description="bytes", examples=[1296000])
     sha256: str
     device_id: str | None
     captured_at: Utc | None
-    pose: Matrix | None  #: map_from_sensor, the client's guess
-    key: str  #: of the blob
+    pose: Matrix | None = Field(description="map_from_sensor as it was given, row-major")
+    key: str = Field(exclude=True)  #: of the blob; clients do not see it
     created: Utc
 
 
@@ -118,63 +140,58 @@ class TileRecord(Record):
         return self
 
 
-class MapRecord(Record):
+class Built(Record):
+    """What a map and a version of it have in common; a map shows its version in use."""
+
+    map_id: str = Field(examples=["lobby"])
+    version: int = Field(examples=[1])  #: 1, 2, ... of the map
+    status: MapStatus
+    model: str = Field(examples=["spicd-net/1"])  #: `name/version`, whose card gives voxel and tile size
+    settings: dict[str, Any]
+    scans: tuple[ScanOutcome, ...]  #: those of the base that were accepted, then the new ones, as requested
+    bounds: Bounds | None = Field(description="metres, map frame")  #: None until it is built
+    counts: dict[str, int] = Field(examples=[{"points": 181342, "tiles": 172, "scans": 25, "accepted": 24}])
+    registration: dict[str, Any] | None = Field(
+        description="totals of the registration of what is new in it (paper, Table 2); null until it is built",
+        examples=[
+            {"scans": 25, "accepted": 24, "pairs_possible": 300, "pairs_tried": 61, "pairs_accepted": 58}
+        ],
+    )
+    job_id: str  #: of the job that builds it, and so of its files (`blob_keys.map_folder`)
+    problem: Problem | None
+    created: Utc
+    updated: Utc
+
+
+class MapRecord(Built):
     """A reference map as it is in use: the newest of its versions that is ready, and the newest where none is."""
 
-    map_id: str
     name: str | None
-    version: int  #: the one that is shown here, as are the status and all that is about its building
-    status: MapStatus
-    model: str  #: `name/version`, whose card gives voxel and tile size
-    settings: dict[str, Any]
-    anchor: Anchor | None
-    scans: tuple[ScanOutcome, ...]  #: in the order of the request
-    bounds: Bounds | None  #: None until it is built
-    counts: dict[str, int]  #: empty until it is built
-    registration: (
-        dict[str, Any] | None
-    )  #: totals of the registration (paper, Table 2); None until it is built
-    job_id: str
-    problem: Problem | None
-    created: Utc
-    updated: Utc
+    anchor: Anchor | None = Field(description="where the map lies on the Earth; null: nobody said")
 
 
-class VersionRecord(Record):
+class VersionRecord(Built):
     """One state of a map; a survey stays with the version that it was compared with."""
 
-    map_id: str
-    version: int  #: 1, 2, ...
-    status: MapStatus
-    base_version: int | None  #: the version that it goes on from; None in the first
-    survey_id: str | None  #: the accepted survey that it takes over; None where it is made of scans
-    model: str  #: the map's
-    settings: dict[str, Any]  #: the map's
-    scans: tuple[ScanOutcome, ...]  #: those of the base that were accepted, then the new ones
-    bounds: Bounds | None
-    counts: dict[str, int]
-    registration: dict[str, Any] | None
-    job_id: str  #: of the job that builds it, and so of its files (`keys.map_folder`)
-    problem: Problem | None
-    created: Utc
-    updated: Utc
+    base_version: int | None = Field(description="the version it goes on from; null in the first")
+    survey_id: str | None = Field(description="the survey it takes over; null where it is made of scans")
 
 
 class SurveyRecord(Record):
     """A later visit compared with a map; `counts` is empty until it is done."""
 
-    survey_id: str
-    map_id: str
-    map_version: (
-        int  #: the version that was in use when the survey was asked for, and that it is compared with
-    )
+    survey_id: str = Field(examples=["survey-91c4"])
+    map_id: str = Field(examples=["lobby"])
+    map_version: int = Field(description="of the map, that the survey is compared with", examples=[1])
     status: SurveyStatus
-    model: str  #: `name/version`
-    threshold: float | None  #: asked for, then the one that was used
+    model: str = Field(examples=["spicd-net/1"])
+    threshold: float | None = Field(description="asked for, then the one that was used")
     device_id: str | None
     captured_at: Utc  #: given, else the latest of its scans, else the time of the request
     scans: tuple[ScanOutcome, ...]  #: in the order of the request
-    counts: dict[str, int]
+    counts: dict[str, int] = Field(
+        examples=[{"tiles": 172, "unchanged": 150, "changed": 9, "inconsistent": 1, "unobserved": 12}]
+    )
     job_id: str
     problem: Problem | None
     created: Utc
@@ -193,7 +210,7 @@ class ModelRecord(Record):
     minutes: float  #: of the training, at most
     epochs: int | None  #: likewise; None: as many as the minutes allow
     card: dict[str, Any] | None  #: None until it is ready; `worker.detectors.card` says what is in it
-    job_id: str  #: of the job that trains it, and so of its files (`keys.model_folder`)
+    job_id: str  #: of the job that trains it, and so of its files (`blob_keys.model_folder`)
     created: Utc
     updated: Utc
 

@@ -1,12 +1,13 @@
-"""Scans: uploaded files, known by their content and the device they came from."""
+"""Scans: uploaded files, known by their content and the device they came from, and their outcomes in maps and surveys."""
 
 from __future__ import annotations
 
 import contextlib
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from datetime import datetime
 from pathlib import Path
+from typing import Any, TypeVar
 from uuid import uuid4
 
 from sqlalchemy import ColumnElement, delete, exists, select, update
@@ -15,11 +16,11 @@ from sqlalchemy.orm import Session
 
 from service.catalog import blob_keys, tables
 from service.catalog.blobs import Blobs
-from service.catalog.clock import now
 from service.catalog.database import Database
-from service.catalog.page import Page, Position, newest_first, page_of
-from service.catalog.records import Matrix, ScanFormat, ScanRecord
-from service.errors import Conflict, NotFound
+from service.catalog.records import Matrix, Page, Position, ScanFormat, ScanOutcome, ScanRecord
+from service.errors import BadRequest, Conflict, NotFound
+
+Row = TypeVar("Row", tables.VersionScan, tables.SurveyScan)
 
 
 def scan_id_of(sha256: str, device_id: str | None) -> str:
@@ -57,7 +58,7 @@ class Scans:
         key = blob_keys.scan_file(scan_id, uuid4().hex, filename)
         self._blobs.put_file(key, path, move=True)
         row = tables.Scan(
-            id=scan_id,
+            scan_id=scan_id,
             filename=filename,
             format=format,
             size=size,
@@ -66,13 +67,13 @@ class Scans:
             captured_at=captured_at,
             pose=None if pose is None else [list(line) for line in pose],
             key=key,
-            created=now(),
+            created=tables.now(),
         )
         try:
             with self._database.write() as session:
                 session.add(row)
                 session.flush()
-                return _record(row), True
+                return ScanRecord.of_row(row), True
         except IntegrityError:  # the same upload, a moment earlier
             self._blobs.delete_prefix(blob_keys.folder_of(key))
             if known := self._sent_again(scan_id):
@@ -89,10 +90,8 @@ class Scans:
         Raises Conflict where it would change under a map or survey that rests on it.
         """
         with self._database.write() as session:
-            row = session.get(tables.Scan, scan_id, with_for_update=True)
-            if row is None:
-                raise NotFound(f"no scan {scan_id!r}; upload it with POST /scans")
-            known = _record(row)
+            row = _row(session, scan_id, lock=True)
+            known = ScanRecord.of_row(row)
             new_time = captured_at is not None and captured_at != known.captured_at
             new_pose = pose is not None and pose != known.pose
             if not (new_time or new_pose):
@@ -106,33 +105,29 @@ class Scans:
             row.captured_at = captured_at or known.captured_at
             row.pose = row.pose if pose is None else [list(line) for line in pose]
             session.flush()
-            return _record(row)
+            return ScanRecord.of_row(row)
 
     def get(self, scan_id: str) -> ScanRecord:
         """One scan. Raises NotFound."""
         with self._database.read() as session:
-            row = session.get(tables.Scan, scan_id)
-            if row is None:
-                raise NotFound(f"no scan {scan_id!r}; upload it with POST /scans")
-            return _record(row)
+            return ScanRecord.of_row(_row(session, scan_id))
 
     def many(self, scan_ids: Sequence[str]) -> tuple[ScanRecord, ...]:
         """Several scans, in the order asked for. Raises NotFound naming every id that is unknown."""
         with self._database.read() as session:
-            return rows_in_order(session, scan_ids)
+            return scans_in_order(session, scan_ids)
 
     def page(self, *, after: Position | None = None, limit: int = 100) -> Page[ScanRecord]:
         """Scans, newest first."""
-        query = newest_first(
-            select(tables.Scan), tables.Scan.created, tables.Scan.id, after=after, limit=limit
+        table = tables.Scan
+        return self._database.page(
+            select(table), table.created, table.scan_id, ScanRecord.of_row, after=after, limit=limit
         )
-        with self._database.read() as session:
-            return page_of([_record(row) for row in session.scalars(query)], limit)
 
     def delete(self, scan_id: str) -> None:
         """Forget a scan and its file. Raises NotFound, and Conflict while a map or survey rests on it."""
         try:
-            if not self._forget(tables.Scan.id == scan_id):
+            if not self._forget(tables.Scan.scan_id == scan_id):
                 raise NotFound(f"no scan {scan_id!r}")
         except IntegrityError as error:
             raise Conflict(f"scan {scan_id!r} belongs to a map or survey; delete that first") from error
@@ -153,37 +148,55 @@ class Scans:
 
     def _sent_again(self, scan_id: str) -> ScanRecord | None:
         """The scan of this id, with the note that one more client relies on it; None where there is none."""
-        statement = update(tables.Scan).where(tables.Scan.id == scan_id).values(resent=now())
+        statement = update(tables.Scan).where(tables.Scan.scan_id == scan_id).values(resent=tables.now())
         with self._database.write() as session:
             row = session.scalar(statement.returning(tables.Scan))
-            return None if row is None else _record(row)
+            return None if row is None else ScanRecord.of_row(row)
 
 
-def rows_in_order(session: Session, scan_ids: Sequence[str]) -> tuple[ScanRecord, ...]:
-    """The scans of `scan_ids`, in that order. Raises NotFound naming every id that is unknown."""
-    found = {row.id: row for row in session.scalars(select(tables.Scan).where(tables.Scan.id.in_(scan_ids)))}
-    missing = [scan_id for scan_id in scan_ids if scan_id not in found]
+def checked_scan_ids(scan_ids: Sequence[str]) -> tuple[str, ...]:
+    """Return the ids: at least one, none twice. Raises BadRequest."""
+    if not scan_ids:
+        raise BadRequest("no scans: name them in scan_ids or send files in scans")
+    twice = sorted({scan_id for scan_id in scan_ids if scan_ids.count(scan_id) > 1})
+    if twice:
+        raise BadRequest(f"scan {', '.join(map(repr, twice))} is named more than once; name each scan once")
+    return tuple(scan_ids)
+
+
+def scans_in_order(session: Session, scan_ids: Sequence[str]) -> tuple[ScanRecord, ...]:
+    """Return the scans of `scan_ids`, in that order. Raises NotFound naming every id that is unknown."""
+    rows = session.scalars(select(tables.Scan).where(tables.Scan.scan_id.in_(scan_ids)))
+    known = {row.scan_id: ScanRecord.of_row(row) for row in rows}
+    missing = [scan_id for scan_id in scan_ids if scan_id not in known]
     if missing:
         raise NotFound(f"no scan {', '.join(map(repr, missing))}; upload it with POST /scans")
-    return tuple(_record(found[scan_id]) for scan_id in scan_ids)
+    return tuple(known[scan_id] for scan_id in scan_ids)
+
+
+def outcome_columns(outcome: ScanOutcome) -> dict[str, Any]:
+    """Return the columns of an outcome, less its scan."""
+    return outcome.model_dump(mode="json", exclude={"scan_id"})
+
+
+def write_outcomes(rows: Iterable[Row], outcomes: Iterable[ScanOutcome]) -> None:
+    """Put `outcomes` on the rows of the same scans. Raises ValueError for a scan that was not asked for."""
+    by_scan = {row.scan_id: row for row in rows}
+    for outcome in outcomes:
+        if outcome.scan_id not in by_scan:
+            raise ValueError(f"scan {outcome.scan_id!r} does not belong to this map or survey")
+        for name, value in outcome_columns(outcome).items():
+            setattr(by_scan[outcome.scan_id], name, value)
+
+
+def _row(session: Session, scan_id: str, *, lock: bool = False) -> tables.Scan:
+    row = session.get(tables.Scan, scan_id, with_for_update=lock)
+    if row is None:
+        raise NotFound(f"no scan {scan_id!r}; upload it with POST /scans")
+    return row
 
 
 def _in_use(scan_id: str) -> ColumnElement[bool]:
     return exists().where(tables.VersionScan.scan_id == scan_id) | exists().where(
         tables.SurveyScan.scan_id == scan_id
-    )
-
-
-def _record(row: tables.Scan) -> ScanRecord:
-    return ScanRecord(
-        scan_id=row.id,
-        filename=row.filename,
-        format=row.format,
-        size=row.size,
-        sha256=row.sha256,
-        device_id=row.device_id,
-        captured_at=row.captured_at,
-        pose=row.pose,
-        key=row.key,
-        created=row.created,
     )

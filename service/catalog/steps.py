@@ -1,7 +1,7 @@
 """The steps of each kind of job: which function, on which queue, in which order.
 
 A job that a client sees is a chain of small steps; each takes the job's id alone, finds the rest in the
-catalog, and may be run twice. The workers run no function but these (design: allow-list).
+catalog, and may be run twice. The workers run no function but these (an allow-list).
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class Step:
 STEPS: dict[JobKind, tuple[Step, ...]] = {
     "map": (
         Step(name="register", function="worker.jobs.register_map", queue="geometry"),
-        Step(name="describe", function="worker.jobs.describe_map", queue="inference"),
+        Step(name="encode", function="worker.jobs.encode_map", queue="inference"),
     ),
     "survey": (
         Step(name="register", function="worker.jobs.register_survey", queue="geometry"),
@@ -39,4 +39,9 @@ STEPS: dict[JobKind, tuple[Step, ...]] = {
     ),
 }
 
-ALLOWED_FUNCTIONS = frozenset(step.function for steps in STEPS.values() for step in steps)
+#: A step that a release before 0.2 left in the queue calls `encode_map` so; it is still run.
+_FORMER_FUNCTIONS = ("worker.jobs.describe_map",)
+
+ALLOWED_FUNCTIONS = frozenset(step.function for steps in STEPS.values() for step in steps).union(
+    _FORMER_FUNCTIONS
+)

@@ -1,9 +1,13 @@
-"""The tables, as migrations/ makes them (a test compares the two)."""
+"""The tables, as migrations/ makes them (a test compares the two).
+
+Attributes bear the names of the records' fields, so that `Record.of_row` reads a row as it is.
+"""
 
 from __future__ import annotations
 
 from datetime import UTC, datetime
 from typing import Any
+from uuid import uuid4
 
 from sqlalchemy import (
     JSON,
@@ -17,6 +21,7 @@ from sqlalchemy import (
     UniqueConstraint,
 )
 from sqlalchemy.engine import Dialect
+from sqlalchemy.ext.associationproxy import AssociationProxy, association_proxy
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column, relationship
 
 NAMING = {
@@ -25,6 +30,16 @@ NAMING = {
     "fk": "fk_%(table_name)s_%(column_0_N_name)s",
     "pk": "pk_%(table_name)s",
 }
+
+
+def now() -> datetime:
+    """Return this instant, with its zone."""
+    return datetime.now(UTC)
+
+
+def new_id(kind: str) -> str:
+    """Return a fresh id such as `survey-4f0c...`; it is opaque to clients."""
+    return f"{kind}-{uuid4().hex}"
 
 
 class UtcDateTime(TypeDecorator[datetime]):
@@ -68,7 +83,7 @@ class Scan(Base):
 
     __tablename__ = "scans"
 
-    id: Mapped[str] = mapped_column(primary_key=True)
+    scan_id: Mapped[str] = mapped_column("id", primary_key=True)
     filename: Mapped[str]
     format: Mapped[str]
     size: Mapped[int] = mapped_column(BigInteger)
@@ -124,7 +139,7 @@ class MapVersion(Base):
 
     job_id: Mapped[str] = mapped_column(primary_key=True)
     map_id: Mapped[str] = mapped_column(ForeignKey("maps.id", ondelete="CASCADE"))
-    number: Mapped[int]
+    version: Mapped[int] = mapped_column("number")
     status: Mapped[str]
     base_version: Mapped[int | None]
     survey_id: Mapped[str | None]  # no foreign key: what a version was made from may be deleted since
@@ -137,6 +152,13 @@ class MapVersion(Base):
     scans: Mapped[list[VersionScan]] = relationship(
         order_by=VersionScan.ordinal, cascade="all, delete-orphan", passive_deletes=True
     )
+    of_map: Mapped[Map] = relationship()
+    job: Mapped[Job | None] = relationship(
+        primaryjoin="foreign(MapVersion.job_id) == Job.job_id", viewonly=True
+    )
+    model: AssociationProxy[str] = association_proxy("of_map", "model")
+    settings: AssociationProxy[dict[str, Any]] = association_proxy("of_map", "settings")
+    problem: AssociationProxy[dict[str, Any] | None] = association_proxy("job", "problem")
 
     __table_args__ = (UniqueConstraint("map_id", "number"), Index(None, "map_id", "created", "job_id"))
 
@@ -146,7 +168,7 @@ class Map(Base):
 
     __tablename__ = "maps"
 
-    id: Mapped[str] = mapped_column(primary_key=True)
+    map_id: Mapped[str] = mapped_column("id", primary_key=True)
     name: Mapped[str | None]
     model: Mapped[str]
     settings: Mapped[dict[str, Any]]
@@ -162,9 +184,9 @@ class Survey(Base):
 
     __tablename__ = "surveys"
 
-    id: Mapped[str] = mapped_column(primary_key=True)
+    survey_id: Mapped[str] = mapped_column("id", primary_key=True)
     map_id: Mapped[str] = mapped_column(ForeignKey("maps.id", ondelete="CASCADE"))
-    map_version: Mapped[int] = mapped_column(server_default="1")  # that of the rows before migration 0004
+    map_version: Mapped[int] = mapped_column(server_default="1")
     status: Mapped[str]
     model: Mapped[str]
     threshold: Mapped[float | None]
@@ -178,6 +200,8 @@ class Survey(Base):
     scans: Mapped[list[SurveyScan]] = relationship(
         order_by=SurveyScan.ordinal, cascade="all, delete-orphan", passive_deletes=True
     )
+    job: Mapped[Job | None] = relationship(primaryjoin="foreign(Survey.job_id) == Job.job_id", viewonly=True)
+    problem: AssociationProxy[dict[str, Any] | None] = association_proxy("job", "problem")
 
     __table_args__ = (Index(None, "map_id", "captured_at", "id"), Index(None, "map_id", "created", "id"))
 
@@ -208,6 +232,23 @@ class SurveyTile(Base):
 
     __table_args__ = (Index(None, "survey_id", "state", "score"),)
 
+    @property
+    def tile_index(self) -> tuple[int, int, int]:
+        """Cell of the grid."""
+        return self.i, self.j, self.k
+
+    @property
+    def bounds(self) -> dict[str, tuple[float, float, float]]:
+        """Box in the map frame, metres."""
+        return {"min": (self.min_x, self.min_y, self.min_z), "max": (self.max_x, self.max_y, self.max_z)}
+
+    @property
+    def probabilities(self) -> tuple[float | None, ...] | None:
+        """Unchanged, changed, different place; None where the tile was not observed."""
+        if self.p_unchanged is None:
+            return None
+        return self.p_unchanged, self.p_changed, self.p_different
+
 
 class Model(Base):
     """A model that was trained on a map, known by the job that trains it."""
@@ -218,7 +259,7 @@ class Model(Base):
     map_id: Mapped[str] = mapped_column(ForeignKey("maps.id", ondelete="CASCADE"), index=True)
     map_version: Mapped[int]
     name: Mapped[str]
-    number: Mapped[int]
+    version: Mapped[int] = mapped_column("number")
     status: Mapped[str]
     base: Mapped[str | None]
     minutes: Mapped[float]
@@ -235,7 +276,7 @@ class Job(Base):
 
     __tablename__ = "jobs"
 
-    id: Mapped[str] = mapped_column(primary_key=True)
+    job_id: Mapped[str] = mapped_column("id", primary_key=True)
     kind: Mapped[str]
     map_id: Mapped[str] = mapped_column(ForeignKey("maps.id", ondelete="CASCADE"), index=True)
     survey_id: Mapped[str | None] = mapped_column(ForeignKey("surveys.id", ondelete="CASCADE"), index=True)

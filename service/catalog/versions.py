@@ -5,33 +5,17 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from sqlalchemy import select
-from sqlalchemy.orm import Session, selectinload
+from sqlalchemy import Select, delete, exists, func, select
+from sqlalchemy.orm import Session, aliased, contains_eager, selectinload
 
 from service.catalog import blob_keys, tables
 from service.catalog.blobs import Blobs
-from service.catalog.clock import now
 from service.catalog.database import Database
-from service.catalog.jobs import job_record, new_job
-from service.catalog.outcomes import write_outcomes
-from service.catalog.page import Page, Position, newest_first, page_of
-from service.catalog.records import Bounds, JobRecord, ScanOutcome, VersionRecord
-from service.catalog.version_rows import (
-    check_deletable,
-    check_ready,
-    current_row,
-    forget,
-    further_scans,
-    kept_scans,
-    map_row,
-    new_row,
-    next_number,
-    row_of_job,
-    survey_scans,
-    version_record,
-    version_row,
-)
-from service.errors import BadRequest
+from service.catalog.jobs import new_job
+from service.catalog.records import Bounds, JobRecord, Page, Position, ScanOutcome, VersionRecord
+from service.catalog.scans import checked_scan_ids, outcome_columns, scans_in_order, write_outcomes
+from service.catalog.tables import MapVersion, now
+from service.errors import BadRequest, Conflict, NotFound, NotReady
 
 
 class Versions:
@@ -54,63 +38,48 @@ class Versions:
                 "a version is made either of scans (scan_ids or files) or of one survey (survey_id)"
             )
         with self._database.write() as session:
-            of = map_row(session, map_id, lock=True)
-            base = current_row(session, map_id)
-            number = next_number(session, map_id)
-            new = (
-                further_scans(session, scan_ids, base)
-                if survey_id is None
-                else survey_scans(session, survey_id, base)
-            )
+            lock_map(session, map_id)
+            base = version_in_use(session, map_id)
+            number = _next_number(session, map_id)
+            if survey_id is None:
+                new = _further_scans(session, scan_ids, base)
+            else:
+                new = _survey_scans(session, survey_id, base)
             job = new_job("map", map_id)
-            row = new_row(
-                job,
-                [*kept_scans(base), *new],
-                number=number,
-                base_version=base.number,
-                survey_id=survey_id,
-            )
+            row = new_version(job, [*_accepted(base.scans), *new], number)
+            row.base_version, row.survey_id = base.version, survey_id
             session.add_all([row, job])
             session.flush()
-            return version_record(row, of, None), job_record(job)
+            return VersionRecord.of_row(row), JobRecord.of_row(job)
 
     def get(self, map_id: str, number: int) -> VersionRecord:
-        """One version. Raises NotFound."""
+        """Return one version. Raises NotFound."""
         with self._database.read() as session:
-            return _read(session, version_row(session, map_id, number))
+            return VersionRecord.of_row(_row(session, map_id, number))
 
     def ready(self, map_id: str, number: int) -> VersionRecord:
-        """One version that is built. Raises NotFound and NotReady."""
-        found = self.get(map_id, number)
-        check_ready(found.status, f"version {number} of map {map_id!r}", found.job_id)
-        return found
+        """Return one version that is built. Raises NotFound and NotReady."""
+        version = self.get(map_id, number)
+        check_ready(version.status, f"version {number} of map {map_id!r}", version.job_id)
+        return version
 
     def of_job(self, job_id: str) -> VersionRecord:
-        """The version that a job builds. Raises NotFound, also where it was deleted since."""
+        """Return the version that a job builds. Raises NotFound, also where it was deleted since."""
         with self._database.read() as session:
-            return _read(session, row_of_job(session, job_id))
+            return VersionRecord.of_row(_row_of_job(session, job_id))
 
     def page(self, map_id: str, *, after: Position | None = None, limit: int = 100) -> Page[VersionRecord]:
-        """Versions of a map, newest first. Raises NotFound."""
-        query = newest_first(
-            select(tables.MapVersion, tables.Job.problem)
-            .outerjoin(tables.Job, tables.Job.id == tables.MapVersion.job_id)
-            .where(tables.MapVersion.map_id == map_id)
-            .options(selectinload(tables.MapVersion.scans)),
-            tables.MapVersion.created,
-            tables.MapVersion.job_id,
-            after=after,
-            limit=limit,
-        )
+        """Return versions of a map, newest first. Raises NotFound."""
         with self._database.read() as session:
-            of = map_row(session, map_id)
-            found = [version_record(row, of, problem) for row, problem in session.execute(query)]
-        return page_of(found, limit)
+            map_row(session, map_id)
+        query = whole_versions().where(MapVersion.map_id == map_id)
+        created, key = MapVersion.created, MapVersion.job_id
+        return self._database.page(query, created, key, VersionRecord.of_row, after=after, limit=limit)
 
     def save_outcomes(self, job_id: str, outcomes: Iterable[ScanOutcome]) -> None:
         """Record what became of the scans, also when the version then fails. Raises NotFound."""
         with self._database.write() as session:
-            row = row_of_job(session, job_id)
+            row = _row_of_job(session, job_id)
             write_outcomes(row.scans, outcomes)
             row.updated = now()
 
@@ -128,7 +97,7 @@ class Versions:
         Raises NotFound, also where the version was deleted since.
         """
         with self._database.write() as session:
-            row = row_of_job(session, job_id)
+            row = _row_of_job(session, job_id)
             write_outcomes(row.scans, outcomes)
             row.bounds = bounds.model_dump(mode="json")
             row.counts = dict(counts)
@@ -136,24 +105,186 @@ class Versions:
             row.updated = now()
 
     def delete(self, map_id: str, number: int) -> None:
-        """Forget a version with its job and files; surveys that were compared with it stay.
+        """Delete a version with its job and files; surveys that were compared with it stay.
 
         Raises NotFound, and Conflict for the version in use, one that builds, and one that a survey still needs.
         """
         with self._database.write() as session:
-            map_row(session, map_id, lock=True)
-            row = version_row(session, map_id, number)
-            check_deletable(session, row)
-            built_by = row.job_id
-            forget(session, row)
-        self._blobs.delete_prefix(blob_keys.map_folder(built_by))
+            lock_map(session, map_id)
+            row = _row(session, map_id, number)
+            _check_deletable(session, row)
+            folder = blob_keys.map_folder(row.job_id)
+            _delete(session, row)
+        self._blobs.delete_prefix(folder)
 
     def take_back(self, job_id: str) -> None:
-        """Forget a version whose job never reached the queue."""
+        """Delete a version whose job never reached the queue."""
         with self._database.write() as session:
-            forget(session, row_of_job(session, job_id))
+            _delete(session, _row_of_job(session, job_id))
 
 
-def _read(session: Session, row: tables.MapVersion) -> VersionRecord:
-    job = session.get(tables.Job, row.job_id)
-    return version_record(row, map_row(session, row.map_id), None if job is None else job.problem)
+def map_row(session: Session, map_id: str, *, lock: bool = False) -> tables.Map:
+    """Return the row of a map. Raises NotFound."""
+    row = session.get(tables.Map, map_id, with_for_update=lock)
+    if row is None:
+        raise NotFound(f"no map {map_id!r}; GET /maps lists those there are")
+    return row
+
+
+def lock_map(session: Session, map_id: str) -> None:
+    """Keep everybody else from making or deleting a version of a map until the session ends. Raises NotFound."""
+    map_row(session, map_id, lock=True)
+
+
+def whole_versions() -> Select[MapVersion]:
+    """Return a query for versions with all that their records show."""
+    related = (
+        selectinload(MapVersion.scans),
+        selectinload(MapVersion.job),
+        contains_eager(MapVersion.of_map),
+    )
+    return select(MapVersion).join(MapVersion.of_map).options(*related)
+
+
+def versions_in_use() -> Select[MapVersion]:
+    """Return a query for the version that each map shows: the newest that is ready, else the newest."""
+    other = aliased(MapVersion)
+    newest = select(other.job_id).where(other.map_id == tables.Map.map_id).correlate(tables.Map)
+    newest = newest.order_by(other.status != "ready", other.version.desc()).limit(1)
+    return whole_versions().where(MapVersion.job_id == newest.scalar_subquery())
+
+
+def version_in_use(session: Session, map_id: str) -> MapVersion:
+    """Return the row of the version in use. Raises NotFound, and NotReady where there is none yet."""
+    row = shown_version(session, map_id)
+    check_ready(row.status, f"map {map_id!r}", row.job_id)
+    return row
+
+
+def shown_version(session: Session, map_id: str) -> MapVersion:
+    """Return the row of the version that a map shows, whatever its state. Raises NotFound."""
+    row = session.scalar(versions_in_use().where(tables.Map.map_id == map_id))
+    if row is None:
+        raise NotFound(f"no map {map_id!r}; GET /maps lists those there are")
+    return row
+
+
+def new_version(job: tables.Job, scans: Iterable[ScanOutcome], number: int) -> MapVersion:
+    """Return the row of a version that is going to be built by `job`."""
+    return MapVersion(
+        job_id=job.job_id,
+        map_id=job.map_id,
+        version=number,
+        status="building",
+        counts={},
+        created=job.created,
+        updated=job.created,
+        scans=[
+            tables.VersionScan(scan_id=scan.scan_id, ordinal=n, **outcome_columns(scan))
+            for n, scan in enumerate(scans)
+        ],
+    )
+
+
+def check_ready(status: str, what: str, job_id: str) -> None:
+    """Raise NotReady with the job to look at, unless it is ready."""
+    if status == "building":
+        raise NotReady(f"{what} is still building; follow job {job_id}")
+    if status == "failed":
+        raise NotReady(f"{what} could not be built; job {job_id} says why")
+
+
+def _row(session: Session, map_id: str, number: int) -> MapVersion:
+    map_row(session, map_id)
+    query = select(MapVersion).where(MapVersion.map_id == map_id, MapVersion.version == number)
+    row = session.scalar(query)
+    if row is None:
+        raise NotFound(
+            f"no version {number} of map {map_id!r}; GET /maps/{map_id}/versions lists those there are"
+        )
+    return row
+
+
+def _row_of_job(session: Session, job_id: str) -> MapVersion:
+    row = session.get(MapVersion, job_id)
+    if row is None:
+        raise NotFound(f"job {job_id!r} builds no map, or its map was deleted")
+    return row
+
+
+def _next_number(session: Session, map_id: str) -> int:
+    """Return one more than the largest there is. Raises Conflict while another version builds."""
+    of_map = MapVersion.map_id == map_id
+    building = session.scalar(select(MapVersion).where(of_map, MapVersion.status == "building"))
+    if building is not None:
+        raise Conflict(
+            f"version {building.version} of map {map_id!r} is still building (job {building.job_id}); one version "
+            "builds at a time"
+        )
+    return 1 + (session.scalar(select(func.max(MapVersion.version)).where(of_map)) or 0)
+
+
+def _further_scans(session: Session, scan_ids: Sequence[str], base: MapVersion) -> list[ScanOutcome]:
+    """Return scans that are still to be registered. Raises NotFound, and BadRequest for one that is in `base`."""
+    scan_ids = checked_scan_ids(scan_ids)
+    scans_in_order(session, scan_ids)
+    known = _shared(base, scan_ids)
+    if known:
+        raise BadRequest(f"scan {known} is in version {base.version} of the map; send further ones")
+    return [ScanOutcome(scan_id=scan_id) for scan_id in scan_ids]
+
+
+def _survey_scans(session: Session, survey_id: str, base: MapVersion) -> list[ScanOutcome]:
+    """Return the accepted scans of a survey, which stays until the session ends.
+
+    Raises NotFound, also for a survey of another map, NotReady, and Conflict where `base` has taken it over.
+    """
+    survey = session.get(tables.Survey, survey_id, with_for_update=True)
+    if survey is None or survey.map_id != base.map_id:
+        raise NotFound(f"no survey {survey_id!r} of map {base.map_id!r}")
+    if survey.status != "ready":
+        raise NotReady(f"survey {survey_id!r} is {survey.status}; look at job {survey.job_id}")
+    scans = _accepted(survey.scans)
+    known = _shared(base, [scan.scan_id for scan in scans])
+    if known:
+        raise Conflict(
+            f"version {base.version} of the map holds scan {known} of survey {survey_id!r} already"
+        )
+    return scans
+
+
+def _accepted(rows: Iterable[tables.VersionScan | tables.SurveyScan]) -> list[ScanOutcome]:
+    """Return the accepted scans: what a later version keeps."""
+    return [ScanOutcome.of_row(row) for row in rows if row.accepted]
+
+
+def _shared(base: MapVersion, scan_ids: Iterable[str]) -> str:
+    """Name those of the scans that `base` holds."""
+    kept = {scan.scan_id for scan in _accepted(base.scans)}
+    return ", ".join(map(repr, sorted(kept.intersection(scan_ids))))
+
+
+def _check_deletable(session: Session, row: MapVersion) -> None:
+    """Raise Conflict for the version in use, one that builds, and one that a survey or a model needs meanwhile."""
+    name = f"version {row.version} of map {row.map_id!r}"
+    if row.status == "building":
+        raise Conflict(f"{name} is still building; dismiss job {row.job_id} first")
+    if row is shown_version(session, row.map_id):
+        raise Conflict(f"{name} is the one in use; delete the map, or make a newer version first")
+    if _needed(session, row, tables.Survey, "running"):
+        raise Conflict(f"a survey is being compared with {name}; wait for it, or dismiss its job")
+    if _needed(session, row, tables.Model, "training"):
+        raise Conflict(f"a model is being trained on {name}; wait for it, or dismiss its job")
+
+
+def _needed(
+    session: Session, row: MapVersion, by: type[tables.Survey] | type[tables.Model], status: str
+) -> bool:
+    of_version = (by.map_id == row.map_id, by.map_version == row.version, by.status == status)
+    return bool(session.scalar(select(exists().where(*of_version))))
+
+
+def _delete(session: Session, row: MapVersion) -> None:
+    """Delete a version and its job."""
+    session.execute(delete(tables.Job).where(tables.Job.job_id == row.job_id))
+    session.delete(row)

@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from service.tile_features import tile_collection, tile_feature
 from worker.detectors.detector import Detector
 from worker.pipeline.flow import (
     BuiltMap,
@@ -19,7 +20,7 @@ from worker.pipeline.flow import (
 )
 from worker.pipeline.registration.results import ScanFile, ScanResult
 from worker.pipeline.results.changes import ChangeSet
-from worker.pipeline.results.export import feature_collection, tile_results, write_coloured_cloud
+from worker.pipeline.results.export import tile_results, write_coloured_cloud
 from worker.pipeline.results.picture import draw_picture
 from worker.progress import Progress, no_progress
 
@@ -59,8 +60,17 @@ def write_results(
     """`tiles.geojson`, `cloud.ply` and `picture.png` in the folder `out`, by what they are. Raises OSError."""
     out.mkdir(parents=True, exist_ok=True)
     files = {"tiles": out / "tiles.geojson", "cloud": out / "cloud.ply", "picture": out / "picture.png"}
-    features = feature_collection(found.changes, map_id=map_id, survey_id=survey_id, model=model)
-    files["tiles"].write_text(json.dumps(features, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    survey = {
+        "map_id": map_id,
+        "survey_id": survey_id,
+        "model": model,
+        "captured_at": None,
+        "threshold": found.changes.threshold,
+    }
+    tiles = tile_collection(
+        tile_feature(**asdict(tile), survey=survey) for tile in tile_results(found.changes)
+    )
+    files["tiles"].write_text(json.dumps(tiles, indent=1, allow_nan=False) + "\n", encoding="utf-8")
     write_coloured_cloud(files["cloud"], found.located.current, found.changes)
     draw_picture(
         files["picture"],

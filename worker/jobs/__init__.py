@@ -4,12 +4,15 @@ Every step takes the job's id alone and may run twice: it reads what the step be
 an earlier run of itself left. A step of a job that has ended does nothing.
 """
 
-from worker.jobs.maps import describe_map, register_map
+from worker.jobs.maps import encode_map, register_map
 from worker.jobs.surveys import export_survey, register_survey, score_survey
 from worker.jobs.training import finish_model, pack_tiles, train_model
 
+describe_map = encode_map  # as steps name it that a release before 0.2 left in the queue
+
 __all__ = [
     "describe_map",
+    "encode_map",
     "export_survey",
     "finish_model",
     "pack_tiles",

@@ -40,13 +40,13 @@ def register_map(at: Context) -> None:
 
 
 @step
-def describe_map(at: Context) -> None:
+def encode_map(at: Context) -> None:
     """What the model can know of the reference alone; then the map is ready."""
     version = at.catalog.versions.of_job(at.job.job_id)
     detector = kept_detector(at, version.model)
     with at.catalog.blobs.local(blob_keys.map_tiles(at.job.job_id)) as path:
         tiles = archive.load_tiles(path)
-    description = detector.describe(tiles, progress=lambda _, share: at.report("describing", share))
+    description = detector.describe(tiles, progress=lambda _, share: at.report("encoding", share))
     key = blob_keys.map_embedding(at.job.job_id, version.model, detector.card.sha256)
     put(at, key, lambda path: archive.save_arrays(path, description))
     at.catalog.jobs.succeed(at.job.job_id)

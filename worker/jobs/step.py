@@ -27,7 +27,7 @@ MAP_STAGES = {
     "fusing": (0.75, 0.85),
     "tiling": (0.85, 0.88),
     "saving": (0.88, 0.9),
-    "describing": (0.9, 1.0),
+    "encoding": (0.9, 1.0),
 }
 SURVEY_STAGES = {
     "registering": (0.0, 0.45),
@@ -41,7 +41,7 @@ MODEL_STAGES = {
     "packing": (0.0, 0.05),
     "training": (0.05, 0.92),
     "calibrating": (0.92, 0.96),
-    "describing": (0.96, 1.0),
+    "encoding": (0.96, 1.0),
 }
 STAGES: dict[JobKind, dict[str, tuple[float, float]]] = {
     "map": MAP_STAGES,

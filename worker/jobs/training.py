@@ -147,7 +147,7 @@ def _describe(at: Context, detector: Detector, model: ModelRecord, version: Vers
     """So that the first survey has half of the work, as with the map's own model."""
     with at.catalog.blobs.local(blob_keys.map_tiles(version.job_id)) as path:
         tiles = archive.load_tiles(path)
-    description = detector.describe(tiles, progress=lambda _, share: at.report("describing", share))
+    description = detector.describe(tiles, progress=lambda _, share: at.report("encoding", share))
     key = blob_keys.map_embedding(version.job_id, model.model, detector.card.sha256)
     put(at, key, lambda path: archive.save_arrays(path, description))
 

@@ -41,8 +41,8 @@ def server(tmp_path) -> Iterator[tuple[httpx.Client, int, Path]]:
     here = Path(__file__).resolve()
     process = subprocess.Popen(
         [sys.executable, "-c", SERVER, settings.data_dir, settings.model_store, str(port)],
-        cwd=here.parents[2],
-        env={"PYTHONPATH": f"{here.parents[2]}:{here.parent}", "PATH": "/usr/bin:/bin"},
+        cwd=here.parents[3],
+        env={"PYTHONPATH": f"{here.parents[3]}:{here.parent}", "PATH": "/usr/bin:/bin"},
     )
     try:
         with httpx.Client(base_url=f"http://127.0.0.1:{port}", timeout=120) as client:

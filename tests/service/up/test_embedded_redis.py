@@ -16,7 +16,7 @@ from redis import Redis
 from service.up import embedded_redis
 from service.up.embedded_redis import DataFolderInUse, EmbeddedRedis, LaunchFailed, find_server
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 HOLDER = """
 import sys, time
 from pathlib import Path

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from service.api import schema
+from service.api import openapi
 
-PROJECT = Path(__file__).resolve().parents[2]
-WRITTEN = PROJECT / schema.FILE
+PROJECT = Path(__file__).resolve().parents[3]
+WRITTEN = PROJECT / openapi.FILE
 
 
 @pytest.fixture(scope="module")
@@ -19,7 +19,7 @@ def document() -> dict:
 
 
 def test_the_written_description_is_that_of_the_code():
-    assert WRITTEN.read_text() == schema.written(), "run `python -m service.api.schema`"
+    assert WRITTEN.read_text() == openapi.written(), "run `python -m service.api.openapi`"
 
 
 def test_every_reference_leads_somewhere(document):

@@ -6,7 +6,6 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from service.catalog.attempts import Attempts
 from tests.support.samples import add_map
 
 HOW = "the process of step m1-register ended by signal SIGKILL"
@@ -17,18 +16,13 @@ def job_id(catalog):
     return add_map(catalog, ready=False)
 
 
-@pytest.fixture
-def attempts(catalog):
-    return Attempts(catalog.database)
-
-
-def test_the_first_two_attempts_that_are_lost_are_told_and_the_third_fails_the_job(catalog, job_id, attempts):
+def test_the_first_two_attempts_that_are_lost_are_told_and_the_third_fails_the_job(catalog, job_id):
     catalog.jobs.start(job_id)
     for number in (2, 3):
-        assert attempts.lose(job_id, HOW)
+        assert catalog.jobs.lose_attempt(job_id, HOW)
         job = catalog.jobs.get(job_id)
         assert (job.status, job.message) == ("running", f"started again ({number} of 3): {HOW}")
-    assert not attempts.lose(job_id, HOW)
+    assert not catalog.jobs.lose_attempt(job_id, HOW)
     problem = catalog.jobs.get(job_id).problem
     assert problem.code == "worker_died"
     assert "SIGKILL" in problem.detail
@@ -36,48 +30,48 @@ def test_the_first_two_attempts_that_are_lost_are_told_and_the_third_fails_the_j
     assert catalog.maps.get("lobby").status == "failed"
 
 
-def test_a_job_that_died_before_it_said_so_runs_from_then_on(catalog, job_id, attempts):
-    assert attempts.lose(job_id, HOW)
+def test_a_job_that_died_before_it_said_so_runs_from_then_on(catalog, job_id):
+    assert catalog.jobs.lose_attempt(job_id, HOW)
     job = catalog.jobs.get(job_id)
     assert (job.status, job.started) == ("running", job.updated)
 
 
-def test_the_start_of_the_next_attempt_keeps_the_first_instant_and_the_share(catalog, job_id, attempts):
+def test_the_start_of_the_next_attempt_keeps_the_first_instant_and_the_share(catalog, job_id):
     catalog.jobs.start(job_id)
     catalog.jobs.report(job_id, message="registering", progress=0.5)
     before = catalog.jobs.get(job_id)
-    attempts.lose(job_id, HOW)
+    catalog.jobs.lose_attempt(job_id, HOW)
     catalog.jobs.start(job_id)
     after = catalog.jobs.get(job_id)
     assert (after.started, after.progress) == (before.started, 50)
 
 
-def test_what_is_put_back_costs_no_attempt(catalog, job_id, attempts):
+def test_what_is_put_back_costs_no_attempt(catalog, job_id):
     catalog.jobs.start(job_id)
     for _ in range(5):
-        assert attempts.put_back(job_id)
+        assert catalog.jobs.put_back(job_id)
     assert catalog.jobs.get(job_id).status == "running"
-    assert attempts.lose(job_id, HOW)
+    assert catalog.jobs.lose_attempt(job_id, HOW)
     assert "(2 of 3)" in catalog.jobs.get(job_id).message
 
 
 @pytest.mark.parametrize("end", ["succeed", "dismiss"])
-def test_a_job_that_ended_is_not_started_again(catalog, job_id, attempts, end):
+def test_a_job_that_ended_is_not_started_again(catalog, job_id, end):
     catalog.jobs.start(job_id)
     getattr(catalog.jobs, end)(job_id)
     ended = catalog.jobs.get(job_id)
-    assert not attempts.lose(job_id, HOW)
-    assert not attempts.put_back(job_id)
+    assert not catalog.jobs.lose_attempt(job_id, HOW)
+    assert not catalog.jobs.put_back(job_id)
     assert catalog.jobs.get(job_id) == ended
 
 
-def test_a_job_that_is_gone_is_not_started_again(attempts):
-    assert not attempts.lose("job-nowhere", HOW)
-    assert not attempts.put_back("job-nowhere")
+def test_a_job_that_is_gone_is_not_started_again(catalog):
+    assert not catalog.jobs.lose_attempt("job-nowhere", HOW)
+    assert not catalog.jobs.put_back("job-nowhere")
 
 
-def test_of_five_that_lose_a_job_at_once_two_start_it_again(catalog, job_id, attempts):
+def test_of_five_that_lose_a_job_at_once_two_start_it_again(catalog, job_id):
     with ThreadPoolExecutor(5) as pool:
-        answers = list(pool.map(lambda _: attempts.lose(job_id, HOW), range(5)))
+        answers = list(pool.map(lambda _: catalog.jobs.lose_attempt(job_id, HOW), range(5)))
     assert answers.count(True) == 2
     assert catalog.jobs.get(job_id).status == "failed"

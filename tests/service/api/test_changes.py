@@ -6,7 +6,7 @@ from datetime import timedelta
 
 import pytest
 
-from service.api.paging import encoded
+from service.api.http.paging import encoded
 from tests.support.samples import (
     NOON,
     RememberingQueue,

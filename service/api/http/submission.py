@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import contextlib
 import logging
-from collections.abc import Callable, Iterator, Sequence
-from datetime import datetime
+from collections.abc import Callable, Iterator
+from typing import Annotated
 
-from service.api.incoming import Upload
-from service.api.services import Services
-from service.catalog.attempts import Attempts
+from fastapi import Request as HttpRequest
+from fastapi import Response
+from pydantic import BeforeValidator, Field
+
+from service.api.http.bodies import Body
+from service.api.http.dependencies import Services
+from service.api.http.documents import Link, Request, link
+from service.api.http.fields import DeviceId, Id, Instant, names_from_text
 from service.catalog.catalog import Catalog
 from service.catalog.records import JobRecord, ScanRecord
 from service.errors import QueueUnavailable, ServiceError
@@ -17,31 +22,32 @@ from service.errors import QueueUnavailable, ServiceError
 log = logging.getLogger(__name__)
 
 
+class ScansRequest(Request):
+    """Scans that were uploaded before; others may come with the request."""
+
+    scan_ids: Annotated[tuple[Id, ...], BeforeValidator(names_from_text), Field(max_length=1000)] = ()
+    captured_at: Annotated[Instant | None, Field(description="of the files in this request")] = None
+    device_id: Annotated[DeviceId | None, Field(description="of the files in this request")] = None
+
+
 @contextlib.contextmanager
-def kept_scans(
-    catalog: Catalog,
-    uploads: Sequence[Upload],
-    scan_ids: Sequence[str],
-    *,
-    device_id: str | None,
-    captured_at: datetime | None,
-) -> Iterator[tuple[str, ...]]:
-    """The ids of the scans of a request: those named, then the files it brought, each once.
+def kept_scans(catalog: Catalog, body: Body, wanted: ScansRequest) -> Iterator[tuple[str, ...]]:
+    """Give the ids of the scans of a request: those named, then the files it brought, each once.
 
     When the block raises, files that were new are forgotten again.
     """
     new: list[ScanRecord] = []
-    ids = list(scan_ids)
+    ids = list(wanted.scan_ids)
     try:
-        for upload in uploads:
+        for upload in body.uploads:
             scan, is_new = catalog.scans.add(
                 upload.path,
                 filename=upload.filename,
                 format=upload.format,
                 size=upload.size,
                 sha256=upload.sha256,
-                device_id=device_id,
-                captured_at=captured_at,
+                device_id=wanted.device_id,
+                captured_at=wanted.captured_at,
             )
             if is_new:
                 new.append(scan)
@@ -52,6 +58,13 @@ def kept_scans(
         for scan in new:
             catalog.scans.take_back(scan)
         raise
+
+
+def monitor(request: HttpRequest, response: Response, job: JobRecord) -> Link:
+    """Return the link to a job that was submitted, which the answer names in `Location` as well."""
+    here = link(request, f"/jobs/{job.job_id}", "monitor")
+    response.headers["Location"] = here.href
+    return here
 
 
 def submit(services: Services, job: JobRecord, *, forget: Callable[[], None]) -> None:
@@ -69,12 +82,12 @@ def resubmit(services: Services) -> None:
     A job that waits was perhaps never submitted: a process died between the two, or Redis lost it. One that runs has
     lost its worker, and with it an attempt: what takes the whole machine down with it must not do so for ever.
     """
-    attempts = Attempts(services.catalog.database)
+    jobs = services.catalog.jobs
     try:
-        for job in services.catalog.jobs.unfinished():
+        for job in jobs.unfinished():
             if services.queue.holds(job.job_id, job.kind):
                 continue
-            if job.status == "accepted" or attempts.lose(job.job_id, "the service ended while it ran"):
+            if job.status == "accepted" or jobs.lose_attempt(job.job_id, "the service ended while it ran"):
                 services.queue.submit(job.job_id, job.kind)
     except QueueUnavailable as error:
         log.warning("unfinished jobs could not be submitted again: %s", error)

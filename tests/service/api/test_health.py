@@ -7,7 +7,7 @@ import shutil
 
 from sqlalchemy import text
 
-from service.api.problems import MEDIA_TYPE
+from service.api.http.problems import MEDIA_TYPE
 from tests.support.samples import add_map
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from service.api.problems import MEDIA_TYPE, PROBLEMS
+from service.api.http.problems import MEDIA_TYPE, PROBLEMS
 from service.errors import ServiceError
 from tests.support.samples import (
     MODEL,

@@ -7,7 +7,7 @@ from typing import Annotated, Protocol, cast
 
 from fastapi import Depends, Request
 
-from service.api.cards import Cards
+from service.api.http.cards import Cards
 from service.catalog.catalog import Catalog
 from service.catalog.steps import JobKind
 from service.settings import Settings

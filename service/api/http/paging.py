@@ -5,21 +5,15 @@ from __future__ import annotations
 import base64
 import json
 from collections.abc import Callable, Sequence
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any
 
 from fastapi import Request as HttpRequest
 from pydantic import Field
 
-from service.api.documents import Document, Link, link
-from service.api.requests import Request
-from service.api.values import instant
-from service.catalog.changes import ChangePosition
-from service.catalog.clock import rfc3339
-from service.catalog.page import Page, Position
+from service.api.http.documents import Link, Request, link
+from service.api.http.fields import instant
+from service.catalog.records import Page, Position, rfc3339
 from service.errors import BadRequest
-
-T = TypeVar("T")
-D = TypeVar("D", bound=Document)
 
 Limit = Annotated[int, Field(ge=1, le=1000, description="most items in one answer")]
 Cursor = Annotated[str | None, Field(max_length=1000, description="from a `next` link; opaque")]
@@ -35,7 +29,7 @@ class PageRequest(Request):
         """Where to go on. Raises BadRequest."""
         if self.cursor is None:
             return None
-        created, key = _decoded(self.cursor, instant, str)
+        created, key = decoded(self.cursor, instant, str)
         return created, key
 
 
@@ -54,25 +48,13 @@ def next_link(request: HttpRequest, cursor: str, media_type: str = "application/
     return link(request, f"{_path(request)}?{url.query}", "next", media_type)
 
 
-def change_cursor(position: ChangePosition) -> str:
-    """The cursor behind a change."""
-    return encoded(rfc3339(position.captured_at), position.survey_id, position.score.hex(), position.tile_id)
-
-
-def change_position(cursor: str | None) -> ChangePosition | None:
-    """Where to go on. Raises BadRequest."""
-    if cursor is None:
-        return None
-    captured_at, survey_id, score, tile_id = _decoded(cursor, instant, str, float.fromhex, str)
-    return ChangePosition(captured_at=captured_at, survey_id=survey_id, score=score, tile_id=tile_id)
-
-
 def encoded(*parts: str) -> str:
     """An opaque cursor of these parts."""
     return base64.urlsafe_b64encode(json.dumps(parts).encode()).decode().rstrip("=")
 
 
-def _decoded(cursor: str, *readers: Callable[[str], Any]) -> Sequence[Any]:
+def decoded(cursor: str, *readers: Callable[[str], Any]) -> Sequence[Any]:
+    """Return the parts of a cursor, each as its reader reads it. Raises BadRequest."""
     try:
         parts = json.loads(base64.urlsafe_b64decode(cursor + "=" * (-len(cursor) % 4)))
         return [read(part) for read, part in zip(readers, parts, strict=True)]

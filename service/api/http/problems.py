@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from typing import Any
+from typing import Annotated, Any
 from uuid import uuid4
 
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse, Response
-from pydantic import BaseModel, Field
+from pydantic import BaseModel, BeforeValidator, Field
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 
@@ -70,10 +70,19 @@ class ProblemDocument(BaseModel):
     errors: list[InvalidValue] | None = None
 
 
-def problem_of(problem: Problem) -> ProblemDocument:
-    """The document of a failed job's problem; an unknown code keeps its type under a general title."""
+def problem_of(problem: Problem | None) -> ProblemDocument | None:
+    """Return the document of a failed job's problem; an unknown code keeps its type under a general title."""
+    if problem is None:
+        return None
     status, title = PROBLEMS.get(problem.code, PROBLEMS["pipeline_error"])
     return ProblemDocument(type=_type(problem.code), title=title, status=status, detail=problem.detail)
+
+
+#: The problem of a record as its document shows it.
+JobProblem = Annotated[ProblemDocument | None, BeforeValidator(problem_of)]
+
+#: What may be wrong with any body; documented in this order.
+BODY = ("incomplete_body", "too_large", "wrong_media_type", "bad_request", "invalid_request")
 
 
 def response(

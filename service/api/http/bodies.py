@@ -1,0 +1,240 @@
+"""Bodies of requests: JSON, a form with files, or one raw file, in memory that does not grow with the body.
+
+Forms (multipart/form-data, RFC 7578) are read as they come: files go to disk at once, fields stay small in memory. The
+framework's own form would keep every file in a spool of its own and only then hand it over, too late for a limit.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from collections.abc import AsyncIterator, Callable
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from fastapi import Request
+from fastapi.concurrency import run_in_threadpool
+from pydantic import BaseModel
+from python_multipart.exceptions import FormParserError
+from python_multipart.multipart import MultipartParser, parse_options_header
+
+from service.api.http.uploads import Incoming, Upload
+from service.errors import BadRequest, TooLarge, WrongMediaType
+from service.settings import Settings
+
+PIECE = 1 << 20  #: bytes handed to the disk at a time
+MAX_JSON_BYTES = 1 << 20
+MAX_FIELDS_BYTES = 1 << 20  #: of all fields of a form together
+MAX_PARTS = 2000  #: of a form
+INCOMING = (
+    "incoming"  #: folder in the data folder; on the disk of the blobs, so that keeping a file is a rename
+)
+
+JSON = "application/json"
+FORM = "multipart/form-data"
+RAW = "application/octet-stream"
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Body:
+    """What a request brought; the files go when the request ends."""
+
+    fields: dict[str, Any] = field(default_factory=dict)
+    uploads: tuple[Upload, ...] = ()
+
+
+@contextlib.asynccontextmanager
+async def received(
+    request: Request, settings: Settings, *, takes: tuple[str, ...], files: str, filename: str | None = None
+) -> AsyncIterator[Body]:
+    """The body of a request in one of the media types `takes`.
+
+    `files` names the form field of files; `filename` that of a raw body. Raises WrongMediaType, TooLarge,
+    BadRequest, ScanUnreadable; leaves nothing behind whichever way it ends.
+    """
+    media_type, options = _media_type(request)
+    if media_type not in takes:
+        said = media_type or "no media type"
+        raise WrongMediaType(f"the body comes as {said}; send it as {' or '.join(takes)}")
+    folder = settings.data_dir / INCOMING
+    limit = MAX_JSON_BYTES if media_type == JSON else settings.max_upload_bytes
+    await run_in_threadpool(folder.mkdir, parents=True, exist_ok=True)
+    kept = ExitStack()
+    try:
+        if media_type == JSON:
+            text = bytearray()
+            await _pour(request, text.extend, limit=limit)
+            yield Body(fields=_json(bytes(text)))
+        elif media_type == FORM:
+            if not options.get(b"boundary"):
+                raise BadRequest("the Content-Type names no boundary; let the HTTP library write this header")
+            form = Form(options[b"boundary"], folder, kept, frozenset({files}))
+            await _pour(request, form.feed, limit=limit)
+            form.finish()
+            yield Body(fields=form.fields, uploads=tuple(form.uploads))
+        else:
+            file = kept.enter_context(Incoming(folder, filename or ""))
+            await _pour(request, file.write, limit=limit)
+            yield Body(uploads=(await run_in_threadpool(file.finish),))
+    finally:
+        await run_in_threadpool(kept.close)
+
+
+def documented(
+    *,
+    json: type[BaseModel] | None = None,
+    raw: bool = False,
+    form: type[BaseModel] | None = None,
+    file: str = "file",
+) -> dict[str, Any]:
+    """Return the `openapi_extra` of a route that reads its body by hand; `file` is the form field of the file or files."""
+    content: dict[str, Any] = {}
+    binary = {"type": "string", "format": "binary"}
+    if raw:
+        content[RAW] = {"schema": binary}
+    if json is not None:
+        content[JSON] = {"schema": _reference(json)}
+    if form is not None:
+        files = binary if file == "file" else {"type": "array", "items": binary}
+        content[FORM] = {
+            "schema": {"allOf": [_reference(form), {"type": "object", "properties": {file: files}}]}
+        }
+    return {"requestBody": {"required": True, "content": content}}
+
+
+def _reference(model: type[BaseModel]) -> dict[str, str]:
+    return {"$ref": f"#/components/schemas/{model.__name__}"}
+
+
+async def _pour(request: Request, take: Callable[[bytes], None], *, limit: int) -> None:
+    """Hand the body to `take` in pieces, in a thread. Raises TooLarge as soon as it is, also without a length."""
+    declared = request.headers.get("content-length", "")
+    if declared.isdigit() and int(declared) > limit:
+        raise TooLarge(f"the body has {declared} bytes, more than the {limit} that are taken")
+    size = 0
+    piece = bytearray()
+    async for chunk in request.stream():
+        size += len(chunk)
+        if size > limit:
+            raise TooLarge(f"the body has more than the {limit} bytes that are taken")
+        piece += chunk
+        if len(piece) >= PIECE:
+            await run_in_threadpool(take, bytes(piece))
+            piece.clear()
+    if piece:
+        await run_in_threadpool(take, bytes(piece))
+
+
+def _media_type(request: Request) -> tuple[str, dict[bytes, bytes]]:
+    kind, options = parse_options_header(request.headers.get("content-type", ""))
+    return kind.decode("latin-1").lower(), options
+
+
+def _json(text: bytes) -> dict[str, Any]:
+    if not text.strip():
+        raise BadRequest("the body is empty; send a JSON object")
+    try:
+        fields = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise BadRequest(f"the body is not JSON: {error}") from error
+    if not isinstance(fields, dict):
+        raise BadRequest(f"the body is a JSON {type(fields).__name__}; send an object")
+    return fields
+
+
+class Form:
+    """A form being received; `feed` and `finish` block on the disk and so run in a thread."""
+
+    def __init__(self, boundary: bytes, folder: Path, kept: ExitStack, file_fields: frozenset[str]) -> None:
+        """Files of `file_fields` go to `folder`, and `kept` removes them at its end."""
+        self.fields: dict[str, Any] = {}
+        self.uploads: list[Upload] = []
+        self._folder, self._kept, self._file_fields = folder, kept, file_fields
+        self._header: tuple[bytearray, bytearray] = (bytearray(), bytearray())
+        self._disposition = b""
+        self._name = ""
+        self._file: Incoming | None = None
+        self._text = bytearray()
+        self._parts = self._text_bytes = 0
+        self._ended = False
+        self._parser = MultipartParser(
+            boundary,
+            {
+                "on_part_begin": self._part_begin,
+                "on_header_field": self._header_field,
+                "on_header_value": self._header_value,
+                "on_header_end": self._header_end,
+                "on_headers_finished": self._headers_finished,
+                "on_part_data": self._part_data,
+                "on_part_end": self._part_end,
+                "on_end": self._end,
+            },
+        )
+
+    def feed(self, data: bytes) -> None:
+        """Take the next piece of the body. Raises BadRequest, TooLarge, ScanUnreadable."""
+        try:
+            self._parser.write(data)
+        except FormParserError as error:
+            raise BadRequest(f"the multipart body cannot be read: {error}") from error
+
+    def finish(self) -> None:
+        """The body has ended. Raises BadRequest when the form has not."""
+        if not self._ended:
+            raise BadRequest("the multipart body ends before its last boundary; send it again")
+
+    def _part_begin(self) -> None:
+        self._parts += 1
+        if self._parts > MAX_PARTS:
+            raise BadRequest(f"more than {MAX_PARTS} parts in one form")
+        self._disposition, self._name, self._file = b"", "", None
+        self._text = bytearray()
+
+    def _header_field(self, data: bytes, start: int, end: int) -> None:
+        self._header[0].extend(data[start:end])
+
+    def _header_value(self, data: bytes, start: int, end: int) -> None:
+        self._header[1].extend(data[start:end])
+
+    def _header_end(self) -> None:
+        if bytes(self._header[0]).lower() == b"content-disposition":
+            self._disposition = bytes(self._header[1])
+        self._header = (bytearray(), bytearray())
+
+    def _headers_finished(self) -> None:
+        kind, options = parse_options_header(self._disposition)
+        if kind != b"form-data" or b"name" not in options:
+            raise BadRequest("a part of the form has no name (Content-Disposition: form-data; name=...)")
+        self._name = options[b"name"].decode("utf-8", "replace")
+        if b"filename" not in options and self._name not in self._file_fields:
+            return
+        if self._name not in self._file_fields:
+            wanted = " or ".join(repr(name) for name in sorted(self._file_fields))
+            raise BadRequest(f"a file in the field {self._name!r}; files go in {wanted}")
+        filename = options.get(b"filename", b"scan").decode("utf-8", "replace")
+        self._file = self._kept.enter_context(Incoming(self._folder, filename))
+
+    def _part_data(self, data: bytes, start: int, end: int) -> None:
+        if self._file is not None:
+            self._file.write(memoryview(data)[start:end])
+            return
+        self._text_bytes += end - start
+        if self._text_bytes > MAX_FIELDS_BYTES:
+            raise TooLarge(f"the fields of the form hold more than {MAX_FIELDS_BYTES} bytes")
+        self._text.extend(data[start:end])
+
+    def _part_end(self) -> None:
+        if self._file is not None:
+            self.uploads.append(self._file.finish())
+            return
+        value = self._text.decode("utf-8", "replace")
+        known = self.fields.get(self._name)
+        if known is None:
+            self.fields[self._name] = value
+        else:
+            self.fields[self._name] = [*(known if isinstance(known, list) else [known]), value]
+
+    def _end(self) -> None:
+        self._ended = True

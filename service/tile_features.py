@@ -1,0 +1,91 @@
+"""Tiles as features: OGC Features and Geometries JSON 1.0 (JSON-FG, OGC 21-045r1), which is GeoJSON as well.
+
+A tile is a Prism in the map's own frame: metres, z up. GeoJSON's `geometry` admits WGS 84 alone (RFC 7946, Section 4), so it
+is null where nobody said where the map lies. Plain JSON values: the API checks and answers with them
+(`service.api.features`), `spicd-worker detect` writes them to a file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+Corner = tuple[float, float, float]  #: metres, map frame
+Ring = tuple[tuple[float, float], ...]
+
+CONFORMS_TO = (
+    "http://www.opengis.net/spec/json-fg-1/1.0/conf/core",
+    "http://www.opengis.net/spec/json-fg-1/1.0/conf/prisms",
+)
+FEATURE_TYPE = "spicd-tile"
+#: OGC's name for a local Cartesian frame of three axes in metres, z up (JSON-FG repository, core/crs).
+MAP_FRAME = "http://www.opengis.net/def/crs/OGC/0/Engineering3D"
+
+
+def tile_collection(features: Iterable[dict[str, Any]], *, matched: int | None = None) -> dict[str, Any]:
+    """Return a FeatureCollection without links; `matched` counts the features of every page, left out: these."""
+    features = list(features)
+    return {
+        "type": "FeatureCollection",
+        "conformsTo": list(CONFORMS_TO),
+        "featureType": FEATURE_TYPE,
+        "coordRefSys": MAP_FRAME,
+        "numberMatched": len(features) if matched is None else matched,
+        "numberReturned": len(features),
+        "links": [],
+        "features": features,
+    }
+
+
+def tile_feature(
+    *,
+    tile_id: str,
+    tile_index: Sequence[int],
+    lower: Corner,
+    upper: Corner,
+    state: str,
+    score: float | None,
+    probabilities: Sequence[float] | None,
+    n_reference: int,
+    n_current: int,
+    survey: Mapping[str, Any],
+    geometry: dict[str, Any] | None = None,
+) -> dict[str, Any]:
+    """Return one tile of a survey.
+
+    `survey` holds the properties that all its tiles share, `survey_id` and `captured_at` (RFC 3339) among them; where
+    the latter is None, `time` is null. `geometry` is the footprint in WGS 84.
+    """
+    captured_at = survey["captured_at"]
+    return {
+        "type": "Feature",
+        "id": f"{survey['survey_id']}.{tile_id}",
+        "geometry": geometry,
+        "place": {
+            "type": "Prism",
+            "base": {
+                "type": "Polygon",
+                "coordinates": [[list(corner) for corner in footprint(lower, upper)]],
+            },
+            "lower": lower[2],
+            "upper": upper[2],
+        },
+        "time": None if captured_at is None else {"timestamp": captured_at},
+        "properties": {
+            "tile_id": tile_id,
+            "tile_index": list(tile_index),
+            "center": [round((low + high) / 2, 6) for low, high in zip(lower, upper, strict=True)],
+            "state": state,
+            "score": score,
+            "probabilities": None if probabilities is None else list(probabilities),
+            "n_reference": n_reference,
+            "n_current": n_current,
+            **survey,
+        },
+    }
+
+
+def footprint(lower: Corner, upper: Corner) -> Ring:
+    """Return the outline of a box seen from above, counter-clockwise and closed."""
+    (x0, y0, _), (x1, y1, _) = lower, upper
+    return (x0, y0), (x1, y0), (x1, y1), (x0, y1), (x0, y0)

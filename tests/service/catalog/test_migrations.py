@@ -1,0 +1,130 @@
+"""A database of the last 0.1 build is up to date as it is; one of an earlier or a later build is refused."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from sqlalchemy import inspect
+
+from service.catalog import blob_keys
+from service.catalog.catalog import Catalog, open_catalog
+from service.catalog.database import Database, WrongRevision
+from service.settings import Settings
+from tests.support.samples import BOUNDS, IDENTITY, add_survey, tile
+
+WRITTEN = Path(__file__).with_name("release_0_1_0.sql")
+
+
+@pytest.fixture
+def old(tmp_path: Path) -> Settings:
+    """A data folder with the database that release 0.1.0 wrote: two versions of a map, a survey, a trained model."""
+    settings = Settings(data_dir=tmp_path / "data")
+    settings.data_dir.mkdir()
+    run(settings, WRITTEN.read_text())
+    return settings
+
+
+@pytest.fixture
+def opened(old: Settings) -> Iterator[Catalog]:
+    catalog = open_catalog(old)
+    yield catalog
+    catalog.close()
+
+
+def run(settings: Settings, script: str) -> None:
+    connection = sqlite3.connect(settings.data_dir / "spicd.sqlite")
+    connection.executescript(script)
+    connection.close()
+
+
+def test_the_map_of_the_last_build_is_read_as_it_was_written(opened: Catalog) -> None:
+    lobby = opened.maps.ready("lobby")
+    assert (lobby.version, lobby.job_id, lobby.counts, lobby.bounds) == (1, "job-1", {"tiles": 4}, BOUNDS)
+    assert lobby.anchor is not None
+    assert (lobby.anchor.longitude, lobby.anchor.heading) == (13.4, 90)
+    (scan,) = lobby.scans
+    assert (scan.scan_id, scan.accepted, scan.fitness, scan.map_from_scan) == ("scan-1", True, 0.98, IDENTITY)
+    building, ready = opened.versions.page("lobby").items
+    assert (building.version, building.base_version, building.status) == (2, 1, "building")
+    assert [scan.scan_id for scan in building.scans] == ["scan-1", "scan-3"]
+    assert (ready.version, ready.registration) == (1, {"scans": 1})
+
+
+def test_the_survey_of_the_last_build_keeps_its_tiles(opened: Catalog) -> None:
+    survey = opened.surveys.ready("survey-1")
+    assert (survey.map_version, survey.threshold, survey.counts["changed"]) == (1, 0.5, 1)
+    tiles = [change.tile for change in opened.changes.of_survey("survey-1")]
+    assert tiles == [tile(0, 0), tile(1, 0, "unobserved")]
+
+
+def test_the_model_and_the_jobs_of_the_last_build_are_there(opened: Catalog) -> None:
+    (model,) = opened.models.ready()
+    assert (model.model, model.minutes, model.card) == (
+        "lobby-net/1",
+        5,
+        {"name": "lobby-net", "version": "1", "threshold": 0.4},
+    )
+    assert [job.status for job in opened.jobs.page().items] == [
+        "successful",
+        "accepted",
+        "successful",
+        "successful",
+    ]
+    assert [job.job_id for job in opened.jobs.unfinished()] == ["job-3"]
+    assert opened.scans.get("scan-2").key.startswith("scans/scan-2-")
+
+
+def test_the_embedding_of_the_last_build_is_found_under_its_key() -> None:
+    key = blob_keys.map_embedding("job-1", "spicd-net/1", "0123456789abcdef")
+    assert key == "maps/job-1/description-spicd-net-1-0123456789ab.npz"
+
+
+def test_work_goes_on_in_a_database_of_the_last_build(opened: Catalog) -> None:
+    assert opened.jobs.start("job-3")
+    outcomes = [scan.model_copy(update={"accepted": True}) for scan in opened.versions.get("lobby", 2).scans]
+    opened.versions.save_result("job-3", outcomes=outcomes, bounds=BOUNDS, counts={"tiles": 5})
+    assert opened.jobs.succeed("job-3")
+    survey_id, _ = add_survey(opened, [tile(0, 0)])
+    assert opened.surveys.ready(survey_id).map_version == 2
+    opened.maps.delete("lobby")
+    assert opened.jobs.page().items == []
+
+
+def test_the_tables_of_the_last_build_are_those_of_a_new_database(old: Settings, tmp_path: Path) -> None:
+    new = Database(f"sqlite:///{tmp_path / 'new.sqlite'}")
+    new.upgrade()
+    before, now = inspect(Database(old.resolved_database_url()).engine), inspect(new.engine)
+    assert set(before.get_table_names()) == set(now.get_table_names())
+    for table in now.get_table_names():
+        assert describe(before, table) == describe(now, table)
+
+
+def describe(inspector: object, table: str) -> dict[str, list[str]]:
+    """Columns, keys and indices of a table, each in no particular order."""
+    parts = ("get_columns", "get_foreign_keys", "get_indexes", "get_unique_constraints")
+    return {part: sorted(map(str, getattr(inspector, part)(table))) for part in parts}
+
+
+@pytest.mark.parametrize("revision", ["0001", "0004"])
+def test_a_database_of_an_earlier_build_is_refused_with_what_to_do(old: Settings, revision: str) -> None:
+    run(old, f"UPDATE alembic_version SET version_num = '{revision}'")
+    with pytest.raises(WrongRevision, match=rf"revision {revision}.*last 0\.1 build.*empty data folder"):
+        open_catalog(old)
+
+
+def test_a_database_of_a_later_release_is_refused_as_well(old: Settings) -> None:
+    run(old, "UPDATE alembic_version SET version_num = '0006'")
+    with pytest.raises(WrongRevision, match="a newer release"):
+        open_catalog(old)
+
+
+def test_what_is_refused_stays_as_it_was(old: Settings) -> None:
+    run(old, "UPDATE alembic_version SET version_num = '0003'")
+    file = old.data_dir / "spicd.sqlite"
+    before = list(sqlite3.connect(file).iterdump())
+    with pytest.raises(WrongRevision):
+        open_catalog(old)
+    assert list(sqlite3.connect(file).iterdump()) == before
