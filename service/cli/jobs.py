@@ -9,8 +9,8 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
-from service.cli.maps import facts
-from service.cli.terminal import Terminal, columns
+from service.cli.tables import columns, facts
+from service.cli.terminal import Terminal
 from service.client import ClientError, Document, sentence
 
 _STYLES = {"successful": "green", "failed": "red", "dismissed": "yellow", "running": "cyan"}
@@ -31,45 +31,31 @@ def jobs(
     terminal: Terminal = ctx.obj
     if job_id is None and (cancel or wait):
         raise ClientError("name the job; `spicd jobs` lists them")
-    with terminal.client() as client:
-        if job_id is None:
-            found = client.jobs()
-            terminal.show(found, lambda: _table(found))
-            return
-        if cancel:
-            job = client.dismiss(job_id)
-        else:
-            job = terminal.wait(client, job_id) if wait else client.job(job_id)
-    terminal.show(job, lambda: _whole(job))
+    if job_id is None:
+        terminal.ask(lambda client: client.jobs(), _table)
+    elif cancel:
+        terminal.ask(lambda client: client.dismiss(job_id), _whole)
+    elif wait:
+        terminal.ask(lambda client: terminal.wait(client, job_id), _whole)
+    else:
+        terminal.ask(lambda client: client.job(job_id), _whole)
 
 
-def _table(found: list[Document]) -> Table:
+def _table(jobs: list[Document]) -> Table:
     table = columns("job", "kind", "status", "progress", "message", "created")
-    for job in found:
+    for job in jobs:
         status = Text(job["status"], style=_STYLES.get(job["status"], ""))
-        progress = f"{job.get('progress') or 0} %"
-        table.add_row(
-            job["jobID"],
-            job.get("processID"),
-            status,
-            progress,
-            Text(job.get("message") or ""),
-            job.get("created"),
-        )
+        message = Text(job.get("message") or "")
+        table.add_row(job["jobID"], job.get("processID"), status, _percent(job), message, job.get("created"))
     return table
 
 
 def _whole(job: Document) -> Group:
-    about = facts(
-        [
-            ("job", job["jobID"]),
-            ("status", job["status"]),
-            ("progress", f"{job.get('progress') or 0} %"),
-            ("message", job.get("message")),
-            ("created", job.get("created")),
-            ("started", job.get("started")),
-            ("finished", job.get("finished")),
-        ]
-    )
+    shown = {**job, "job": job["jobID"], "progress": _percent(job)}
+    about = facts(shown, "job", "status", "progress", "message", "created", "started", "finished")
     problem = job.get("problem")
     return Group(about, Text(sentence(problem), style="red")) if problem else Group(about)
+
+
+def _percent(job: Document) -> str:
+    return f"{job.get('progress') or 0} %"

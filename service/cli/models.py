@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 from rich.console import Group
 from rich.table import Table
 
-from service.cli.maps import Wait, facts
-from service.cli.terminal import Terminal, columns
+from service.cli.tables import columns, facts, number
+from service.cli.terminal import Terminal, Wait
 from service.client import Document
 
 
@@ -30,9 +30,7 @@ def list_(ctx: typer.Context) -> None:
     if ctx.invoked_subcommand is not None:
         return
     terminal: Terminal = ctx.obj
-    with terminal.client() as client:
-        found = client.models()
-    terminal.show(found, lambda: _table(found))
+    terminal.ask(lambda client: client.models(), _table)
 
 
 def train(
@@ -50,45 +48,25 @@ def train(
     terminal: Terminal = ctx.obj
     with terminal.client() as client:
         accepted = client.train_model(map_id, name=name, base=base, minutes=minutes, epochs=epochs)
-        if not wait:
-            terminal.show(accepted, lambda: _accepted_line(accepted))
-            return
-        terminal.wait(client, accepted["job_id"])
-        card = client.model(accepted["model"])
-    terminal.show(card, lambda: _whole(card))
-
-
-def _accepted_line(accepted: Document) -> str:
-    job_id = accepted["job_id"]
-    return f"model {accepted['model']}: job {job_id} is on its way, `spicd jobs {job_id}` shows it"
+        model = accepted["model"]
+        terminal.accepted(client, f"model {model}", accepted, wait, lambda: client.model(model), _whole)
 
 
 def _table(cards: list[Document]) -> Table:
     table = columns("model", "detector", "threshold", "summary")
     for card in cards:
-        name = f"{card.get('name')}/{card.get('version')}"
-        table.add_row(
-            name, str(card.get("detector", "")), str(card.get("threshold", "")), str(card.get("summary", ""))
-        )
+        table.add_row(_name(card), *(str(card.get(key, "")) for key in ("detector", "threshold", "summary")))
     return table
 
 
 def _whole(card: Document) -> Group:
-    about = facts(
-        [
-            ("model", f"{card.get('name')}/{card.get('version')}"),
-            ("summary", card.get("summary")),
-            ("threshold", card.get("threshold")),
-        ]
-    )
     figures = columns("measured on", "area under ROC", "precision", "recall", "F1")
     for name, measured in card.get("evaluation", {}).items():
         if isinstance(measured, dict):
-            figures.add_row(
-                name, *(_two(measured.get(key)) for key in ("area_under_roc", "precision", "recall", "f1"))
-            )
-    return Group(about, figures)
+            values = (measured.get(key) for key in ("area_under_roc", "precision", "recall", "f1"))
+            figures.add_row(name, *(number(value, 2) for value in values))
+    return Group(facts({**card, "model": _name(card)}, "model", "summary", "threshold"), figures)
 
 
-def _two(value: Any) -> str:
-    return f"{value:.2f}" if isinstance(value, int | float) else ""
+def _name(card: Document) -> str:
+    return f"{card.get('name')}/{card.get('version')}"

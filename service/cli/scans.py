@@ -8,11 +8,9 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
-from service.cli.terminal import Terminal, columns, read_pose
+from service.cli.tables import columns
+from service.cli.terminal import Captured, Device, Terminal, read_pose
 from service.client import ClientError, Document
-
-Captured = Annotated[str | None, typer.Option("--captured-at", help="RFC 3339, with its zone.")]
-Device = Annotated[str | None, typer.Option("--device-id", help="Which robot or scanner.")]
 
 
 def register(commands: typer.Typer) -> None:
@@ -36,12 +34,8 @@ def add(
     if pose is not None and len(files) > 1:
         raise ClientError("one pose belongs to one scan; add the files one at a time")
     start = read_pose(pose) if pose else None
-    with terminal.client() as client:
-        found = [
-            terminal.upload(client, file, device_id=device_id, captured_at=captured_at, pose=start)
-            for file in files
-        ]
-    terminal.show(found, lambda: _table(found))
+    about = {"device_id": device_id, "captured_at": captured_at, "pose": start}
+    terminal.ask(lambda client: [terminal.upload(client, file, **about) for file in files], _table)
 
 
 def _table(scans: list[Document]) -> Table:

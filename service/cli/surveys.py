@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Annotated
 
 import typer
 from rich.console import Group
 from rich.table import Table
 
-from service.cli.maps import Model, Scans, Wait, accepted_line, counts, facts, number, scan_table
-from service.cli.scans import Captured, Device
-from service.cli.terminal import Terminal, columns
+from service.cli.tables import columns, counts, facts, number, point, scan_table
+from service.cli.terminal import Captured, Device, Model, Scans, Terminal, Wait
 from service.client import Document
 
 
@@ -40,28 +40,27 @@ def submit(
     with terminal.client() as client:
         ids = terminal.scan_ids(client, scans, **about)
         accepted = client.submit_survey(map_id, ids, model=model, threshold=threshold, **about)
-        if not wait:
-            terminal.show(accepted, lambda: accepted_line("survey", accepted))
-            return
-        terminal.wait(client, accepted["job_id"])
-        found = client.survey(accepted["survey_id"])
-    terminal.show(found, lambda: _whole(found, terminal.url))
+        survey_id = accepted["survey_id"]
+        terminal.accepted(
+            client,
+            f"survey {survey_id}",
+            accepted,
+            wait,
+            lambda: client.survey(survey_id),
+            _whole(terminal.url),
+        )
 
 
 def list_(ctx: typer.Context, map_id: str) -> None:
     """Every survey of a map."""
     terminal: Terminal = ctx.obj
-    with terminal.client() as client:
-        found = client.surveys(map_id)
-    terminal.show(found, lambda: _table(found))
+    terminal.ask(lambda client: client.surveys(map_id), _table)
 
 
 def show(ctx: typer.Context, survey_id: str) -> None:
     """One survey with its scans and counts."""
     terminal: Terminal = ctx.obj
-    with terminal.client() as client:
-        found = client.survey(survey_id)
-    terminal.show(found, lambda: _whole(found, terminal.url))
+    terminal.ask(lambda client: client.survey(survey_id), _whole(terminal.url))
 
 
 def changes(
@@ -75,11 +74,8 @@ def changes(
 ) -> None:
     """The changed tiles of a map, newest first."""
     terminal: Terminal = ctx.obj
-    with terminal.client() as client:
-        found = client.changes(
-            map_id, survey=survey, bbox=bbox, datetime=datetime, min_score=min_score, limit=limit
-        )
-    terminal.show(found, lambda: _change_table(found))
+    filters = {"survey": survey, "bbox": bbox, "datetime": datetime, "min_score": min_score, "limit": limit}
+    terminal.ask(lambda client: client.changes(map_id, **filters), _change_table)
 
 
 def _table(surveys: list[Document]) -> Table:
@@ -90,34 +86,40 @@ def _table(surveys: list[Document]) -> Table:
     return table
 
 
-def _whole(found: Document, url: str) -> Group:
-    survey_id = found["survey_id"]
-    ready = found["status"] == "ready"
-    about = facts(
-        [
-            ("survey", survey_id),
-            ("map", found.get("map_id")),
-            ("status", found["status"]),
-            ("captured", found.get("captured_at")),
-            ("model", found.get("model")),
-            ("threshold", found.get("threshold")),
-            ("tiles", counts(found)),
-            ("cloud", f"{url}/surveys/{survey_id}/cloud.ply" if ready else None),
-            ("picture", f"{url}/surveys/{survey_id}/picture.png" if ready else None),
-            ("features", f"{url}/surveys/{survey_id}/tiles" if ready else None),
-        ]
-    )
-    return Group(about, scan_table(found.get("scans", [])))
+def _whole(url: str) -> Callable[[Document], Group]:
+    """Return what draws a survey of the service at `url`."""
+
+    def draw(survey: Document) -> Group:
+        about = {
+            "survey": survey["survey_id"],
+            "map": survey.get("map_id"),
+            "captured": survey.get("captured_at"),
+        }
+        here = f"{url}/surveys/{survey['survey_id']}"
+        rows = {"tiles": counts(survey)}
+        if survey["status"] == "ready":
+            rows |= {
+                "cloud": f"{here}/cloud.ply",
+                "picture": f"{here}/picture.png",
+                "features": f"{here}/tiles",
+            }
+        names = ("survey", "map", "status", "captured", "model", "threshold")
+        return Group(facts(survey | about, *names, **rows), scan_table(survey))
+
+    return draw
 
 
-def _change_table(found: Document) -> Group:
+def _change_table(collection: Document) -> Group:
     table = columns("tile", "state", "score", "center (m)", "survey", "captured")
-    for feature in found["features"]:
-        tile = feature["properties"]
-        center = ", ".join(f"{value:.2f}" for value in tile["center"])
-        score = number(tile.get("score"), 2)
+    features = collection["features"]
+    for tile in (feature["properties"] for feature in features):
         table.add_row(
-            tile["tile_id"], tile["state"], score, center, tile["survey_id"], tile.get("captured_at")
+            tile["tile_id"],
+            tile["state"],
+            number(tile.get("score"), 2),
+            point(tile["center"]),
+            tile["survey_id"],
+            tile.get("captured_at"),
         )
-    total = found.get("numberMatched", len(found["features"]))
-    return Group(table, f"{len(found['features'])} of {total} changed tiles")
+    total = collection.get("numberMatched", len(features))
+    return Group(table, f"{len(features)} of {total} changed tiles")

@@ -1,4 +1,4 @@
-"""What every command has: the client, a place for results, and one for everything else.
+"""What every command has: the options that several take, the client, a place for results, and one for everything else.
 
 Results go to stdout, as a table or, with `--json`, as JSON and nothing else. Progress, notes and errors go to stderr.
 """
@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, TypeVar
 
 import typer
 from rich.console import Console
@@ -24,9 +24,16 @@ from rich.progress import (
     TextColumn,
     TimeElapsedColumn,
 )
-from rich.table import Table
 
 from service.client import Client, ClientError, Document, JobFailed, OnProgress, Pose
+
+T = TypeVar("T")
+
+Scans = Annotated[list[str], typer.Argument(help="Files, which are uploaded, or ids of scans.")]
+Captured = Annotated[str | None, typer.Option("--captured-at", help="RFC 3339, with its zone.")]
+Device = Annotated[str | None, typer.Option("--device-id", help="Which robot or scanner.")]
+Model = Annotated[str | None, typer.Option(help="`name/version`; `spicd models` lists them.")]
+Wait = Annotated[bool, typer.Option("--wait", help="Follow the job to its end.")]
 
 PIPE_WIDTH = 160  #: characters; where nobody says how wide the place is that stdout goes to
 _ID = re.compile(r"[A-Za-z0-9_-]{1,64}")
@@ -52,12 +59,41 @@ class Terminal:
         with Client(self.url) as client:
             yield client
 
-    def show(self, document: Any, table: Callable[[], Any]) -> None:
+    def ask(self, call: Callable[[Client], T], table: Callable[[T], Any]) -> None:
+        """Call the API and print its answer."""
+        with self.client() as client:
+            answer = call(client)
+        self.show(answer, table)
+
+    def show(self, document: T, table: Callable[[T], Any]) -> None:
         """Print a result: the document itself with `--json`, otherwise what `table` makes of it."""
         if self.as_json:
             self._print_json(document)
         else:
-            self.out.print(table())
+            self.out.print(table(document))
+
+    def deleted(self, name: str, **ids: Any) -> None:
+        """Say that a thing is gone."""
+        self.show({**ids, "deleted": True}, lambda _: f"{name} is deleted")
+
+    def accepted(
+        self,
+        client: Client,
+        name: str,
+        accepted: Document,
+        wait: bool,
+        result: Callable[[], Document],
+        table: Callable[[Document], Any],
+    ) -> None:
+        """Say that a job is on its way; with `wait` follow it to its end, and print its `result`."""
+        job_id = accepted["job_id"]
+        if wait:
+            self.wait(client, job_id)
+            self.show(result(), table)
+        else:
+            self.show(
+                accepted, lambda _: f"{name}: job {job_id} is on its way, `spicd jobs {job_id}` shows it"
+            )
 
     def note(self, text: str) -> None:
         """Tell a person something that is no result."""
@@ -117,14 +153,6 @@ class Terminal:
 def _description() -> TextColumn:
     """What a bar is about, as it is: a file name may look like markup."""
     return TextColumn("{task.description}", style="bold", markup=False)
-
-
-def columns(*names: str) -> Table:
-    """An empty table that folds what is too long for it: an id that is cut is of no use."""
-    table = Table()
-    for name in names:
-        table.add_column(name, overflow="fold")
-    return table
 
 
 def _advance(bar: Progress) -> OnProgress:

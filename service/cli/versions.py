@@ -8,9 +8,8 @@ import typer
 from rich.console import Group
 from rich.table import Table
 
-from service.cli.maps import Wait, counts, facts, scan_table
-from service.cli.scans import Captured, Device
-from service.cli.terminal import Terminal, columns
+from service.cli.tables import columns, counts, facts, scan_table
+from service.cli.terminal import Captured, Device, Terminal, Wait
 from service.client import Document
 
 Further = Annotated[
@@ -42,28 +41,21 @@ def add(
     with terminal.client() as client:
         ids = terminal.scan_ids(client, scans or [], device_id=device_id, captured_at=captured_at)
         accepted = client.create_version(map_id, ids, survey_id=survey)
-        if not wait:
-            terminal.show(accepted, lambda: _accepted_line(accepted))
-            return
-        terminal.wait(client, accepted["job_id"])
-        found = client.version(map_id, accepted["version"])
-    terminal.show(found, lambda: _whole(found))
+        version = accepted["version"]
+        name = f"version {version} of map {map_id}"
+        terminal.accepted(client, name, accepted, wait, lambda: client.version(map_id, version), _whole)
 
 
 def list_(ctx: typer.Context, map_id: str) -> None:
     """Every version of a map."""
     terminal: Terminal = ctx.obj
-    with terminal.client() as client:
-        found = client.versions(map_id)
-    terminal.show(found, lambda: _table(found))
+    terminal.ask(lambda client: client.versions(map_id), _table)
 
 
 def show(ctx: typer.Context, map_id: str, version: int) -> None:
     """One version with its scans."""
     terminal: Terminal = ctx.obj
-    with terminal.client() as client:
-        found = client.version(map_id, version)
-    terminal.show(found, lambda: _whole(found))
+    terminal.ask(lambda client: client.version(map_id, version), _whole)
 
 
 def delete(ctx: typer.Context, map_id: str, version: int) -> None:
@@ -71,14 +63,7 @@ def delete(ctx: typer.Context, map_id: str, version: int) -> None:
     terminal: Terminal = ctx.obj
     with terminal.client() as client:
         client.delete_version(map_id, version)
-    gone = {"map_id": map_id, "version": version, "deleted": True}
-    terminal.show(gone, lambda: f"version {version} of map {map_id} is deleted")
-
-
-def _accepted_line(accepted: Document) -> str:
-    job_id = accepted["job_id"]
-    name = f"version {accepted['version']} of map {accepted['map_id']}"
-    return f"{name}: job {job_id} is on its way, `spicd jobs {job_id}` shows it"
+    terminal.deleted(f"version {version} of map {map_id}", map_id=map_id, version=version)
 
 
 def _made_from(one: Document) -> str:
@@ -98,14 +83,7 @@ def _table(versions: list[Document]) -> Table:
     return table
 
 
-def _whole(found: Document) -> Group:
-    about = facts(
-        [
-            ("map", found["map_id"]),
-            ("version", found["version"]),
-            ("status", found["status"]),
-            ("made from", _made_from(found)),
-            ("counts", counts(found)),
-        ]
-    )
-    return Group(about, scan_table(found.get("scans", [])))
+def _whole(document: Document) -> Group:
+    about = {"map": document["map_id"], **document}
+    rows = {"made from": _made_from(document), "counts": counts(document)}
+    return Group(facts(about, "map", "version", "status", **rows), scan_table(document))

@@ -1,0 +1,62 @@
+"""Documents of the API as tables for people."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from rich.table import Table
+from rich.text import Text
+
+from service.client import Document
+
+_ACCEPTED: dict[bool | None, Text] = {True: Text("yes", style="green"), False: Text("no", style="red")}
+
+
+def columns(*names: str) -> Table:
+    """Return an empty table that folds what is too long for it: an id that is cut is of no use."""
+    table = Table()
+    for name in names:
+        table.add_column(name, overflow="fold")
+    return table
+
+
+def facts(document: Document, *names: str, **more: Any) -> Table:
+    """Return two columns: the members of these `names` and `more`, without those that are not there."""
+    table = Table(show_header=False, box=None)
+    rows = {name: document.get(name) for name in names} | more
+    for name, value in rows.items():
+        if value not in (None, "", {}):
+            table.add_row(Text(name, style="bold"), str(value))
+    return table
+
+
+def counts(document: Document) -> str:
+    """Write counts as `changed 3, unchanged 40`."""
+    return ", ".join(
+        f"{name.replace('_', ' ')} {number}" for name, number in document.get("counts", {}).items()
+    )
+
+
+def scan_table(document: Document) -> Table:
+    """Return how each scan of a map, version or survey was registered."""
+    table = columns("scan", "accepted", "fitness", "rmse (m)", "sigma (m)", "reason")
+    for scan in document.get("scans", []):
+        table.add_row(
+            scan["scan_id"],
+            _ACCEPTED.get(scan.get("accepted"), Text()),
+            number(scan.get("fitness"), 2),
+            number(scan.get("rmse"), 3),
+            number(scan.get("translation_sigma"), 3),
+            scan.get("reason"),
+        )
+    return table
+
+
+def number(value: Any, digits: int) -> str:
+    """Write a number, and nothing for what is none."""
+    return f"{value:.{digits}f}" if isinstance(value, int | float) else ""
+
+
+def point(values: list[float]) -> str:
+    """Write coordinates in metres."""
+    return ", ".join(number(value, 2) for value in values)
