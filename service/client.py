@@ -12,7 +12,7 @@ import json
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, BinaryIO, Self
+from typing import Any, Self
 from urllib.parse import quote
 
 import httpx
@@ -88,16 +88,16 @@ class Client:
         on_sent: OnSent | None = None,
     ) -> Document:
         """Send one PLY or PCD, streamed from disk; `captured_at` is RFC 3339, `pose` map_from_sensor in metres."""
-        query = {
-            "filename": filename or (source.name if isinstance(source, Path) else "scan"),
-            "device_id": device_id,
-            "captured_at": captured_at,
-            "pose": None if pose is None else json.dumps([list(row) for row in pose]),
-        }
+        query = _given(
+            filename=filename or (source.name if isinstance(source, Path) else "scan"),
+            device_id=device_id,
+            captured_at=captured_at,
+            pose=None if pose is None else json.dumps([list(row) for row in pose]),
+        )
         size = source.stat().st_size if isinstance(source, Path) else len(source)
         headers = {"Content-Type": "application/octet-stream", "Content-Length": str(size)}
         content = _pieces(source, size, on_sent)
-        return self._json("POST", "/scans", params=_given(query), headers=headers, content=content)
+        return self._json("POST", "/scans", params=query, headers=headers, content=content)
 
     # maps
 
@@ -112,9 +112,8 @@ class Client:
         anchor: Document | None = None,
     ) -> Document:
         """Build a reference map; returns `map_id` and `job_id`."""
-        about = {"id": map_id, "name": name, "model": model, "settings": settings, "anchor": anchor}
-        body = {**about, "scan_ids": list(scan_ids)}
-        return self._json("POST", "/maps", json=_given(body))
+        about = _given(id=map_id, name=name, model=model, settings=settings, anchor=anchor)
+        return self._json("POST", "/maps", json={**about, "scan_ids": list(scan_ids)})
 
     def maps(self) -> list[Document]:
         """Every map."""
@@ -139,8 +138,8 @@ class Client:
         self, map_id: str, scan_ids: Sequence[str] = (), *, survey_id: str | None = None
     ) -> Document:
         """Go on from a map's version in use, with further scans or a survey; returns `version` and `job_id`."""
-        body = {"scan_ids": list(scan_ids) or None, "survey_id": survey_id}
-        return self._json("POST", f"/maps/{_quoted(map_id)}/versions", json=_given(body))
+        body = _given(scan_ids=list(scan_ids) or None, survey_id=survey_id)
+        return self._json("POST", f"/maps/{_quoted(map_id)}/versions", json=body)
 
     def versions(self, map_id: str) -> list[Document]:
         """Every version of a map, newest first."""
@@ -167,14 +166,9 @@ class Client:
         threshold: float | None = None,
     ) -> Document:
         """Compare scans with a map; returns `survey_id` and `job_id`."""
-        body = {
-            "scan_ids": list(scan_ids),
-            "captured_at": captured_at,
-            "device_id": device_id,
-            "model": model,
-            "threshold": threshold,
-        }
-        return self._json("POST", f"/maps/{_quoted(map_id)}/surveys", json=_given(body))
+        about = _given(captured_at=captured_at, device_id=device_id, model=model, threshold=threshold)
+        body = {**about, "scan_ids": list(scan_ids)}
+        return self._json("POST", f"/maps/{_quoted(map_id)}/surveys", json=body)
 
     def surveys(self, map_id: str) -> list[Document]:
         """Every survey of a map."""
@@ -190,7 +184,7 @@ class Client:
 
     def changes(self, map_id: str, **filters: Any) -> Document:
         """One page of changed tiles; filters are those of the API: `survey bbox datetime min_score limit`."""
-        return self._json("GET", f"/maps/{_quoted(map_id)}/changes", params=_given(filters))
+        return self._json("GET", f"/maps/{_quoted(map_id)}/changes", params=_given(**filters))
 
     # jobs and models
 
@@ -232,13 +226,13 @@ class Client:
         epochs: int | None = None,
     ) -> Document:
         """Train a model on a map, from nothing or from `base`; returns `model` and `job_id`."""
-        body = {"name": name, "base": base, "minutes": minutes, "epochs": epochs}
-        return self._json("POST", f"/maps/{_quoted(map_id)}/models", json=_given(body))
+        body = _given(name=name, base=base, minutes=minutes, epochs=epochs)
+        return self._json("POST", f"/maps/{_quoted(map_id)}/models", json=body)
 
     def model(self, model: str) -> Document:
         """The card of `name/version`."""
         name, _, version = model.partition("/")
-        return self._json("GET", f"/models/{_quoted(name)}", params=_given({"version": version or None}))
+        return self._json("GET", f"/models/{_quoted(name)}", params=_given(version=version or None))
 
     # files
 
@@ -275,14 +269,14 @@ class Client:
 
     def _all(self, path: str, name: str) -> list[Document]:
         """The list `name` of a document and of the pages that follow it."""
-        found: list[Document] = []
+        items: list[Document] = []
         following: str | None = path
         while following:
             page = self._json("GET", following)
-            found += page[name]
+            items += page[name]
             links = page.get("links", [])
             following = next((link["href"] for link in links if link.get("rel") == "next"), None)
-        return found
+        return items
 
     def _unreachable(self, error: httpx.TransportError) -> Unreachable:
         if isinstance(error, httpx.ConnectError | httpx.ConnectTimeout):
@@ -292,8 +286,8 @@ class Client:
         return Unreachable(f"the connection to {self.url} broke ({type(error).__name__}); try again")
 
 
-def _given(values: dict[str, Any]) -> dict[str, Any]:
-    """What was given, without what was left out."""
+def _given(**values: Any) -> dict[str, Any]:
+    """Return what was given, without what was left out."""
     return {name: value for name, value in values.items() if value is not None}
 
 
@@ -308,16 +302,11 @@ def _pieces(source: Path | bytes, size: int, on_sent: OnSent | None) -> Iterator
         return
     sent = 0
     with source.open("rb") as file:
-        for piece in _read(file):
+        while piece := file.read(PIECE):
             yield piece
             sent += len(piece)
             if on_sent is not None:
                 on_sent(sent, size)
-
-
-def _read(file: BinaryIO) -> Iterator[bytes]:
-    while piece := file.read(PIECE):
-        yield piece
 
 
 def _refused(answer: httpx.Response) -> RequestRefused:

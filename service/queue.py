@@ -6,8 +6,8 @@ the catalog.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from typing import Any
 
 from redis import Redis
@@ -53,55 +53,45 @@ class JobQueue:
 
     def ping(self) -> None:
         """Return when the queue can take jobs."""
-        try:
+        with _redis_errors():
             self._redis.ping()
-        except RedisError as error:
-            raise _unavailable(error) from error
 
     def submit(self, job_id: str, kind: JobKind) -> None:
         """Enqueue the steps of a job, all or none; a job that the queue holds is left as it is.
 
         One that it lost goes on with the first step that had not finished, as far as the queue remembers.
         """
-        try:
-            with self._redis.pipeline() as pipe:
-                # every change of a step's state is one of these keys, so who comes between is noticed
-                pipe.watch(*(Job.key_for(step_id(job_id, step)) for step in self._steps[kind]))  # type: ignore[no-untyped-call]
-                if self._holds(job_id, kind):
-                    return
-                jobs = self._chain(job_id, self._left(job_id, kind))
-                pipe.multi()
-                for job in jobs:
-                    self._forget(job, pipe)
-                for waiting in jobs[1:]:
-                    self._defer(waiting, pipe)
-                self._queue(jobs[0].origin).enqueue_job(jobs[0], pipeline=pipe)
-                pipe.execute()
-        except WatchError:  # the same job was submitted, or moved on, between the look and the write
-            return
-        except RedisError as error:
-            raise _unavailable(error) from error
+        # a WatchError: the same job was submitted, or moved on, between the look and the write
+        with _redis_errors(), suppress(WatchError), self._redis.pipeline() as pipe:
+            # every change of a step's state is one of these keys, so who comes between is noticed
+            pipe.watch(*(Job.key_for(step_id(job_id, step)) for step in self._steps[kind]))  # type: ignore[no-untyped-call]
+            if self._holds(job_id, kind):
+                return
+            jobs = self._chain(job_id, self._left(job_id, kind))
+            pipe.multi()
+            for job in jobs:
+                self._forget(job, pipe)
+            for waiting in jobs[1:]:
+                self._defer(waiting, pipe)
+            self._queue(jobs[0].origin).enqueue_job(jobs[0], pipeline=pipe)
+            pipe.execute()
 
     def holds(self, job_id: str, kind: JobKind) -> bool:
         """Whether a step of the job waits for a worker, or a worker has its claim on one.
 
         A claim outlives its worker by about a minute; then another worker finds it and asks what to do.
         """
-        try:
+        with _redis_errors():
             return self._holds(job_id, kind)
-        except RedisError as error:
-            raise _unavailable(error) from error
 
     def release_claims(self) -> None:
         """Take all claims away: for a caller who knows that no worker is alive, and need not wait until they end."""
-        try:
+        with _redis_errors():
             for name in sorted({step.queue for steps in self._steps.values() for step in steps}):
                 queue = self._queue(name)
                 self._redis.delete(
                     queue.started_job_registry.key, queue.intermediate_queue_key, queue.registry_cleaning_key
                 )
-        except RedisError as error:
-            raise _unavailable(error) from error
 
     def dismiss(self, job_id: str, kind: JobKind) -> None:
         """Take back what waits and stop what runs in a geometry worker.
@@ -110,19 +100,15 @@ class JobQueue:
         catalog between batches whether its job was dismissed. So does a step that starts while this call is made.
         """
         ids = [step_id(job_id, step) for step in self._steps[kind]]
-        try:
-            found = Job.fetch_many(ids, connection=self._redis, serializer=JSONSerializer)
-            for job in reversed([job for job in found if job]):  # the last first: nothing moves up meanwhile
+        with _redis_errors(), suppress(InvalidJobOperation):  # a step that expired between two looks
+            known = Job.fetch_many(ids, connection=self._redis, serializer=JSONSerializer)
+            for job in reversed([job for job in known if job]):  # the last first: nothing moves up meanwhile
                 status = job.get_status(refresh=False)
                 if status in (JobStatus.QUEUED, JobStatus.DEFERRED):
                     job.delete()
                 elif status == JobStatus.STARTED and job.origin == "geometry":
                     with suppress(InvalidJobOperation, NoSuchJobError):  # it ended just now
                         send_stop_job_command(self._redis, job.id, serializer=JSONSerializer)
-        except InvalidJobOperation:  # a step that expired between two looks
-            return
-        except RedisError as error:
-            raise _unavailable(error) from error
 
     def close(self) -> None:
         """Give the connections back."""
@@ -143,8 +129,8 @@ class JobQueue:
         """The steps from the first that has not finished; all of them where none is known, or none is left."""
         steps = self._steps[kind]
         ids = [step_id(job_id, step) for step in steps]
-        found = Job.fetch_many(ids, connection=self._redis, serializer=JSONSerializer)
-        for number, job in enumerate(found):
+        known = Job.fetch_many(ids, connection=self._redis, serializer=JSONSerializer)
+        for number, job in enumerate(known):
             if job is None or job.get_status(refresh=False) != JobStatus.FINISHED:
                 return steps[number:]
         return steps
@@ -192,9 +178,12 @@ class JobQueue:
         job.save(pipeline=pipe)
 
 
-def _unavailable(error: RedisError) -> QueueUnavailable:
-    """One sentence; the address is left out, for it may hold a password."""
-    kind = type(error).__name__
-    return QueueUnavailable(
-        f"the job queue does not answer ({kind}); nothing was recorded, try again shortly"
-    )
+@contextmanager
+def _redis_errors() -> Iterator[None]:
+    """Raise QueueUnavailable for an error of Redis: one sentence, without the address, which may hold a password."""
+    try:
+        yield
+    except RedisError as error:
+        raise QueueUnavailable(
+            f"the job queue does not answer ({type(error).__name__}); nothing was recorded, try again shortly"
+        ) from error

@@ -12,7 +12,7 @@ from service.api.http.dependencies import Provided
 from service.api.http.documents import Document, Link, link
 from service.api.http.fields import Id
 from service.api.http.paging import PageRequest, list_links
-from service.api.http.problems import JobProblem, documented
+from service.api.http.problems import LISTED, NAMED, JobProblem, documented
 from service.api.http.submission import dismiss
 from service.api.models import model_path
 from service.catalog.records import JobRecord, JobStatus
@@ -57,7 +57,7 @@ class JobList(Document):
     links: list[Link]
 
 
-@router.get("/jobs", summary="List jobs", responses=documented("invalid_request", "bad_request"))
+@router.get("/jobs", summary="List jobs", responses=LISTED)
 def list_jobs(request: Request, services: Provided, asked: Annotated[JobsRequest, Query()]) -> JobList:
     """Newest first."""
     page = services.catalog.jobs.page(
@@ -67,7 +67,7 @@ def list_jobs(request: Request, services: Provided, asked: Annotated[JobsRequest
     return JobList(jobs=[job_document(job, request) for job in page.items], links=links)
 
 
-@router.get("/jobs/{job_id}", summary="Follow a job", responses=documented("not_found", "invalid_request"))
+@router.get("/jobs/{job_id}", summary="Follow a job", responses=NAMED)
 def get_job(request: Request, services: Provided, job_id: JobId) -> JobDocument:
     """Its state, stage and progress; a failed job carries its problem."""
     return job_document(services.catalog.jobs.get(job_id), request)

@@ -16,7 +16,7 @@ from service.api.http.documents import Document, Link, Request, checked, link
 from service.api.http.fields import Id, Model, Text, from_text
 from service.api.http.files import blob_response
 from service.api.http.paging import PageRequest, list_links
-from service.api.http.problems import BODY, JobProblem, documented
+from service.api.http.problems import BODY, LISTED, MADE, NAMED, JobProblem, documented
 from service.api.http.submission import ScansRequest, kept_scans, monitor, stop_if_open, submit
 from service.catalog import blob_keys
 from service.catalog.records import Anchor, Built, JobRecord, MapRecord, MapStatus
@@ -46,7 +46,7 @@ class MapSettings(Request):
     registration: RegistrationRequest = RegistrationRequest()
 
 
-class AnchorRequest(Request):
+class AnchorRequest(Anchor):
     """Where a map lies on the Earth: the origin of its frame in WGS 84, and how the frame is turned; z points up there."""
 
     longitude: Annotated[float, Field(ge=-180, le=180, description="degrees, of the origin", examples=[13.4])]
@@ -64,10 +64,6 @@ class AnchorRequest(Request):
             examples=[90],
         ),
     ]
-
-    def anchor(self) -> Anchor:
-        """As the catalog keeps it."""
-        return Anchor(**self.model_dump())
 
 
 class MapRequest(ScansRequest):
@@ -120,16 +116,14 @@ class MapList(Document):
 )
 async def create_map(request: HttpRequest, response: Response, services: Provided) -> AcceptedMap:
     """From scans uploaded before (`scan_ids`) or sent here (`scans`); their poses, where given, set the frame of the map."""
-    async with bodies.received(
-        request, services.settings, takes=(bodies.JSON, bodies.FORM), files="scans"
-    ) as body:
+    async with bodies.received(request, services.settings) as body:
         wanted = checked(MapRequest, body.fields)
         record, job = await run_in_threadpool(_create, services, wanted, body)
     links = [link(request, f"/maps/{record.map_id}", "self"), monitor(request, response, job)]
     return AcceptedMap(map_id=record.map_id, job_id=job.job_id, status=record.status, links=links)
 
 
-@router.get("/maps", summary="List maps", responses=documented("invalid_request", "bad_request"))
+@router.get("/maps", summary="List maps", responses=LISTED)
 def list_maps(request: HttpRequest, services: Provided, asked: Annotated[PageRequest, Query()]) -> MapList:
     """Newest first."""
     page = services.catalog.maps.page(after=asked.after(), limit=asked.limit)
@@ -137,7 +131,7 @@ def list_maps(request: HttpRequest, services: Provided, asked: Annotated[PageReq
     return MapList(maps=[map_document(record, request) for record in page.items], links=links)
 
 
-@router.get("/maps/{map_id}", summary="Look at a map", responses=documented("not_found", "invalid_request"))
+@router.get("/maps/{map_id}", summary="Look at a map", responses=NAMED)
 def get_map(request: HttpRequest, services: Provided, map_id: MapId) -> MapDocument:
     """Its version in use: state, what became of each scan, and extent and counts once it is ready.
 
@@ -146,12 +140,7 @@ def get_map(request: HttpRequest, services: Provided, map_id: MapId) -> MapDocum
     return map_document(services.catalog.maps.get(map_id), request)
 
 
-@router.delete(
-    "/maps/{map_id}",
-    status_code=204,
-    summary="Delete a map",
-    responses=documented("not_found", "invalid_request"),
-)
+@router.delete("/maps/{map_id}", status_code=204, summary="Delete a map", responses=NAMED)
 def delete_map(services: Provided, map_id: MapId) -> None:
     """With its versions, surveys, jobs and files; jobs that still run are stopped first. Its scans stay."""
     services.catalog.maps.get(map_id)
@@ -164,10 +153,7 @@ def delete_map(services: Provided, map_id: MapId) -> None:
     "/maps/{map_id}/manifest",
     summary="The tiles of a map",
     response_model=dict[str, Any],
-    responses={
-        200: {"description": "The tile manifest, fields as in Table A1 of the paper"},
-        **documented("not_found", "not_ready", "invalid_request"),
-    },
+    responses={200: {"description": "The tile manifest, fields as in Table A1 of the paper"}, **MADE},
 )
 def get_manifest(services: Provided, map_id: MapId) -> Response:
     """Tile size, bounds, and every tile that is kept."""
@@ -178,10 +164,7 @@ def get_manifest(services: Provided, map_id: MapId) -> Response:
     "/maps/{map_id}/cloud.ply",
     summary="The cloud of a map",
     response_class=Response,
-    responses={
-        **files.documented(bodies.RAW, "The fused reference map, PLY"),
-        **documented("not_found", "not_ready", "invalid_request"),
-    },
+    responses=files.documented(bodies.RAW, "The fused reference map, PLY") | MADE,
 )
 def get_map_cloud(services: Provided, map_id: MapId) -> Response:
     """The fused reference map, in metres."""
@@ -196,18 +179,13 @@ def get_map_cloud(services: Provided, map_id: MapId) -> Response:
 )
 async def put_anchor(request: HttpRequest, services: Provided, map_id: MapId) -> MapDocument:
     """From now on every feature of the map, old or new, carries its footprint in WGS 84 as `geometry`."""
-    async with bodies.received(request, services.settings, takes=(bodies.JSON,), files="") as body:
+    async with bodies.received(request, services.settings, takes=(bodies.JSON,)) as body:
         wanted = checked(AnchorRequest, body.fields)
-    record = await run_in_threadpool(services.catalog.maps.set_anchor, map_id, wanted.anchor())
+    record = await run_in_threadpool(services.catalog.maps.set_anchor, map_id, wanted)
     return map_document(record, request)
 
 
-@router.delete(
-    "/maps/{map_id}/anchor",
-    status_code=204,
-    summary="Take a map off the Earth",
-    responses=documented("not_found", "invalid_request"),
-)
+@router.delete("/maps/{map_id}/anchor", status_code=204, summary="Take a map off the Earth", responses=NAMED)
 def delete_anchor(services: Provided, map_id: MapId) -> None:
     """Features have no `geometry` then; once more changes nothing."""
     services.catalog.maps.set_anchor(map_id, None)
@@ -223,7 +201,7 @@ def _create(services: Services, wanted: MapRequest, body: Body) -> tuple[MapReco
             map_id=wanted.id,
             name=wanted.name,
             settings=wanted.settings.model_dump(mode="json", exclude_none=True),
-            anchor=None if wanted.anchor is None else wanted.anchor.anchor(),
+            anchor=wanted.anchor,
         )
         submit(services, job, forget=lambda: catalog.maps.delete(record.map_id))
     return record, job

@@ -83,7 +83,7 @@ async def train_model(
 
     Its threshold is chosen on a part of the map that was kept out of training. Surveys then name the model.
     """
-    async with bodies.received(request, services.settings, takes=(bodies.JSON,), files="") as body:
+    async with bodies.received(request, services.settings, takes=(bodies.JSON,)) as body:
         wanted = checked(TrainingRequest, body.fields)
     record, job = await run_in_threadpool(_create, services, map_id, wanted)
     return AcceptedModel(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from typing import Annotated
 
 from fastapi import APIRouter, Path, Query, Response
@@ -15,7 +16,7 @@ from service.api.http.dependencies import Provided
 from service.api.http.documents import Document, Link, Request, checked
 from service.api.http.fields import DeviceId, Id, Instant, Pose, Text
 from service.api.http.paging import PageRequest, list_links
-from service.api.http.problems import BODY, documented
+from service.api.http.problems import BODY, LISTED, NAMED, documented
 from service.catalog.catalog import Catalog
 from service.catalog.records import ScanRecord
 from service.errors import BadRequest
@@ -35,15 +36,16 @@ class ScanQuery(Request):
     pose: Annotated[str | None, Field(description="JSON: 4x4 row-major, map_from_sensor")] = None
 
 
-class ScanRequest(Request):
+Start = Annotated[
+    Pose | None, Field(description="4x4 row-major, map_from_sensor; a start for the registration")
+]
+
+
+class ScanRequest(ScanQuery):
     """What may be said of one scan."""
 
     filename: Annotated[Text | None, Field(max_length=255, examples=["hall.pcd"])] = None
-    captured_at: Annotated[Instant | None, Field(description="RFC 3339")] = None
-    device_id: DeviceId | None = None
-    pose: Annotated[
-        Pose | None, Field(description="4x4 row-major, map_from_sensor; a start for the registration")
-    ] = None
+    pose: Start = None  # type: ignore[assignment]  # read from the text
 
 
 class ScanDocument(ScanRecord, Document):
@@ -95,7 +97,7 @@ async def upload_scan(
     return ScanDocument.of_row(record)
 
 
-@router.get("/scans", summary="List scans", responses=documented("invalid_request", "bad_request"))
+@router.get("/scans", summary="List scans", responses=LISTED)
 def list_scans(request: HttpRequest, services: Provided, asked: Annotated[PageRequest, Query()]) -> ScanList:
     """Newest first."""
     page = services.catalog.scans.page(after=asked.after(), limit=asked.limit)
@@ -103,9 +105,7 @@ def list_scans(request: HttpRequest, services: Provided, asked: Annotated[PageRe
     return ScanList(scans=[ScanDocument.of_row(scan) for scan in page.items], links=links)
 
 
-@router.get(
-    "/scans/{scan_id}", summary="Look at a scan", responses=documented("not_found", "invalid_request")
-)
+@router.get("/scans/{scan_id}", summary="Look at a scan", responses=NAMED)
 def get_scan(services: Provided, scan_id: Annotated[Id, Path()]) -> ScanDocument:
     """What is known of one scan."""
     return ScanDocument.of_row(services.catalog.scans.get(scan_id))
@@ -127,11 +127,7 @@ def _keep(catalog: Catalog, body: Body, wanted: ScanRequest) -> tuple[ScanRecord
         raise BadRequest(f"{len(body.uploads)} files in the form; send one, in the field 'file'")
     upload = body.uploads[0]
     record, is_new = catalog.scans.add(
-        upload.path,
-        filename=wanted.filename or upload.filename,
-        format=upload.format,
-        size=upload.size,
-        sha256=upload.sha256,
+        **{**asdict(upload), "filename": wanted.filename or upload.filename},
         device_id=wanted.device_id,
         captured_at=wanted.captured_at,
         pose=wanted.pose,

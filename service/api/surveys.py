@@ -18,7 +18,7 @@ from service.api.http.documents import Document, Link, checked, link
 from service.api.http.fields import DeviceId, Id, Instant, Model
 from service.api.http.files import blob_response
 from service.api.http.paging import PageRequest, list_links
-from service.api.http.problems import BODY, JobProblem, documented
+from service.api.http.problems import BODY, MADE, NAMED, JobProblem, documented
 from service.api.http.submission import ScansRequest, kept_scans, monitor, stop_if_open, submit
 from service.catalog import blob_keys
 from service.catalog.records import JobRecord, MapRecord, SurveyRecord, SurveyStatus
@@ -75,9 +75,7 @@ async def create_survey(
 ) -> AcceptedSurvey:
     """Of scans uploaded before (`scan_ids`) or sent here (`scans`), with the version of the map that is in use now."""
     reference = await run_in_threadpool(services.catalog.maps.ready, map_id)  # before a long upload
-    async with bodies.received(
-        request, services.settings, takes=(bodies.JSON, bodies.FORM), files="scans"
-    ) as body:
+    async with bodies.received(request, services.settings) as body:
         wanted = checked(SurveyRequest, body.fields)
         record, job = await run_in_threadpool(_create, services, reference, wanted, body)
     return AcceptedSurvey(
@@ -104,9 +102,7 @@ def list_surveys(
     return SurveyList(surveys=[survey_document(record, request) for record in page.items], links=links)
 
 
-@router.get(
-    "/surveys/{survey_id}", summary="Look at a survey", responses=documented("not_found", "invalid_request")
-)
+@router.get("/surveys/{survey_id}", summary="Look at a survey", responses=NAMED)
 def get_survey(request: HttpRequest, services: Provided, survey_id: SurveyId) -> SurveyDocument:
     """Its state, what became of each scan, and the tiles in each state once it is ready."""
     return survey_document(services.catalog.surveys.get(survey_id), request)
@@ -132,7 +128,7 @@ def delete_survey(services: Provided, survey_id: SurveyId) -> None:
     summary="Every tile of a survey",
     response_class=FeatureResponse,
     response_model=None,
-    responses={**features.documented(), **documented("not_found", "not_ready", "invalid_request")},
+    responses=features.documented() | MADE,
 )
 def get_tiles(request: HttpRequest, services: Provided, survey_id: SurveyId) -> FeatureResponse:
     """Unchanged, changed, inconsistent and unobserved tiles alike."""
@@ -147,10 +143,7 @@ def get_tiles(request: HttpRequest, services: Provided, survey_id: SurveyId) -> 
     "/surveys/{survey_id}/cloud.ply",
     summary="The coloured cloud of a survey",
     response_class=Response,
-    responses={
-        **files.documented(bodies.RAW, "The current map coloured by result, PLY"),
-        **documented("not_found", "not_ready", "invalid_request"),
-    },
+    responses=files.documented(bodies.RAW, "The current map coloured by result, PLY") | MADE,
 )
 def get_survey_cloud(services: Provided, survey_id: SurveyId) -> Response:
     """With the scalar fields `change_score` and `tile_state` beside the colours."""
@@ -167,10 +160,7 @@ def get_survey_cloud(services: Provided, survey_id: SurveyId) -> Response:
     "/surveys/{survey_id}/picture.png",
     summary="The picture of a survey",
     response_class=Response,
-    responses={
-        **files.documented("image/png", "Top view of the map, tiles by state"),
-        **documented("not_found", "not_ready", "invalid_request"),
-    },
+    responses=files.documented("image/png", "Top view of the map, tiles by state") | MADE,
 )
 def get_picture(services: Provided, survey_id: SurveyId) -> Response:
     """Top view of the map with the tiles by state."""

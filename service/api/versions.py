@@ -15,7 +15,7 @@ from service.api.http.dependencies import Provided, Services
 from service.api.http.documents import Document, Link, checked, link
 from service.api.http.fields import Id
 from service.api.http.paging import PageRequest, list_links
-from service.api.http.problems import BODY, JobProblem, documented
+from service.api.http.problems import BODY, MADE, NAMED, JobProblem, documented
 from service.api.http.submission import ScansRequest, kept_scans, monitor, submit
 from service.api.maps import BuiltDocument, MapId, cloud_response, file_links, manifest_response
 from service.catalog.records import JobRecord, MapStatus, VersionRecord
@@ -71,9 +71,7 @@ async def create_version(
     stays in use until the new one is ready; one version builds at a time.
     """
     await run_in_threadpool(services.catalog.maps.ready, map_id)  # before a long upload
-    async with bodies.received(
-        request, services.settings, takes=(bodies.JSON, bodies.FORM), files="scans"
-    ) as body:
+    async with bodies.received(request, services.settings) as body:
         wanted = checked(VersionRequest, body.fields)
         record, job = await run_in_threadpool(_create, services, map_id, wanted, body)
     here = link(request, f"/maps/{map_id}/versions/{record.version}", "self")
@@ -100,11 +98,7 @@ def list_versions(
     return VersionList(versions=[version_document(record, request) for record in page.items], links=links)
 
 
-@router.get(
-    "/maps/{map_id}/versions/{number}",
-    summary="Look at a version of a map",
-    responses=documented("not_found", "invalid_request"),
-)
+@router.get("/maps/{map_id}/versions/{number}", summary="Look at a version of a map", responses=NAMED)
 def get_version(request: HttpRequest, services: Provided, map_id: MapId, number: Number) -> VersionDocument:
     """Its state, what it was made from, what became of each scan, and its extent and counts once it is ready."""
     return version_document(services.catalog.versions.get(map_id, number), request)
@@ -128,10 +122,7 @@ def delete_version(services: Provided, map_id: MapId, number: Number) -> None:
     "/maps/{map_id}/versions/{number}/manifest",
     summary="The tiles of a version of a map",
     response_model=dict[str, Any],
-    responses={
-        200: {"description": "The tile manifest, fields as in Table A1 of the paper"},
-        **documented("not_found", "not_ready", "invalid_request"),
-    },
+    responses={200: {"description": "The tile manifest, fields as in Table A1 of the paper"}, **MADE},
 )
 def get_version_manifest(services: Provided, map_id: MapId, number: Number) -> Response:
     """Tile size, bounds, and every tile that is kept; a place has the same tile id in every version."""
@@ -142,10 +133,7 @@ def get_version_manifest(services: Provided, map_id: MapId, number: Number) -> R
     "/maps/{map_id}/versions/{number}/cloud.ply",
     summary="The cloud of a version of a map",
     response_class=Response,
-    responses={
-        **files.documented(bodies.RAW, "The fused reference map, PLY"),
-        **documented("not_found", "not_ready", "invalid_request"),
-    },
+    responses=files.documented(bodies.RAW, "The fused reference map, PLY") | MADE,
 )
 def get_version_cloud(services: Provided, map_id: MapId, number: Number) -> Response:
     """The fused reference map, in metres."""

@@ -15,7 +15,7 @@ from service.catalog.database import Database
 from service.catalog.jobs import new_job
 from service.catalog.records import JobRecord, ModelRecord
 from service.catalog.tables import Model, now
-from service.catalog.versions import lock_map, version_in_use
+from service.catalog.versions import map_row, version_in_use
 from service.errors import Conflict, NotFound
 
 
@@ -41,7 +41,7 @@ class Models:
         name = name or name_for(map_id)
         try:
             with self._database.write() as session:
-                lock_map(session, map_id)  # nobody deletes the version meanwhile
+                map_row(session, map_id, lock=True)  # nobody deletes the version meanwhile
                 version = version_in_use(session, map_id)
                 number = _next_number(session, name)
                 job = new_job("model", map_id, model=f"{name}/{number}")

@@ -25,7 +25,7 @@ from service.catalog.records import (
 )
 from service.catalog.scans import checked_scan_ids, scans_in_order, write_outcomes
 from service.catalog.tables import Survey, SurveyTile, new_id, now
-from service.catalog.versions import lock_map, version_in_use
+from service.catalog.versions import map_row, version_in_use
 from service.errors import Conflict, NotFound, NotReady
 
 
@@ -51,7 +51,7 @@ class Surveys:
         survey_id = new_id("survey")
         job = new_job("survey", map_id, survey_id)
         with self._database.write() as session:
-            lock_map(session, map_id)  # nobody deletes the version meanwhile
+            map_row(session, map_id, lock=True)  # nobody deletes the version meanwhile
             version = version_in_use(session, map_id)
             scans = scans_in_order(session, scan_ids)
             taken = [scan.captured_at for scan in scans if scan.captured_at is not None]

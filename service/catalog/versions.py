@@ -38,7 +38,7 @@ class Versions:
                 "a version is made either of scans (scan_ids or files) or of one survey (survey_id)"
             )
         with self._database.write() as session:
-            lock_map(session, map_id)
+            map_row(session, map_id, lock=True)
             base = version_in_use(session, map_id)
             number = _next_number(session, map_id)
             if survey_id is None:
@@ -110,7 +110,7 @@ class Versions:
         Raises NotFound, and Conflict for the version in use, one that builds, and one that a survey still needs.
         """
         with self._database.write() as session:
-            lock_map(session, map_id)
+            map_row(session, map_id, lock=True)
             row = _row(session, map_id, number)
             _check_deletable(session, row)
             folder = blob_keys.map_folder(row.job_id)
@@ -124,16 +124,11 @@ class Versions:
 
 
 def map_row(session: Session, map_id: str, *, lock: bool = False) -> tables.Map:
-    """Return the row of a map. Raises NotFound."""
+    """Return the row of a map; with `lock` nobody else makes or deletes a version of it meanwhile. Raises NotFound."""
     row = session.get(tables.Map, map_id, with_for_update=lock)
     if row is None:
         raise NotFound(f"no map {map_id!r}; GET /maps lists those there are")
     return row
-
-
-def lock_map(session: Session, map_id: str) -> None:
-    """Keep everybody else from making or deleting a version of a map until the session ends. Raises NotFound."""
-    map_row(session, map_id, lock=True)
 
 
 def whole_versions() -> Select[MapVersion]:

@@ -16,6 +16,7 @@ from service.catalog.records import JobRecord, ScanRecord
 from service.catalog.steps import STEPS, JobKind
 from service.settings import Settings
 from tests.support.house import MAP, MODEL, OTHER_CUT, SAME_CUT, SEEN_TO, House, Material, run
+from worker import jobs
 from worker.cloud.formats.pcd import write_pcd
 from worker.cloud.formats.scan import read_scan
 from worker.cloud.poses import difference
@@ -165,9 +166,9 @@ def test_each_step_of_a_map_may_run_twice(house: House) -> None:
     assert house.catalog.maps.get("again").model_dump(exclude={"updated"}) == record.model_dump(
         exclude={"updated"}
     )
-    run_until_killed(job, "describe")
+    run_until_killed(job, "encode")
     files = house.files()
-    run(job, "describe")
+    run(job, "encode")
     assert house.files() == files
     made, first = (
         {name.removeprefix(folder): found for name, found in files.items() if name.startswith(folder)}
@@ -343,3 +344,10 @@ def test_what_a_step_is_in_the_middle_of_lies_in_the_scratch_folder(
     run(house.map_of(house.add("one.pcd", house.material.before[1]), map_id="hall"))
     assert set(folders) == {Settings().scratch_dir()}
     assert list(Settings().scratch_dir().iterdir()) == []
+
+
+def test_the_last_step_of_a_map_that_a_former_release_queued_is_the_one_of_today() -> None:
+    assert jobs.describe_map is jobs.encode_map
+    assert {step.function.removeprefix("worker.jobs.") for steps in STEPS.values() for step in steps} <= set(
+        jobs.__all__
+    )

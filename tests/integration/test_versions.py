@@ -187,7 +187,7 @@ def test_each_step_of_a_version_may_run_twice(house: House, further: ScanRecord,
     assert house.files() == files
     again = house.catalog.versions.of_job(job.job_id)
     assert again.model_dump(exclude={"updated"}) == record.model_dump(exclude={"updated"})
-    run(job, "describe")
+    run(job, "encode")
     assert house.catalog.maps.get(MAP).version == 2
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 from redis import Redis
 
+from service.catalog.steps import ALLOWED_FUNCTIONS, STEPS, JobKind, Step
 from service.errors import QueueUnavailable
 from service.queue import JobQueue
 from service.up.embedded_redis import EmbeddedRedis
@@ -172,3 +173,36 @@ def test_a_refused_connection_is_reported_and_the_password_is_not(tmp_path: Path
 def test_a_server_that_accepts_and_says_nothing_does_not_hold_the_request() -> None:
     with socket.create_server(("127.0.0.1", 0)) as silent, pytest.raises(QueueUnavailable):
         JobQueue(f"redis://127.0.0.1:{silent.getsockname()[1]}").ping()
+
+
+#: The steps of a map as releases before 0.2 queued them.
+FORMER: dict[JobKind, tuple[Step, ...]] = {
+    "map": (
+        STEPS["map"][0],
+        Step(name="describe", function="worker.jobs.describe_map", queue="inference"),
+    )
+}
+
+
+def test_a_map_that_a_former_release_queued_goes_on_with_the_step_that_it_queued(
+    server: EmbeddedRedis, queue: JobQueue
+) -> None:
+    former = JobQueue(server.url, steps=FORMER)
+    former.submit("m1", "map")
+    former.close()
+    assert queue.holds("m1", "map")  # so it is not submitted again when the service starts
+    assert {step.function for step in FORMER["map"]} <= ALLOWED_FUNCTIONS
+
+
+def test_a_map_whose_last_step_a_former_release_queued_gets_the_step_of_today_beside_it(
+    server: EmbeddedRedis, queue: JobQueue, redis: Redis
+) -> None:
+    former = JobQueue(server.url, steps=FORMER)
+    former.submit("m1", "map")
+    former.close()
+    redis.delete("rq:queue:geometry")
+    redis.hset("rq:job:m1-register", "status", "finished")
+    redis.rpush("rq:queue:inference", "m1-describe")
+    queue.submit("m1", "map")
+    assert redis.lrange("rq:queue:geometry", 0, -1) == []
+    assert redis.lrange("rq:queue:inference", 0, -1) == ["m1-describe", "m1-encode"]

@@ -13,12 +13,15 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any, cast
 from uuid import uuid4
 
+from fastapi import FastAPI
 from fastapi.testclient import TestClient
 from sqlalchemy import create_engine, make_url, text
 
 from service.api.app import create_app
+from service.api.http.dependencies import Services
 from service.catalog.catalog import Catalog
 from service.catalog.records import Bounds, ScanOutcome, ScanRecord, TileRecord, TileState
 from service.errors import QueueUnavailable
@@ -93,7 +96,12 @@ def running(settings: Settings, queue: RememberingQueue) -> Iterator[TestClient]
 
 def catalog_of(client: TestClient) -> Catalog:
     """The catalog that the API works on; a worker would open the same folder."""
-    return client.app.state.services.catalog
+    return services_of(client).catalog
+
+
+def services_of(client: TestClient) -> Services:
+    """What the routes of the API work with."""
+    return cast("Services", cast("FastAPI", client.app).state.services)
 
 
 def ply(content: str = "hall") -> bytes:
@@ -101,7 +109,7 @@ def ply(content: str = "hall") -> bytes:
     return f"ply\nformat ascii 1.0\ncomment {content}\nend_header\n".encode()
 
 
-def add_scan(catalog: Catalog, content: str = "hall", **known: object) -> ScanRecord:
+def add_scan(catalog: Catalog, content: str = "hall", **known: Any) -> ScanRecord:
     """A scan in the catalog."""
     path = Path(catalog.blobs._root or ".") / f"{content}.part"
     path.write_bytes(ply(content))

@@ -47,7 +47,12 @@ class Body:
 
 @contextlib.asynccontextmanager
 async def received(
-    request: Request, settings: Settings, *, takes: tuple[str, ...], files: str, filename: str | None = None
+    request: Request,
+    settings: Settings,
+    *,
+    takes: tuple[str, ...] = (JSON, FORM),
+    files: str = "scans",
+    filename: str | None = None,
 ) -> AsyncIterator[Body]:
     """The body of a request in one of the media types `takes`.
 

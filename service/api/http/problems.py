@@ -70,6 +70,10 @@ class ProblemDocument(BaseModel):
     errors: list[InvalidValue] | None = None
 
 
+def _type(code: str) -> str:
+    return f"urn:spicd:problem:{code}"
+
+
 def problem_of(problem: Problem | None) -> ProblemDocument | None:
     """Return the document of a failed job's problem; an unknown code keeps its type under a general title."""
     if problem is None:
@@ -111,6 +115,12 @@ def documented(*codes: str) -> dict[int | str, dict[str, Any]]:
     return answers
 
 
+#: The answers of a route that names one thing, that lists, and that gives a file or tiles of something that a job makes.
+NAMED = documented("not_found", "invalid_request")
+LISTED = documented("invalid_request", "bad_request")
+MADE = documented("not_found", "not_ready", "invalid_request")
+
+
 def add_handlers(app: FastAPI) -> None:
     """Make every error of `app` a problem document."""
     app.add_exception_handler(ServiceError, _service_error)
@@ -118,10 +128,6 @@ def add_handlers(app: FastAPI) -> None:
     app.add_exception_handler(HTTPException, _http_error)
     app.add_exception_handler(ClientDisconnect, _disconnected)
     app.add_exception_handler(Exception, _unexpected)
-
-
-def _type(code: str) -> str:
-    return f"urn:spicd:problem:{code}"
 
 
 def _service_error(_request: Request, error: Exception) -> Response:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import logging
 from collections.abc import Callable, Iterator
+from dataclasses import asdict
 from typing import Annotated
 
 from fastapi import Request as HttpRequest
@@ -41,13 +42,7 @@ def kept_scans(catalog: Catalog, body: Body, wanted: ScansRequest) -> Iterator[t
     try:
         for upload in body.uploads:
             scan, is_new = catalog.scans.add(
-                upload.path,
-                filename=upload.filename,
-                format=upload.format,
-                size=upload.size,
-                sha256=upload.sha256,
-                device_id=wanted.device_id,
-                captured_at=wanted.captured_at,
+                **asdict(upload), device_id=wanted.device_id, captured_at=wanted.captured_at
             )
             if is_new:
                 new.append(scan)

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from datetime import timedelta
+from typing import Any
 
 import pytest
+from fastapi.testclient import TestClient
 
 from service.api.http.paging import encoded
+from service.catalog.catalog import Catalog
 from tests.support.samples import (
     NOON,
     RememberingQueue,
@@ -19,10 +23,11 @@ from tests.support.samples import (
     tile,
 )
 
+Visited = tuple[TestClient, dict[str, str]]  #: a service, and the ids of the visits by month
 MARCH, APRIL, MAY = (NOON + timedelta(days=days) for days in (0, 31, 61))
 
 
-def add_visits(catalog) -> dict[str, str]:
+def add_visits(catalog: Catalog) -> dict[str, str]:
     """Three visits: March and April with changes, May without; and a map beside them."""
     add_map(catalog)
     add_map(catalog, "hall")
@@ -45,18 +50,18 @@ def add_visits(catalog) -> dict[str, str]:
 
 
 @pytest.fixture
-def surveys(catalog):
+def surveys(catalog: Catalog) -> dict[str, str]:
     return add_visits(catalog)
 
 
 @pytest.fixture(scope="module")
-def asked_often(tmp_path_factory):
+def asked_often(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Visited]:
     """A service with those visits, for requests that change nothing; and the ids of the visits."""
     with running(settings_in(tmp_path_factory.mktemp("service")), RememberingQueue()) as client:
         yield client, add_visits(catalog_of(client))
 
 
-def found(client, **asked) -> list[tuple[str, float]]:
+def found(client: TestClient, **asked: str) -> list[tuple[str, float]]:
     answer = client.get("/maps/lobby/changes", params=asked)
     assert answer.status_code == 200, answer.text
     body = answer.json()
@@ -67,7 +72,9 @@ def found(client, **asked) -> list[tuple[str, float]]:
 ALL = [("002_000", 0.7), ("001_001", 0.9), ("000_000", 0.6)]
 
 
-def test_changed_tiles_come_newest_visit_first_then_most_certain_first(client, surveys):
+def test_changed_tiles_come_newest_visit_first_then_most_certain_first(
+    client: TestClient, surveys: dict[str, str]
+) -> None:
     assert found(client) == ALL
 
 
@@ -89,7 +96,7 @@ def test_changed_tiles_come_newest_visit_first_then_most_certain_first(client, s
         ({"survey": "march", "min_score": 0.7}, ALL[1:2]),
     ],
 )
-def test_a_filter_keeps_what_it_names(asked_often, asked, expected):
+def test_a_filter_keeps_what_it_names(asked_often: Visited, asked: dict[str, str], expected: Any) -> None:
     client, surveys = asked_often
     if "survey" in asked:
         asked = {**asked, "survey": surveys[asked["survey"]]}
@@ -112,7 +119,7 @@ def test_a_filter_keeps_what_it_names(asked_often, asked, expected):
         {"treshold": "0.5"},
     ],
 )
-def test_a_value_that_does_not_match_is_named(asked_often, asked):
+def test_a_value_that_does_not_match_is_named(asked_often: Visited, asked: dict[str, str]) -> None:
     client, _ = asked_often
     ((name, value),) = asked.items()
     answer = client.get("/maps/lobby/changes", params=asked)
@@ -121,17 +128,21 @@ def test_a_value_that_does_not_match_is_named(asked_often, asked):
     assert answer.json()["errors"][0]["value"] == value
 
 
-def test_a_foreign_cursor_is_refused(client, surveys):
+def test_a_foreign_cursor_is_refused(client: TestClient, surveys: dict[str, str]) -> None:
     for cursor in ("nonsense", "e30", "W10", encoded("2026-03-01T12:00:00", "a", "0x1p-1", "b")):
         answer = client.get("/maps/lobby/changes", params={"cursor": cursor})
         assert answer.status_code == 422
         assert answer.json()["type"] == "urn:spicd:problem:bad_request"
 
 
-def test_pages_hold_every_change_once_while_new_ones_arrive(client, catalog, surveys):
+def test_pages_hold_every_change_once_while_new_ones_arrive(
+    client: TestClient, catalog: Catalog, surveys: dict[str, str]
+) -> None:
     tied = [tile(i, 5, "changed", 0.8) for i in range(7)]
     add_survey(catalog, tied, captured_at=MAY + timedelta(days=1))
-    url, seen, sizes = "/maps/lobby/changes?limit=3&min_score=0.5", [], []
+    url: str | None = "/maps/lobby/changes?limit=3&min_score=0.5"
+    seen: list[str] = []
+    sizes: list[int] = []
     while url:
         body = client.get(url).json()
         assert body["numberMatched"] == (10 if len(sizes) == 0 else 11)
@@ -144,7 +155,9 @@ def test_pages_hold_every_change_once_while_new_ones_arrive(client, catalog, sur
     assert len(set(seen)) == len(seen) == 10
 
 
-def test_only_a_survey_that_is_done_and_of_this_map_can_be_named(client, catalog, surveys):
+def test_only_a_survey_that_is_done_and_of_this_map_can_be_named(
+    client: TestClient, catalog: Catalog, surveys: dict[str, str]
+) -> None:
     running, job_id = add_survey(catalog, ready=False, captured_at=MAY + timedelta(days=3))
     hall = client.get("/maps/hall/surveys").json()["surveys"][0]["survey_id"]
     assert client.get("/maps/lobby/changes", params={"survey": running}).status_code == 409
@@ -155,12 +168,12 @@ def test_only_a_survey_that_is_done_and_of_this_map_can_be_named(client, catalog
     assert found(client) == ALL  # tiles of a survey that was dismissed are not changes
 
 
-def test_a_map_that_is_not_ready_has_no_changes_to_tell(client, catalog):
+def test_a_map_that_is_not_ready_has_no_changes_to_tell(client: TestClient, catalog: Catalog) -> None:
     add_map(catalog, ready=False)
     assert client.get("/maps/lobby/changes").status_code == 409
 
 
-def test_lists_go_on_page_by_page(client, catalog):
+def test_lists_go_on_page_by_page(client: TestClient, catalog: Catalog) -> None:
     for number in range(5):
         add_map(catalog, f"m{number}")
         add_survey(catalog, map_id="m0", captured_at=NOON + timedelta(days=number))
@@ -171,7 +184,8 @@ def test_lists_go_on_page_by_page(client, catalog):
         ("/scans", "scans", "scan_id", 11),
         ("/maps/m0/surveys", "surveys", "survey_id", 5),
     ):
-        url, seen = f"{path}?limit=2", []
+        url: str | None = f"{path}?limit=2"
+        seen = []
         while url:
             body = client.get(url).json()
             assert len(body[name]) <= 2

@@ -5,13 +5,18 @@ from __future__ import annotations
 import json
 import shutil
 
+from fastapi.testclient import TestClient
 from sqlalchemy import text
 
 from service.api.http.problems import MEDIA_TYPE
-from tests.support.samples import add_map
+from service.catalog.catalog import Catalog
+from service.settings import Settings
+from tests.support.samples import RememberingQueue, add_map
 
 
-def test_the_cards_are_passed_on_as_they_are_newest_version_first(client, settings):
+def test_the_cards_are_passed_on_as_they_are_newest_version_first(
+    client: TestClient, settings: Settings
+) -> None:
     for version in ("2", "10"):
         folder = settings.model_store / "spicd-net" / version
         folder.mkdir()
@@ -23,14 +28,14 @@ def test_the_cards_are_passed_on_as_they_are_newest_version_first(client, settin
     assert client.get("/models/spicd-net?version=1").json()["threshold"] == 0.5
 
 
-def test_a_card_that_cannot_be_read_hides_no_other(client, settings):
+def test_a_card_that_cannot_be_read_hides_no_other(client: TestClient, settings: Settings) -> None:
     folder = settings.model_store / "broken" / "1"
     folder.mkdir(parents=True)
     (folder / "card.json").write_text("{")
     assert [card["name"] for card in client.get("/models").json()["models"]] == ["spicd-net"]
 
 
-def test_a_healthy_service_names_its_parts(client):
+def test_a_healthy_service_names_its_parts(client: TestClient) -> None:
     assert client.get("/health/live").json() == {"status": "ok"}
     ready = client.get("/health/ready")
     assert (ready.status_code, ready.json()) == (
@@ -39,7 +44,9 @@ def test_a_healthy_service_names_its_parts(client):
     )
 
 
-def test_a_part_that_fails_is_named_and_the_others_stay_ok(client, catalog, queue, settings):
+def test_a_part_that_fails_is_named_and_the_others_stay_ok(
+    client: TestClient, catalog: Catalog, queue: RememberingQueue, settings: Settings
+) -> None:
     queue.down = True
     answer = client.get("/health/ready")
     assert (answer.status_code, answer.headers["content-type"]) == (503, MEDIA_TYPE)
@@ -54,7 +61,7 @@ def test_a_part_that_fails_is_named_and_the_others_stay_ok(client, catalog, queu
     assert client.get("/health/live").status_code == 200
 
 
-def test_metrics_count_requests_by_route_and_jobs_by_state(client, catalog):
+def test_metrics_count_requests_by_route_and_jobs_by_state(client: TestClient, catalog: Catalog) -> None:
     add_map(catalog, ready=False)
     client.get("/maps/lobby")
     client.get("/maps/none")

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import pytest
+from fastapi.testclient import TestClient
 
+from service.catalog.catalog import Catalog
 from service.catalog.records import Problem
+from service.settings import Settings
 from tests.support.samples import RememberingQueue, add_map, add_survey, catalog_of, running
 
 
-def test_a_job_that_waits_is_an_ogc_status_document(client, catalog):
+def test_a_job_that_waits_is_an_ogc_status_document(client: TestClient, catalog: Catalog) -> None:
     job_id = add_map(catalog, ready=False)
     job = client.get(f"/jobs/{job_id}").json()
     assert job.pop("created") == job.pop("updated")
@@ -29,7 +32,7 @@ def test_a_job_that_waits_is_an_ogc_status_document(client, catalog):
     }
 
 
-def test_a_job_that_runs_shows_its_stage_and_share(client, catalog):
+def test_a_job_that_runs_shows_its_stage_and_share(client: TestClient, catalog: Catalog) -> None:
     job_id = add_map(catalog, ready=False)
     catalog.jobs.start(job_id)
     catalog.jobs.report(job_id, message="registration", progress=0.4)
@@ -38,7 +41,7 @@ def test_a_job_that_runs_shows_its_stage_and_share(client, catalog):
     assert job["started"].endswith("Z")
 
 
-def test_a_finished_job_links_to_its_result(client, catalog):
+def test_a_finished_job_links_to_its_result(client: TestClient, catalog: Catalog) -> None:
     add_map(catalog)
     survey_id, job_id = add_survey(catalog)
     job = client.get(f"/jobs/{job_id}").json()
@@ -48,7 +51,7 @@ def test_a_finished_job_links_to_its_result(client, catalog):
 
 
 @pytest.mark.parametrize("code", ["registration_failed", "scan_unreadable", "internal", "something_new"])
-def test_a_failed_job_carries_its_problem(client, catalog, code):
+def test_a_failed_job_carries_its_problem(client: TestClient, catalog: Catalog, code: str) -> None:
     job_id = add_map(catalog, ready=False)
     catalog.jobs.fail(job_id, Problem(code=code, detail="scan hall.pcd: fitness 0.12 is below 0.55"))
     problem = client.get(f"/jobs/{job_id}").json()["problem"]
@@ -58,7 +61,9 @@ def test_a_failed_job_carries_its_problem(client, catalog, code):
     assert client.get("/maps/lobby").json()["problem"] == problem
 
 
-def test_a_dismissed_job_stays_dismissed_and_answers_the_same_again(client, catalog, queue):
+def test_a_dismissed_job_stays_dismissed_and_answers_the_same_again(
+    client: TestClient, catalog: Catalog, queue: RememberingQueue
+) -> None:
     job_id = add_map(catalog, ready=False)
     first = client.delete(f"/jobs/{job_id}")
     assert (first.status_code, first.json()["status"]) == (200, "dismissed")
@@ -68,14 +73,18 @@ def test_a_dismissed_job_stays_dismissed_and_answers_the_same_again(client, cata
     assert client.get("/maps/lobby").json()["status"] == "failed"
 
 
-def test_a_dismissal_stands_without_a_queue(client, catalog, queue):
+def test_a_dismissal_stands_without_a_queue(
+    client: TestClient, catalog: Catalog, queue: RememberingQueue
+) -> None:
     job_id = add_map(catalog, ready=False)
     queue.down = True
     assert client.delete(f"/jobs/{job_id}").status_code == 200
     assert catalog.jobs.is_dismissed(job_id)
 
 
-def test_a_job_that_ended_by_itself_cannot_be_dismissed(client, catalog, queue):
+def test_a_job_that_ended_by_itself_cannot_be_dismissed(
+    client: TestClient, catalog: Catalog, queue: RememberingQueue
+) -> None:
     job_id = add_map(catalog)
     answer = client.delete(f"/jobs/{job_id}")
     assert (answer.status_code, answer.json()["type"]) == (409, "urn:spicd:problem:conflict")
@@ -83,7 +92,7 @@ def test_a_job_that_ended_by_itself_cannot_be_dismissed(client, catalog, queue):
     assert queue.dismissed == []
 
 
-def test_jobs_are_listed_by_state_and_map(client, catalog):
+def test_jobs_are_listed_by_state_and_map(client: TestClient, catalog: Catalog) -> None:
     waiting = add_map(catalog, ready=False)
     done = add_map(catalog, "hall")
     for asked, ids in (
@@ -95,7 +104,7 @@ def test_jobs_are_listed_by_state_and_map(client, catalog):
         assert [job["jobID"] for job in client.get("/jobs", params=asked).json()["jobs"]] == ids
 
 
-def test_a_start_submits_again_what_is_unfinished_and_not_in_the_queue(settings):
+def test_a_start_submits_again_what_is_unfinished_and_not_in_the_queue(settings: Settings) -> None:
     with running(settings, RememberingQueue()) as client:
         catalog = catalog_of(client)
         first, begun, held, last = (add_map(catalog, name, ready=False) for name in ("a", "b", "c", "d"))
@@ -110,7 +119,7 @@ def test_a_start_submits_again_what_is_unfinished_and_not_in_the_queue(settings)
         assert messages[first] == "waiting"
 
 
-def test_a_job_that_runs_at_the_third_end_of_the_service_is_given_up(settings):
+def test_a_job_that_runs_at_the_third_end_of_the_service_is_given_up(settings: Settings) -> None:
     with running(settings, RememberingQueue()) as client:
         job_id = add_map(catalog_of(client), ready=False)
         catalog_of(client).jobs.start(job_id)
@@ -123,7 +132,7 @@ def test_a_job_that_runs_at_the_third_end_of_the_service_is_given_up(settings):
     assert "3 attempts" in job["problem"]["detail"]
 
 
-def test_a_start_without_a_queue_serves_all_the_same(settings):
+def test_a_start_without_a_queue_serves_all_the_same(settings: Settings) -> None:
     with running(settings, RememberingQueue()) as client:
         add_map(catalog_of(client), ready=False)
     with running(settings, RememberingQueue(down=True)) as client:

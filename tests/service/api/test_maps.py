@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import json
+from typing import Any
 
 import pytest
+from fastapi.testclient import TestClient
 
 from service.catalog import blob_keys
-from tests.support.samples import MODEL, add_map, add_scan, add_survey, ply
+from service.catalog.catalog import Catalog
+from service.settings import Settings
+from tests.support.samples import MODEL, RememberingQueue, add_map, add_scan, add_survey, ply
 
 
-def test_a_map_of_known_scans_is_accepted_and_its_job_submitted(client, catalog, queue):
+def test_a_map_of_known_scans_is_accepted_and_its_job_submitted(
+    client: TestClient, catalog: Catalog, queue: RememberingQueue
+) -> None:
     scan = add_scan(catalog)
     asked = {
         "id": "lobby",
@@ -43,7 +49,7 @@ def test_a_map_of_known_scans_is_accepted_and_its_job_submitted(client, catalog,
     assert client.get(answer.headers["location"]).json()["map_id"] == "lobby"
 
 
-def test_a_map_of_files_keeps_them_as_scans_in_their_order(client, catalog):
+def test_a_map_of_files_keeps_them_as_scans_in_their_order(client: TestClient, catalog: Catalog) -> None:
     known = add_scan(catalog, "known")
     files = [("scans", (f"{name}.ply", ply(name))) for name in ("b", "a", "b")]
     form = {"id": "hall", "scan_ids": known.scan_id, "device_id": "robot-7", "settings": "{}"}
@@ -55,7 +61,7 @@ def test_a_map_of_files_keeps_them_as_scans_in_their_order(client, catalog):
 
 
 @pytest.mark.parametrize("given", [["a", "b"], "a,b", '["a", "b"]'])
-def test_a_form_names_scans_in_three_ways(client, catalog, given):
+def test_a_form_names_scans_in_three_ways(client: TestClient, catalog: Catalog, given: Any) -> None:
     ids = {name: add_scan(catalog, name).scan_id for name in ("a", "b")}
     if isinstance(given, list):
         given = [ids[name] for name in given]
@@ -69,14 +75,16 @@ def test_a_form_names_scans_in_three_ways(client, catalog, given):
     assert [scan.scan_id for scan in catalog.maps.get("hall").scans][:2] == list(ids.values())
 
 
-def test_without_an_id_the_service_chooses_one(client, catalog):
+def test_without_an_id_the_service_chooses_one(client: TestClient, catalog: Catalog) -> None:
     scan_ids = [add_scan(catalog).scan_id]
     ids = {client.post("/maps", json={"scan_ids": scan_ids}).json()["map_id"] for _ in range(2)}
     assert len(ids) == 2
     assert all(client.get(f"/maps/{map_id}").status_code == 200 for map_id in ids)
 
 
-def test_when_the_queue_is_down_nothing_stays_recorded(client, catalog, queue, settings):
+def test_when_the_queue_is_down_nothing_stays_recorded(
+    client: TestClient, catalog: Catalog, queue: RememberingQueue, settings: Settings
+) -> None:
     queue.down = True
     answer = client.post("/maps", data={"id": "lobby"}, files={"scans": ("a.ply", ply())})
     assert answer.status_code == 503
@@ -90,7 +98,7 @@ def test_when_the_queue_is_down_nothing_stays_recorded(client, catalog, queue, s
     assert again.status_code == 202
 
 
-def test_a_taken_id_keeps_no_new_file_and_leaves_the_known_ones(client, catalog):
+def test_a_taken_id_keeps_no_new_file_and_leaves_the_known_ones(client: TestClient, catalog: Catalog) -> None:
     add_map(catalog)
     known = add_scan(catalog, "known")
     answer = client.post(
@@ -104,7 +112,7 @@ def test_a_taken_id_keeps_no_new_file_and_leaves_the_known_ones(client, catalog)
     assert "new.ply" not in names
 
 
-def test_a_ready_map_shows_what_it_is_and_its_files(client, catalog):
+def test_a_ready_map_shows_what_it_is_and_its_files(client: TestClient, catalog: Catalog) -> None:
     job_id = add_map(catalog)
     catalog.blobs.put_bytes(blob_keys.map_manifest(job_id), b'{"n_valid_patches": 4}')
     catalog.blobs.put_bytes(blob_keys.map_cloud(job_id), b"ply\n0123456789")
@@ -121,7 +129,9 @@ def test_a_ready_map_shows_what_it_is_and_its_files(client, catalog):
     assert (part.status_code, part.content) == (206, b"012")
 
 
-def test_deleting_a_map_stops_its_jobs_first(client, catalog, queue):
+def test_deleting_a_map_stops_its_jobs_first(
+    client: TestClient, catalog: Catalog, queue: RememberingQueue
+) -> None:
     add_map(catalog)
     survey_id, job_id = add_survey(catalog, ready=False)
     assert client.delete("/maps/lobby").status_code == 204
@@ -130,7 +140,9 @@ def test_deleting_a_map_stops_its_jobs_first(client, catalog, queue):
         assert client.get(path).status_code == 404
 
 
-def test_a_map_can_be_deleted_while_the_queue_is_down(client, catalog, queue):
+def test_a_map_can_be_deleted_while_the_queue_is_down(
+    client: TestClient, catalog: Catalog, queue: RememberingQueue
+) -> None:
     add_map(catalog, ready=False)
     queue.down = True
     assert client.delete("/maps/lobby").status_code == 204

@@ -7,8 +7,9 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import httpx
 import pytest
@@ -32,7 +33,7 @@ uvicorn.run(create_app(settings, queue=RememberingQueue()), port=int(sys.argv[3]
 
 
 @pytest.fixture
-def server(tmp_path) -> Iterator[tuple[httpx.Client, int, Path]]:
+def server(tmp_path: Path) -> Iterator[tuple[httpx.Client, int, Path]]:
     """A client of a server process, the process's id, and its data folder."""
     settings = settings_in(tmp_path)
     with socket.socket() as free:
@@ -81,7 +82,9 @@ def peak_megabytes(pid: int) -> float:
 
 
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="reads the peak from /proc")
-def test_400_megabytes_raw_and_as_a_form_leave_the_server_under_200_resident(server, record_property):
+def test_400_megabytes_raw_and_as_a_form_leave_the_server_under_200_resident(
+    server: Any, record_property: Callable[[str, object], None]
+) -> None:
     client, pid, data_dir = server
     raw = client.post("/scans", content=content(SIZE), headers=RAW, params={"device_id": "raw"})
     after_raw = peak_megabytes(pid)
@@ -100,7 +103,7 @@ def test_400_megabytes_raw_and_as_a_form_leave_the_server_under_200_resident(ser
     assert max(after_raw, after_form) < 200
 
 
-def test_a_connection_that_breaks_within_the_body_leaves_nothing(server):
+def test_a_connection_that_breaks_within_the_body_leaves_nothing(server: Any) -> None:
     client, _, data_dir = server
     incoming = data_dir / "incoming"
     with socket.create_connection((client.base_url.host, client.base_url.port)) as connection:
@@ -113,7 +116,7 @@ def test_a_connection_that_breaks_within_the_body_leaves_nothing(server):
     assert client.get("/scans").json()["scans"] == []
 
 
-def _until(true) -> None:
+def _until(true: Callable[[], bool]) -> None:
     for _ in range(300):
         if true():
             return

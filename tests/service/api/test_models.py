@@ -2,21 +2,28 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+import httpx
 import pytest
+from fastapi.testclient import TestClient
 
 from service.catalog import blob_keys
+from service.catalog.catalog import Catalog
 from service.catalog.records import Problem
 from service.errors import Conflict
-from tests.support.samples import MODEL, add_map, add_scan, add_version
+from service.settings import Settings
+from tests.support.samples import MODEL, RememberingQueue, add_map, add_scan, add_version
 
 CARD = {"name": "lobby-net", "version": "1", "threshold": 0.3}
 
 
-def post(client, map_id="lobby", **body):
-    return client.post(f"/maps/{map_id}/models", json=body)
+def post(client: TestClient, map_id: str = "lobby", **body: Any) -> httpx.Response:
+    answer: httpx.Response = client.post(f"/maps/{map_id}/models", json=body)
+    return answer
 
 
-def add_model(catalog, *, ready=True, name=None):
+def add_model(catalog: Catalog, *, ready: bool = True, name: str | None = None) -> str:
     """A model of the map `lobby`, trained or not; its job's id."""
     record, job = catalog.models.create("lobby", minutes=5, name=name)
     if ready:
@@ -25,11 +32,14 @@ def add_model(catalog, *, ready=True, name=None):
     return job.job_id
 
 
-def code(answer):
-    return answer.json()["type"].rsplit(":", 1)[1]
+def code(answer: httpx.Response) -> str:
+    kind: str = answer.json()["type"]
+    return kind.rsplit(":", 1)[1]
 
 
-def test_a_training_is_recorded_and_handed_to_the_queue(client, catalog, queue):
+def test_a_training_is_recorded_and_handed_to_the_queue(
+    client: TestClient, catalog: Catalog, queue: RememberingQueue
+) -> None:
     add_map(catalog)
     answer = post(client, base=MODEL, minutes=3, epochs=7)
     assert answer.status_code == 202
@@ -43,20 +53,24 @@ def test_a_training_is_recorded_and_handed_to_the_queue(client, catalog, queue):
     assert (kept.base, kept.minutes, kept.epochs) == (MODEL, 3, 7)
 
 
-def test_versions_of_a_name_are_counted_and_names_may_be_given(client, catalog):
+def test_versions_of_a_name_are_counted_and_names_may_be_given(client: TestClient, catalog: Catalog) -> None:
     add_map(catalog)
     models = [post(client, **body).json()["model"] for body in ({}, {}, {"name": "night"})]
     assert models == ["lobby-net/1", "lobby-net/2", "night/1"]
 
 
-def test_what_is_left_out_is_from_nothing_and_takes_the_services_minutes(client, catalog, settings):
+def test_what_is_left_out_is_from_nothing_and_takes_the_services_minutes(
+    client: TestClient, catalog: Catalog, settings: Settings
+) -> None:
     add_map(catalog)
     kept = catalog.models.of_job(post(client).json()["job_id"])
     assert (kept.base, kept.minutes, kept.epochs) == (None, settings.training_minutes, None)
 
 
 @pytest.mark.parametrize("timeout_s", [3600, 600])
-def test_a_training_ends_before_its_step_is_stopped(client, catalog, settings, timeout_s):
+def test_a_training_ends_before_its_step_is_stopped(
+    client: TestClient, catalog: Catalog, settings: Settings, timeout_s: int
+) -> None:
     add_map(catalog)
     given = settings.model_copy(update={"job_timeout_s": timeout_s})
     most = {3600: 40, 600: 8}[timeout_s]
@@ -77,20 +91,24 @@ def test_a_training_ends_before_its_step_is_stopped(client, catalog, settings, t
         ({"labels": []}, "invalid_request"),
     ],
 )
-def test_a_request_that_cannot_be_met_leaves_nothing(client, catalog, queue, body, problem):
+def test_a_request_that_cannot_be_met_leaves_nothing(
+    client: TestClient, catalog: Catalog, queue: RememberingQueue, body: Any, problem: str
+) -> None:
     add_map(catalog)
     assert code(post(client, **body)) == problem
     assert queue.submitted == []
     assert catalog.models.find("lobby-net") is None
 
 
-def test_a_map_that_is_not_there_or_not_ready_is_not_trained_on(client, catalog):
+def test_a_map_that_is_not_there_or_not_ready_is_not_trained_on(client: TestClient, catalog: Catalog) -> None:
     assert code(post(client)) == "not_found"
     add_map(catalog, ready=False)
     assert code(post(client)) == "not_ready"
 
 
-def test_without_a_queue_nothing_is_recorded(client, catalog, queue):
+def test_without_a_queue_nothing_is_recorded(
+    client: TestClient, catalog: Catalog, queue: RememberingQueue
+) -> None:
     add_map(catalog)
     queue.down = True
     assert code(post(client)) == "queue_unavailable"
@@ -98,7 +116,9 @@ def test_without_a_queue_nothing_is_recorded(client, catalog, queue):
     assert [job.kind for job in catalog.jobs.page().items] == ["map"]
 
 
-def test_a_trained_model_stands_among_the_models_and_may_be_named_by_surveys_and_trainings(client, catalog):
+def test_a_trained_model_stands_among_the_models_and_may_be_named_by_surveys_and_trainings(
+    client: TestClient, catalog: Catalog
+) -> None:
     add_map(catalog)
     job_id = add_model(catalog)
     assert [card["name"] for card in client.get("/models").json()["models"]] == ["spicd-net", "lobby-net"]
@@ -111,7 +131,7 @@ def test_a_trained_model_stands_among_the_models_and_may_be_named_by_surveys_and
     assert post(client, base="lobby-net/1").json()["model"] == "lobby-net/2"
 
 
-def test_a_model_in_training_or_one_that_failed_is_not_ready(client, catalog):
+def test_a_model_in_training_or_one_that_failed_is_not_ready(client: TestClient, catalog: Catalog) -> None:
     add_map(catalog)
     job_id = add_model(catalog, ready=False)
     survey = {"scan_ids": [add_scan(catalog, "tuesday").scan_id], "model": "lobby-net/1"}
@@ -124,7 +144,9 @@ def test_a_model_in_training_or_one_that_failed_is_not_ready(client, catalog):
     assert [card["name"] for card in client.get("/models").json()["models"]] == ["spicd-net"]
 
 
-def test_the_newest_version_that_is_ready_is_shown_where_none_is_named(client, catalog):
+def test_the_newest_version_that_is_ready_is_shown_where_none_is_named(
+    client: TestClient, catalog: Catalog
+) -> None:
     add_map(catalog)
     for _ in range(2):
         add_model(catalog)
@@ -135,14 +157,14 @@ def test_the_newest_version_that_is_ready_is_shown_where_none_is_named(client, c
         assert code(client.get("/models/lobby-net", params={"version": version})) == "not_found"
 
 
-def test_maps_are_cut_for_models_of_the_release(client, catalog):
+def test_maps_are_cut_for_models_of_the_release(client: TestClient, catalog: Catalog) -> None:
     add_map(catalog)
     add_model(catalog)
     answer = client.post("/maps", json={"scan_ids": [add_scan(catalog).scan_id], "model": "lobby-net/1"})
     assert code(answer) == "bad_request"
 
 
-def test_a_model_goes_with_its_map(client, catalog, queue):
+def test_a_model_goes_with_its_map(client: TestClient, catalog: Catalog, queue: RememberingQueue) -> None:
     add_map(catalog)
     done = add_model(catalog)
     running = add_model(catalog, ready=False)
@@ -153,7 +175,7 @@ def test_a_model_goes_with_its_map(client, catalog, queue):
     assert not catalog.blobs.exists(blob_keys.model_weights(done))
 
 
-def test_a_version_that_a_model_is_trained_on_stays(catalog):
+def test_a_version_that_a_model_is_trained_on_stays(catalog: Catalog) -> None:
     add_map(catalog)
     job_id = add_model(catalog, ready=False)
     add_version(catalog)

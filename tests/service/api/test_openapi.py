@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -14,15 +15,16 @@ WRITTEN = PROJECT / openapi.FILE
 
 
 @pytest.fixture(scope="module")
-def document() -> dict:
-    return json.loads(WRITTEN.read_text())
+def document() -> dict[str, Any]:
+    written: dict[str, Any] = json.loads(WRITTEN.read_text())
+    return written
 
 
-def test_the_written_description_is_that_of_the_code():
+def test_the_written_description_is_that_of_the_code() -> None:
     assert WRITTEN.read_text() == openapi.written(), "run `python -m service.api.openapi`"
 
 
-def test_every_reference_leads_somewhere(document):
+def test_every_reference_leads_somewhere(document: dict[str, Any]) -> None:
     def references(node: object) -> set[str]:
         if isinstance(node, dict):
             here = {node["$ref"]} if "$ref" in node else set()
@@ -38,7 +40,7 @@ def test_every_reference_leads_somewhere(document):
         assert found
 
 
-def test_every_call_of_the_public_api_is_described(document):
+def test_every_call_of_the_public_api_is_described(document: dict[str, Any]) -> None:
     calls = {f"{method.upper()} {path}" for path, methods in document["paths"].items() for method in methods}
     assert calls == {
         "POST /scans",
@@ -79,7 +81,7 @@ def test_every_call_of_the_public_api_is_described(document):
     }
 
 
-def test_every_error_is_described_as_a_problem(document):
+def test_every_error_is_described_as_a_problem(document: dict[str, Any]) -> None:
     for path, methods in document["paths"].items():
         for method, call in methods.items():
             for status, answer in call["responses"].items():
@@ -88,7 +90,7 @@ def test_every_error_is_described_as_a_problem(document):
                     assert list(content) == ["application/problem+json"], (method, path, status)
 
 
-def test_uploads_describe_their_body(document):
+def test_uploads_describe_their_body(document: dict[str, Any]) -> None:
     bodies = {
         path: list(document["paths"][path]["post"]["requestBody"]["content"]) for path in ("/scans", "/maps")
     }
@@ -98,7 +100,7 @@ def test_uploads_describe_their_body(document):
     }
 
 
-def test_importing_the_api_brings_neither_torch_nor_the_worker():
+def test_importing_the_api_brings_neither_torch_nor_the_worker() -> None:
     import subprocess
     import sys
 

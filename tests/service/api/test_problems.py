@@ -2,9 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any, cast
+
+import httpx
 import pytest
+from fastapi import FastAPI
+from fastapi.testclient import TestClient
 
 from service.api.http.problems import MEDIA_TYPE, PROBLEMS
+from service.catalog.catalog import Catalog
+from service.catalog.maps import Maps
 from service.errors import ServiceError
 from tests.support.samples import (
     MODEL,
@@ -15,6 +24,7 @@ from tests.support.samples import (
     catalog_of,
     ply,
     running,
+    services_of,
     settings_in,
 )
 
@@ -24,7 +34,7 @@ FORM = {"Content-Type": "multipart/form-data; boundary=b"}
 
 
 @pytest.fixture(scope="module")
-def asked(tmp_path_factory):
+def asked(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
     """A service with a map that is ready and one that is not, for requests that change nothing."""
     with running(settings_in(tmp_path_factory.mktemp("service")), RememberingQueue()) as client:
         add_map(catalog_of(client), "ready")
@@ -32,10 +42,10 @@ def asked(tmp_path_factory):
         yield client
 
 
-def problem(answer, status: int, code: str) -> dict:
+def problem(answer: httpx.Response, status: int, code: str) -> dict[str, Any]:
     assert answer.status_code == status, answer.text
     assert answer.headers["content-type"] == MEDIA_TYPE
-    body = answer.json()
+    body: dict[str, Any] = answer.json()
     assert body["type"] == f"urn:spicd:problem:{code}"
     assert body["status"] == status
     assert body["title"] and body["detail"]
@@ -82,7 +92,9 @@ def problem(answer, status: int, code: str) -> dict:
         ("GET", "/models/a%20b", 422, "invalid_request"),
     ],
 )
-def test_a_request_without_a_body_ends_in_its_problem(asked, method, path, status, code):
+def test_a_request_without_a_body_ends_in_its_problem(
+    asked: TestClient, method: str, path: str, status: Any, code: str
+) -> None:
     problem(asked.request(method, path), status, code)
 
 
@@ -123,7 +135,9 @@ def test_a_request_without_a_body_ends_in_its_problem(asked, method, path, statu
     ],
 )
 @pytest.mark.parametrize("path", ["/maps", "/maps/ready/surveys"])
-def test_a_body_that_does_not_match_ends_in_its_problem(asked, path, headers, body, status, code):
+def test_a_body_that_does_not_match_ends_in_its_problem(
+    asked: TestClient, path: str, headers: dict[str, str], body: Any, status: Any, code: str
+) -> None:
     problem(asked.post(path, content=body, headers=headers), status, code)
 
 
@@ -149,21 +163,23 @@ def test_a_body_that_does_not_match_ends_in_its_problem(asked, path, headers, bo
         ({"name": "n" * 201}, "body.name", "n" * 200 + "..."),
     ],
 )
-def test_a_field_that_does_not_match_is_named_with_its_value(asked, fields, place, value):
+def test_a_field_that_does_not_match_is_named_with_its_value(
+    asked: TestClient, fields: dict[str, Any], place: str, value: object
+) -> None:
     answer = asked.post("/maps", json={"scan_ids": [add_scan(catalog_of(asked)).scan_id], **fields})
     errors = problem(answer, 422, "invalid_request")["errors"]
     assert [(error["place"], error["value"]) for error in errors] == [(place, value)]
 
 
 @pytest.mark.parametrize("threshold", ["-0.1", "1.1", "NaN", "high"])
-def test_a_threshold_is_a_probability(asked, threshold):
+def test_a_threshold_is_a_probability(asked: TestClient, threshold: float) -> None:
     answer = asked.post(
         "/maps/ready/surveys", data={"threshold": threshold}, files={"scans": ("a.ply", ply())}
     )
     assert problem(answer, 422, "invalid_request")["errors"][0]["place"] == "body.threshold"
 
 
-def test_what_is_in_the_way_is_a_conflict(client, catalog):
+def test_what_is_in_the_way_is_a_conflict(client: TestClient, catalog: Catalog) -> None:
     job_id = add_map(catalog)
     used = catalog.maps.get("lobby").scans[0].scan_id
     taken = client.post("/maps", json={"id": "lobby", "scan_ids": [used]})
@@ -172,21 +188,18 @@ def test_what_is_in_the_way_is_a_conflict(client, catalog):
     problem(client.delete(f"/jobs/{job_id}"), 409, "conflict")
 
 
-def test_an_unexpected_error_tells_nothing_of_the_inside(client, catalog, caplog):
+def test_an_unexpected_error_tells_nothing_of_the_inside(
+    client: TestClient, catalog: Catalog, caplog: pytest.LogCaptureFixture
+) -> None:
     catalog.database.engine.dispose()
-    services = client.app.state.services
+    services = services_of(client)
 
     class Broken:
         def page(self, **_: object) -> None:
             raise RuntimeError("postgresql://user:secret@host")
 
-    broken = {name: getattr(services.catalog, name) for name in services.catalog.__slots__}
-    client.app.state.services = type(services)(
-        settings=services.settings,
-        queue=services.queue,
-        cards=services.cards,
-        catalog=type(services.catalog)(**{**broken, "maps": Broken()}),
-    )
+    broken = replace(services.catalog, maps=cast("Maps", Broken()))
+    cast("FastAPI", client.app).state.services = replace(services, catalog=broken)
     answer = client.get("/maps")
     body = problem(answer, 500, "internal")
     assert "secret" not in answer.text
@@ -194,23 +207,25 @@ def test_an_unexpected_error_tells_nothing_of_the_inside(client, catalog, caplog
     assert body["instance"] in caplog.text
 
 
-def test_a_405_says_what_is_allowed(client):
+def test_a_405_says_what_is_allowed(client: TestClient) -> None:
     assert "GET" in client.put("/maps/lobby").headers["allow"]
 
 
-def test_every_error_of_the_service_has_its_place_in_the_table():
+def test_every_error_of_the_service_has_its_place_in_the_table() -> None:
     codes = {kind.code for kind in ServiceError.__subclasses__()}
     assert codes <= set(PROBLEMS)
     assert all(PROBLEMS[code][0] is not None for code in codes)
 
 
-def test_every_error_of_the_pipeline_has_a_title():
+def test_every_error_of_the_pipeline_has_a_title() -> None:
     errors = pytest.importorskip("worker.errors")
-    kinds = [kind for kind in vars(errors).values() if isinstance(kind, type)]
+    kinds: list[Any] = [kind for kind in vars(errors).values() if isinstance(kind, type)]
     assert {kind.code for kind in kinds} - {"cancelled"} <= set(PROBLEMS)
 
 
-def test_a_problem_of_a_survey_that_ran_is_no_problem_of_the_request(client, catalog):
+def test_a_problem_of_a_survey_that_ran_is_no_problem_of_the_request(
+    client: TestClient, catalog: Catalog
+) -> None:
     add_map(catalog)
     survey_id, job_id = add_survey(catalog, ready=False)
     catalog.jobs.dismiss(job_id)

@@ -7,22 +7,28 @@ import json
 import os
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
+from fastapi.testclient import TestClient
 
+from service.catalog.catalog import Catalog
 from service.errors import QueueUnavailable
-from tests.support.samples import IDENTITY, add_map, ply, running
+from service.settings import Settings
+from tests.support.samples import IDENTITY, RememberingQueue, add_map, ply, running
 
 RAW = {"Content-Type": "application/octet-stream"}
 POSE = [[0, -1, 0, 2.5], [1, 0, 0, 0], [0, 0, 1, 0.35], [0, 0, 0, 1]]
 
 
-def incoming(settings) -> list[Path]:
+def incoming(settings: Settings) -> list[Path]:
     folder = settings.data_dir / "incoming"
     return list(folder.iterdir()) if folder.exists() else []
 
 
-def test_a_raw_body_becomes_a_scan_with_its_bytes(client, catalog, settings):
+def test_a_raw_body_becomes_a_scan_with_its_bytes(
+    client: TestClient, catalog: Catalog, settings: Settings
+) -> None:
     sent = {"filename": "hall.ply", "captured_at": "2026-03-01T13:00:00+01:00", "pose": json.dumps(POSE)}
     answer = client.post("/scans", content=ply(), headers=RAW, params=sent)
     scan = answer.json()
@@ -38,7 +44,7 @@ def test_a_raw_body_becomes_a_scan_with_its_bytes(client, catalog, settings):
     assert client.get(answer.headers["location"]).json() == scan
 
 
-def test_a_form_brings_the_same_scan_with_its_fields(client):
+def test_a_form_brings_the_same_scan_with_its_fields(client: TestClient) -> None:
     form = {"device_id": "robot-7", "captured_at": "2026-03-01T12:00:00Z", "pose": json.dumps(POSE)}
     answer = client.post("/scans", data=form, files={"file": ("flur.ply", ply())})
     scan = answer.json()
@@ -49,7 +55,7 @@ def test_a_form_brings_the_same_scan_with_its_fields(client):
     assert raw.json() == scan
 
 
-def test_the_same_bytes_twice_are_one_scan_and_from_two_devices_two(client):
+def test_the_same_bytes_twice_are_one_scan_and_from_two_devices_two(client: TestClient) -> None:
     ids = []
     for device, status in (("a", 201), ("a", 200), ("b", 201)):
         answer = client.post("/scans", content=ply(), headers=RAW, params={"device_id": device})
@@ -67,12 +73,14 @@ def test_the_same_bytes_twice_are_one_scan_and_from_two_devices_two(client):
         (b"#.PCD\n", "pcd"),
     ],
 )
-def test_the_first_bytes_tell_the_format(client, head, known):
+def test_the_first_bytes_tell_the_format(client: TestClient, head: bytes, known: str) -> None:
     assert client.post("/scans", content=head, headers=RAW).json()["format"] == known
 
 
 @pytest.mark.parametrize("body", [b"", b"plywood", b"\x89PNG\r\n", b"\x00" * 100])
-def test_another_file_is_refused_by_name_and_leaves_nothing(client, catalog, settings, body):
+def test_another_file_is_refused_by_name_and_leaves_nothing(
+    client: TestClient, catalog: Catalog, settings: Settings, body: Any
+) -> None:
     answer = client.post("/scans", content=body, headers=RAW, params={"filename": "hall.png"})
     assert answer.status_code == 422
     assert answer.json()["type"] == "urn:spicd:problem:scan_unreadable"
@@ -85,7 +93,9 @@ def test_another_file_is_refused_by_name_and_leaves_nothing(client, catalog, set
 
 @pytest.mark.parametrize("declared", [True, False])
 @pytest.mark.parametrize("as_form", [True, False])
-def test_a_body_over_the_limit_is_refused_and_leaves_nothing(client, catalog, settings, declared, as_form):
+def test_a_body_over_the_limit_is_refused_and_leaves_nothing(
+    client: TestClient, catalog: Catalog, settings: Settings, declared: bool, as_form: bool
+) -> None:
     body, headers = ply() + bytes(settings.max_upload_bytes), RAW
     if as_form:
         request = client.build_request("POST", "/scans", files={"file": ("hall.ply", body)})
@@ -99,7 +109,9 @@ def test_a_body_over_the_limit_is_refused_and_leaves_nothing(client, catalog, se
 
 
 @pytest.mark.parametrize("cut", [30, 120, 180])
-def test_a_form_that_ends_early_leaves_nothing(client, catalog, settings, cut):
+def test_a_form_that_ends_early_leaves_nothing(
+    client: TestClient, catalog: Catalog, settings: Settings, cut: int
+) -> None:
     request = client.build_request("POST", "/scans", files={"file": ("hall.ply", ply())})
     headers = {"Content-Type": request.headers["content-type"]}
     answer = client.post("/scans", content=request.read()[:cut], headers=headers)
@@ -121,7 +133,9 @@ def test_a_form_that_ends_early_leaves_nothing(client, catalog, settings, cut):
         ("[[NaN,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]", "finite"),
     ],
 )
-def test_a_pose_that_is_not_rigid_or_far_away_is_refused_with_its_place(client, pose, told):
+def test_a_pose_that_is_not_rigid_or_far_away_is_refused_with_its_place(
+    client: TestClient, pose: Any, told: str
+) -> None:
     for answer in (
         client.post("/scans", content=ply(), headers=RAW, params={"pose": pose}),
         client.post("/scans", data={"pose": pose}, files={"file": ("hall.ply", ply())}),
@@ -131,14 +145,14 @@ def test_a_pose_that_is_not_rigid_or_far_away_is_refused_with_its_place(client, 
         assert ".pose" in answer.json()["errors"][0]["place"]
 
 
-def test_a_pose_ten_kilometres_away_is_taken(client):
+def test_a_pose_ten_kilometres_away_is_taken(client: TestClient) -> None:
     pose = [[1, 0, 0, 6000], [0, 1, 0, -8000], *(list(row) for row in IDENTITY[2:])]
     answer = client.post("/scans", content=ply(), headers=RAW, params={"pose": json.dumps(pose)})
     assert (answer.status_code, answer.json()["pose"]) == (201, pose)
 
 
 @pytest.mark.parametrize("when", ["2026-03-01", "2026-03-01T12:00:00", "1700000000", "noon"])
-def test_a_time_without_a_zone_is_refused(client, when):
+def test_a_time_without_a_zone_is_refused(client: TestClient, when: str) -> None:
     answer = client.post("/scans", content=ply(), headers=RAW, params={"captured_at": when})
     assert answer.status_code == 422
     assert answer.json()["errors"][0] == {
@@ -148,7 +162,7 @@ def test_a_time_without_a_zone_is_refused(client, when):
     }
 
 
-def test_a_file_name_is_kept_as_one_short_line(client):
+def test_a_file_name_is_kept_as_one_short_line(client: TestClient) -> None:
     body = (
         b'--b\r\nContent-Disposition: form-data; name="file"; filename="../a\x00\x1b\xff'
         + b"x" * 300
@@ -162,7 +176,7 @@ def test_a_file_name_is_kept_as_one_short_line(client):
     assert name.isprintable()
 
 
-def test_a_form_takes_one_file_in_its_field(client):
+def test_a_form_takes_one_file_in_its_field(client: TestClient) -> None:
     two = client.post("/scans", files=[("file", ("a.ply", ply())), ("file", ("b.ply", ply()))])
     assert (two.status_code, two.json()["detail"][:7]) == (422, "2 files")
     other = client.post("/scans", files={"scan": ("a.ply", ply())})
@@ -171,7 +185,7 @@ def test_a_form_takes_one_file_in_its_field(client):
     assert none.status_code == 415
 
 
-def test_a_scan_is_deleted_once_and_not_while_a_map_rests_on_it(client, catalog):
+def test_a_scan_is_deleted_once_and_not_while_a_map_rests_on_it(client: TestClient, catalog: Catalog) -> None:
     scan_id = client.post("/scans", content=ply(), headers=RAW).json()["scan_id"]
     assert client.delete(f"/scans/{scan_id}").status_code == 204
     assert client.delete(f"/scans/{scan_id}").status_code == 404
@@ -185,7 +199,9 @@ MOVED = json.dumps([[1, 0, 0, 4], *IDENTITY[1:]])
 LATER = "2026-03-02T12:00:00Z"
 
 
-def test_the_same_bytes_with_another_pose_or_time_correct_a_scan_that_nothing_rests_on(client):
+def test_the_same_bytes_with_another_pose_or_time_correct_a_scan_that_nothing_rests_on(
+    client: TestClient,
+) -> None:
     client.post("/scans", content=ply(), headers=RAW, params={"pose": TURNED, "filename": "hall.ply"})
     answer = client.post("/scans", content=ply(), headers=RAW, params={"pose": MOVED, "captured_at": LATER})
     scan = answer.json()
@@ -195,7 +211,9 @@ def test_the_same_bytes_with_another_pose_or_time_correct_a_scan_that_nothing_re
     assert (again.status_code, again.json()) == (200, scan)  # what is not said stays
 
 
-def test_the_same_bytes_with_another_pose_are_refused_once_a_map_rests_on_the_scan(client):
+def test_the_same_bytes_with_another_pose_are_refused_once_a_map_rests_on_the_scan(
+    client: TestClient,
+) -> None:
     scan = client.post("/scans", content=ply(), headers=RAW, params={"pose": TURNED}).json()
     client.post("/maps", json={"scan_ids": [scan["scan_id"]]})
     refused = client.post("/scans", content=ply(), headers=RAW, params={"pose": MOVED})
@@ -206,20 +224,22 @@ def test_the_same_bytes_with_another_pose_are_refused_once_a_map_rests_on_the_sc
 
 
 def test_an_upload_that_was_acknowledged_outlives_a_request_that_brought_the_same_bytes_and_failed(
-    client, catalog, queue
-):
+    client: TestClient, catalog: Catalog, queue: RememberingQueue, monkeypatch: pytest.MonkeyPatch
+) -> None:
     sent: list[str] = []
 
     def refuse(job_id: str, kind: str) -> None:
         sent.append(client.post("/scans", content=ply(), headers=RAW).json()["scan_id"])
         raise QueueUnavailable("the job queue does not answer")
 
-    queue.submit = refuse
+    monkeypatch.setattr(queue, "submit", refuse)
     assert client.post("/maps", files={"scans": ("hall.ply", ply())}).status_code == 503
     assert catalog.blobs.get_bytes(catalog.scans.get(sent[0]).key) == ply()
 
 
-def test_a_start_sweeps_what_a_killed_process_left_and_no_upload_of_today(settings, queue):
+def test_a_start_sweeps_what_a_killed_process_left_and_no_upload_of_today(
+    settings: Settings, queue: RememberingQueue
+) -> None:
     folder = settings.data_dir / "incoming"
     folder.mkdir(parents=True)
     for name, age_s in (("old.part", 25 * 3600), ("new.part", 60)):
@@ -229,7 +249,9 @@ def test_a_start_sweeps_what_a_killed_process_left_and_no_upload_of_today(settin
         assert [path.name for path in folder.iterdir()] == ["new.part"]
 
 
-def test_every_real_scan_is_taken_by_its_first_bytes_sound_or_not(client, shared_data):
+def test_every_real_scan_is_taken_by_its_first_bytes_sound_or_not(
+    client: TestClient, shared_data: Path
+) -> None:
     """Whether it can be read is for the job to say; only what names neither format is refused here."""
     refused = []
     for path in sorted((shared_data / "formats").rglob("*.p[lc][yd]")):

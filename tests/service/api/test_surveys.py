@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
+from fastapi.testclient import TestClient
 
 from service.catalog import blob_keys
-from tests.support.samples import NOON, add_map, add_scan, add_survey, ply, tile
+from service.catalog.catalog import Catalog
+from service.settings import Settings
+from tests.support.samples import NOON, RememberingQueue, add_map, add_scan, add_survey, ply, tile
 
 
-def test_a_survey_of_files_is_accepted_and_its_job_submitted(client, catalog, queue):
+def test_a_survey_of_files_is_accepted_and_its_job_submitted(
+    client: TestClient, catalog: Catalog, queue: RememberingQueue
+) -> None:
     add_map(catalog)
     form = {"captured_at": "2026-03-01T12:00:00Z", "device_id": "robot-7", "threshold": "0.7"}
     files = [("scans", ("a.ply", ply("a"))), ("scans", ("b.ply", ply("b")))]
@@ -25,13 +32,15 @@ def test_a_survey_of_files_is_accepted_and_its_job_submitted(client, catalog, qu
     assert catalog.scans.get(found["scans"][0]["scan_id"]).captured_at == NOON
 
 
-def test_a_survey_of_known_scans_takes_the_model_of_the_map(client, catalog):
+def test_a_survey_of_known_scans_takes_the_model_of_the_map(client: TestClient, catalog: Catalog) -> None:
     add_map(catalog)
     answer = client.post("/maps/lobby/surveys", json={"scan_ids": [add_scan(catalog).scan_id]})
     assert catalog.surveys.get(answer.json()["survey_id"]).model == catalog.maps.get("lobby").model
 
 
-def test_a_survey_before_its_map_is_ready_is_refused_unread(client, catalog, settings):
+def test_a_survey_before_its_map_is_ready_is_refused_unread(
+    client: TestClient, catalog: Catalog, settings: Settings
+) -> None:
     add_map(catalog, ready=False)
     answer = client.post("/maps/lobby/surveys", files={"scans": ("a.ply", ply())})
     assert answer.status_code == 409
@@ -39,7 +48,9 @@ def test_a_survey_before_its_map_is_ready_is_refused_unread(client, catalog, set
     assert [scan.filename for scan in catalog.scans.page().items] == ["map-lobby.ply"]
 
 
-def test_when_the_queue_is_down_no_survey_stays_recorded(client, catalog, queue):
+def test_when_the_queue_is_down_no_survey_stays_recorded(
+    client: TestClient, catalog: Catalog, queue: RememberingQueue
+) -> None:
     add_map(catalog)
     queue.down = True
     answer = client.post("/maps/lobby/surveys", files={"scans": ("a.ply", ply())})
@@ -49,7 +60,7 @@ def test_when_the_queue_is_down_no_survey_stays_recorded(client, catalog, queue)
     assert len(catalog.jobs.page().items) == 1
 
 
-def test_the_tiles_are_features_in_the_frame_of_the_map(client, catalog):
+def test_the_tiles_are_features_in_the_frame_of_the_map(client: TestClient, catalog: Catalog) -> None:
     add_map(catalog)
     tiles = [tile(1, 2, "changed", 0.93), tile(0, 0, "unobserved"), tile(0, 1, "unchanged", 0.1)]
     survey_id, _ = add_survey(catalog, tiles)
@@ -97,7 +108,9 @@ def test_the_tiles_are_features_in_the_frame_of_the_map(client, catalog):
 
 @pytest.mark.parametrize("what", ["tiles", "cloud.ply", "picture.png"])
 @pytest.mark.parametrize("ended", [False, True])
-def test_a_survey_without_a_result_says_so(client, catalog, what, ended):
+def test_a_survey_without_a_result_says_so(
+    client: TestClient, catalog: Catalog, what: str, ended: Any
+) -> None:
     add_map(catalog)
     survey_id, job_id = add_survey(catalog, ready=False)
     if ended:
@@ -107,7 +120,7 @@ def test_a_survey_without_a_result_says_so(client, catalog, what, ended):
     assert job_id in answer.json()["detail"]
 
 
-def test_the_files_of_a_survey_come_as_they_are(client, catalog):
+def test_the_files_of_a_survey_come_as_they_are(client: TestClient, catalog: Catalog) -> None:
     add_map(catalog)
     survey_id, _ = add_survey(catalog)
     missing = client.get(f"/surveys/{survey_id}/picture.png")
@@ -119,7 +132,9 @@ def test_the_files_of_a_survey_come_as_they_are(client, catalog):
     assert (picture.content, picture.headers["content-type"]) == (b"\x89PNG", "image/png")
 
 
-def test_deleting_a_survey_stops_its_job_and_leaves_its_map(client, catalog, queue):
+def test_deleting_a_survey_stops_its_job_and_leaves_its_map(
+    client: TestClient, catalog: Catalog, queue: RememberingQueue
+) -> None:
     add_map(catalog)
     survey_id, job_id = add_survey(catalog, ready=False)
     assert client.delete(f"/surveys/{survey_id}").status_code == 204

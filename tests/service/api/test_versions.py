@@ -3,17 +3,30 @@
 from __future__ import annotations
 
 from datetime import timedelta
+from typing import Any
 
+import httpx
 import pytest
+from fastapi.testclient import TestClient
 
 from service.catalog import blob_keys
+from service.catalog.catalog import Catalog
 from service.catalog.records import Problem, ScanOutcome
-from tests.support.samples import NOON, add_map, add_scan, add_survey, add_version, ply, tile
+from tests.support.samples import (
+    NOON,
+    RememberingQueue,
+    add_map,
+    add_scan,
+    add_survey,
+    add_version,
+    ply,
+    tile,
+)
 
 PROBLEM = Problem(code="map_failed", detail="no scan holds a pose")
 
 
-def accept_scans(catalog, survey_id):
+def accept_scans(catalog: Catalog, survey_id: str) -> list[ScanOutcome]:
     """What registration would have recorded of the survey's scans."""
     pose = ((1, 0, 0, 2.5), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1))
     scans = [
@@ -31,16 +44,19 @@ def accept_scans(catalog, survey_id):
     return scans
 
 
-def post(client, **asked):
-    return client.post("/maps/lobby/versions", json=asked)
+def post(client: TestClient, **asked: Any) -> httpx.Response:
+    answer: httpx.Response = client.post("/maps/lobby/versions", json=asked)
+    return answer
 
 
-def shown(client):
+def shown(client: TestClient) -> Any:
     found = client.get("/maps/lobby").json()
     return found["version"], found["status"], found["counts"]
 
 
-def test_a_version_of_further_scans_is_accepted_and_its_job_submitted(client, catalog, queue):
+def test_a_version_of_further_scans_is_accepted_and_its_job_submitted(
+    client: TestClient, catalog: Catalog, queue: RememberingQueue
+) -> None:
     add_map(catalog)
     (kept,) = catalog.maps.get("lobby").scans
     further = add_scan(catalog, "further")
@@ -59,7 +75,7 @@ def test_a_version_of_further_scans_is_accepted_and_its_job_submitted(client, ca
     assert client.get(f"/jobs/{accepted['job_id']}").json()["map_id"] == "lobby"
 
 
-def test_a_version_of_files_keeps_them_as_scans(client, catalog):
+def test_a_version_of_files_keeps_them_as_scans(client: TestClient, catalog: Catalog) -> None:
     add_map(catalog)
     files = [("scans", (f"{name}.ply", ply(name))) for name in ("b", "a")]
     answer = client.post("/maps/lobby/versions", data={"device_id": "robot-7"}, files=files)
@@ -69,7 +85,9 @@ def test_a_version_of_files_keeps_them_as_scans(client, catalog):
     assert [scan.device_id for scan in scans] == [None, "robot-7", "robot-7"]
 
 
-def test_a_version_of_an_accepted_survey_takes_its_scans_over_with_their_poses(client, catalog, queue):
+def test_a_version_of_an_accepted_survey_takes_its_scans_over_with_their_poses(
+    client: TestClient, catalog: Catalog, queue: RememberingQueue
+) -> None:
     add_map(catalog)
     survey_id, _ = add_survey(catalog, [tile(0, 0)])
     scans = accept_scans(catalog, survey_id)
@@ -81,7 +99,9 @@ def test_a_version_of_an_accepted_survey_takes_its_scans_over_with_their_poses(c
     assert found["scans"][1:] == [scan.model_dump(mode="json") for scan in scans]
 
 
-def test_a_map_stays_in_use_while_a_version_builds_and_shows_it_when_it_is_ready(client, catalog):
+def test_a_map_stays_in_use_while_a_version_builds_and_shows_it_when_it_is_ready(
+    client: TestClient, catalog: Catalog
+) -> None:
     first = add_map(catalog)
     second = add_version(catalog, ready=False)
     catalog.jobs.start(second)
@@ -99,7 +119,9 @@ def test_a_map_stays_in_use_while_a_version_builds_and_shows_it_when_it_is_ready
 
 
 @pytest.mark.parametrize("how", ["failed", "dismissed"])
-def test_a_version_that_came_to_nothing_leaves_the_map_as_it_was(client, catalog, how):
+def test_a_version_that_came_to_nothing_leaves_the_map_as_it_was(
+    client: TestClient, catalog: Catalog, how: str
+) -> None:
     add_map(catalog)
     before = client.get("/maps/lobby").json()
     job_id = add_version(catalog, ready=False)
@@ -118,7 +140,7 @@ def test_a_version_that_came_to_nothing_leaves_the_map_as_it_was(client, catalog
     assert catalog.versions.get("lobby", 3).base_version == 1
 
 
-def test_one_version_builds_at_a_time_and_the_refusal_names_it(client, catalog):
+def test_one_version_builds_at_a_time_and_the_refusal_names_it(client: TestClient, catalog: Catalog) -> None:
     add_map(catalog)
     job_id = add_version(catalog, ready=False)
     answer = client.post("/maps/lobby/versions", files={"scans": ("a.ply", ply("new"))})
@@ -130,7 +152,9 @@ def test_one_version_builds_at_a_time_and_the_refusal_names_it(client, catalog):
 
 
 @pytest.mark.parametrize("ended", [False, True])
-def test_a_map_that_has_no_version_to_go_on_from_is_not_ready(client, catalog, ended):
+def test_a_map_that_has_no_version_to_go_on_from_is_not_ready(
+    client: TestClient, catalog: Catalog, ended: Any
+) -> None:
     job_id = add_map(catalog, ready=False)
     if ended:
         catalog.jobs.fail(job_id, PROBLEM)
@@ -140,7 +164,7 @@ def test_a_map_that_has_no_version_to_go_on_from_is_not_ready(client, catalog, e
     assert job_id in answer.json()["detail"]
 
 
-def test_a_survey_of_another_map_or_of_none_is_not_found(client, catalog):
+def test_a_survey_of_another_map_or_of_none_is_not_found(client: TestClient, catalog: Catalog) -> None:
     add_map(catalog)
     add_map(catalog, "hall")
     foreign, _ = add_survey(catalog, [tile(0, 0)], map_id="hall")
@@ -150,7 +174,9 @@ def test_a_survey_of_another_map_or_of_none_is_not_found(client, catalog):
 
 
 @pytest.mark.parametrize("ended", [False, True])
-def test_a_survey_without_a_result_cannot_be_taken_over(client, catalog, ended):
+def test_a_survey_without_a_result_cannot_be_taken_over(
+    client: TestClient, catalog: Catalog, ended: Any
+) -> None:
     add_map(catalog)
     survey_id, job_id = add_survey(catalog, ready=False)
     if ended:
@@ -161,7 +187,7 @@ def test_a_survey_without_a_result_cannot_be_taken_over(client, catalog, ended):
     assert job_id in answer.json()["detail"]
 
 
-def test_a_survey_is_taken_over_once(client, catalog):
+def test_a_survey_is_taken_over_once(client: TestClient, catalog: Catalog) -> None:
     add_map(catalog)
     survey_id, _ = add_survey(catalog, [tile(0, 0)])
     accept_scans(catalog, survey_id)
@@ -170,7 +196,7 @@ def test_a_survey_is_taken_over_once(client, catalog):
     assert (answer.status_code, answer.json()["type"]) == (409, "urn:spicd:problem:conflict")
 
 
-def test_a_version_needs_scans_or_a_survey_and_not_both(client, catalog):
+def test_a_version_needs_scans_or_a_survey_and_not_both(client: TestClient, catalog: Catalog) -> None:
     add_map(catalog)
     survey_id, _ = add_survey(catalog, [tile(0, 0)])
     further = add_scan(catalog, "further").scan_id
@@ -179,7 +205,9 @@ def test_a_version_needs_scans_or_a_survey_and_not_both(client, catalog):
         assert (answer.status_code, answer.json()["type"]) == (422, "urn:spicd:problem:bad_request")
 
 
-def test_a_scan_of_the_version_in_use_is_refused_and_one_that_was_left_out_may_come_again(client, catalog):
+def test_a_scan_of_the_version_in_use_is_refused_and_one_that_was_left_out_may_come_again(
+    client: TestClient, catalog: Catalog
+) -> None:
     job_id = add_map(catalog)
     (kept,) = catalog.maps.get("lobby").scans
     answer = post(client, scan_ids=[kept.scan_id])
@@ -190,7 +218,9 @@ def test_a_scan_of_the_version_in_use_is_refused_and_one_that_was_left_out_may_c
     assert again.accepted is None
 
 
-def test_when_the_queue_is_down_no_version_stays_recorded(client, catalog, queue):
+def test_when_the_queue_is_down_no_version_stays_recorded(
+    client: TestClient, catalog: Catalog, queue: RememberingQueue
+) -> None:
     add_map(catalog)
     queue.down = True
     answer = client.post("/maps/lobby/versions", files={"scans": ("a.ply", ply())})
@@ -202,12 +232,13 @@ def test_when_the_queue_is_down_no_version_stays_recorded(client, catalog, queue
     assert client.post("/maps/lobby/versions", files={"scans": ("a.ply", ply())}).json()["version"] == 2
 
 
-def test_versions_are_listed_newest_first_page_by_page(client, catalog):
+def test_versions_are_listed_newest_first_page_by_page(client: TestClient, catalog: Catalog) -> None:
     add_map(catalog)
     add_map(catalog, "hall")
     for _ in range(4):
         add_version(catalog)
-    url, seen = "/maps/lobby/versions?limit=2", []
+    url: str | None = "/maps/lobby/versions?limit=2"
+    seen = []
     while url:
         body = client.get(url).json()
         seen.append([found["version"] for found in body["versions"]])
@@ -215,7 +246,9 @@ def test_versions_are_listed_newest_first_page_by_page(client, catalog):
     assert seen == [[5, 4], [3, 2], [1]]
 
 
-def test_a_survey_keeps_the_version_that_was_in_use_when_it_was_asked_for(client, catalog):
+def test_a_survey_keeps_the_version_that_was_in_use_when_it_was_asked_for(
+    client: TestClient, catalog: Catalog
+) -> None:
     add_map(catalog)
     early, job_id = add_survey(catalog, ready=False)
     add_version(catalog)
@@ -229,7 +262,9 @@ def test_a_survey_keeps_the_version_that_was_in_use_when_it_was_asked_for(client
     assert one["properties"]["map_version"] == 1
 
 
-def test_a_deleted_version_takes_its_files_and_job_and_leaves_the_surveys_compared_with_it(client, catalog):
+def test_a_deleted_version_takes_its_files_and_job_and_leaves_the_surveys_compared_with_it(
+    client: TestClient, catalog: Catalog
+) -> None:
     first = add_map(catalog)
     survey_id, _ = add_survey(catalog, [tile(1, 0)])
     second = add_version(catalog)
@@ -248,7 +283,7 @@ def test_a_deleted_version_takes_its_files_and_job_and_leaves_the_surveys_compar
     assert client.delete("/maps/lobby/versions/1").status_code == 404
 
 
-def test_a_version_that_is_needed_is_not_deleted(client, catalog):
+def test_a_version_that_is_needed_is_not_deleted(client: TestClient, catalog: Catalog) -> None:
     add_map(catalog)
     assert client.delete("/maps/lobby/versions/1").status_code == 409  # in use
     _, job_id = add_survey(catalog, ready=False)
@@ -260,7 +295,7 @@ def test_a_version_that_is_needed_is_not_deleted(client, catalog):
     assert client.delete("/maps/lobby/versions/1").status_code == 204
 
 
-def test_a_survey_stays_while_a_version_is_built_of_it(client, catalog):
+def test_a_survey_stays_while_a_version_is_built_of_it(client: TestClient, catalog: Catalog) -> None:
     add_map(catalog)
     survey_id, _ = add_survey(catalog, [tile(1, 0)])
     accept_scans(catalog, survey_id)
@@ -272,7 +307,9 @@ def test_a_survey_stays_while_a_version_is_built_of_it(client, catalog):
     assert client.get("/maps/lobby/versions/2").json()["survey_id"] == survey_id
 
 
-def test_a_deleted_map_takes_the_files_of_all_its_versions(client, catalog, queue):
+def test_a_deleted_map_takes_the_files_of_all_its_versions(
+    client: TestClient, catalog: Catalog, queue: RememberingQueue
+) -> None:
     jobs = [add_map(catalog), add_version(catalog), add_version(catalog, ready=False)]
     for job_id in jobs:
         catalog.blobs.put_bytes(blob_keys.map_cloud(job_id), b"ply")
@@ -284,7 +321,7 @@ def test_a_deleted_map_takes_the_files_of_all_its_versions(client, catalog, queu
 
 
 @pytest.mark.parametrize("number", ["0", "-1", "x", "99999999999999999999"])
-def test_a_number_that_no_version_has_is_refused(client, catalog, number):
+def test_a_number_that_no_version_has_is_refused(client: TestClient, catalog: Catalog, number: Any) -> None:
     add_map(catalog)
     assert client.get(f"/maps/lobby/versions/{number}").status_code == 422
     assert client.get("/maps/lobby/versions/7").status_code == 404

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -13,17 +14,17 @@ from service.catalog.blobs import Blobs
 
 
 @pytest.fixture
-def blobs(tmp_path):
+def blobs(tmp_path: Path) -> Blobs:
     return Blobs((tmp_path / "blobs").as_uri())
 
 
 @pytest.fixture(params=["folder", "elsewhere"])
-def either(request, tmp_path):
+def either(request: pytest.FixtureRequest, tmp_path: Path) -> Blobs:
     """A local folder, and a store that is not one (obstore's memory stands in for S3)."""
     return Blobs((tmp_path / "blobs").as_uri() if request.param == "folder" else "memory:///")
 
 
-def test_bytes_come_back_by_key(either):
+def test_bytes_come_back_by_key(either: Blobs) -> None:
     either.put_bytes("maps/lobby/cloud.ply", b"ply")
     assert either.get_bytes("maps/lobby/cloud.ply") == b"ply"
     assert either.size("maps/lobby/cloud.ply") == 3
@@ -32,13 +33,13 @@ def test_bytes_come_back_by_key(either):
         assert path.read_bytes() == b"ply"
 
 
-def test_what_was_put_last_stands(either):
+def test_what_was_put_last_stands(either: Blobs) -> None:
     either.put_bytes("a/b", b"first, longer")
     either.put_bytes("a/b", b"second")
     assert either.get_bytes("a/b") == b"second"
 
 
-def test_a_file_of_seven_megabytes_comes_back_in_pieces(either, tmp_path):
+def test_a_file_of_seven_megabytes_comes_back_in_pieces(either: Blobs, tmp_path: Path) -> None:
     source = tmp_path / "scan.bin"
     source.write_bytes(bytes(range(256)) * 28_000)
     either.put_file("scans/s/scan.bin", source)
@@ -47,7 +48,7 @@ def test_a_file_of_seven_megabytes_comes_back_in_pieces(either, tmp_path):
 
 
 @pytest.mark.parametrize("ask", ["get_bytes", "size", "path", "stream", "local"])
-def test_a_missing_key_is_a_missing_file(blobs, ask):
+def test_a_missing_key_is_a_missing_file(blobs: Blobs, ask: Any) -> None:
     with pytest.raises(FileNotFoundError):
         if ask == "local":
             with blobs.local("maps/none/cloud.ply"):
@@ -57,7 +58,7 @@ def test_a_missing_key_is_a_missing_file(blobs, ask):
     assert not blobs.exists("maps/none/cloud.ply")
 
 
-def test_a_moved_file_is_gone_where_it_was(either, tmp_path):
+def test_a_moved_file_is_gone_where_it_was(either: Blobs, tmp_path: Path) -> None:
     source = tmp_path / "scan.bin"
     source.write_bytes(b"scan")
     either.put_file("scans/s/scan.bin", source, move=True)
@@ -65,13 +66,13 @@ def test_a_moved_file_is_gone_where_it_was(either, tmp_path):
     assert not source.exists()
 
 
-def test_a_local_blob_is_read_where_it_lies(blobs, tmp_path):
+def test_a_local_blob_is_read_where_it_lies(blobs: Blobs, tmp_path: Path) -> None:
     blobs.put_bytes("a/b.bin", b"x")
     with blobs.local("a/b.bin") as path:
         assert path == tmp_path / "blobs" / "a" / "b.bin"
 
 
-def test_a_copy_from_elsewhere_goes_when_it_was_read():
+def test_a_copy_from_elsewhere_goes_when_it_was_read() -> None:
     elsewhere = Blobs("memory:///")
     elsewhere.put_bytes("a/b.bin", b"x")
     with elsewhere.local("a/b.bin") as path:
@@ -79,14 +80,14 @@ def test_a_copy_from_elsewhere_goes_when_it_was_read():
     assert not path.exists()
 
 
-def test_many_looks_at_once_find_the_store_well_and_leave_nothing(blobs, tmp_path):
+def test_many_looks_at_once_find_the_store_well_and_leave_nothing(blobs: Blobs, tmp_path: Path) -> None:
     with ThreadPoolExecutor(8) as threads:
         looks = [threads.submit(blobs.ping) for _ in range(200)]
     assert [look.exception() for look in looks if look.exception()] == []
     assert list((tmp_path / "blobs" / "health").iterdir()) == []
 
 
-def test_a_prefix_takes_its_blobs_and_no_others(either):
+def test_a_prefix_takes_its_blobs_and_no_others(either: Blobs) -> None:
     either.put_bytes("maps/lobby/cloud.ply", b"x")
     either.put_bytes("maps/lobby/scans/a.npz", b"x")
     either.put_bytes("maps/lobby2/cloud.ply", b"x")
@@ -97,7 +98,7 @@ def test_a_prefix_takes_its_blobs_and_no_others(either):
     assert either.exists("maps/lobby2/cloud.ply")
 
 
-def test_a_copy_stays_as_it_was_when_the_first_is_replaced_or_deleted(either):
+def test_a_copy_stays_as_it_was_when_the_first_is_replaced_or_deleted(either: Blobs) -> None:
     either.put_bytes("maps/one/scans/a.npz", b"first")
     for _ in range(2):
         either.copy("maps/one/scans/a.npz", "maps/two/scans/a.npz")
@@ -110,8 +111,10 @@ def test_a_copy_stays_as_it_was_when_the_first_is_replaced_or_deleted(either):
         either.copy("maps/one/scans/a.npz", "maps/two/scans/b.npz")
 
 
-def test_where_the_disk_knows_no_links_a_copy_is_written(blobs, monkeypatch):
-    def refuse(path, target):
+def test_where_the_disk_knows_no_links_a_copy_is_written(
+    blobs: Blobs, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(path: Path, target: Path) -> None:
         raise OSError(errno.EPERM, "Operation not permitted")
 
     monkeypatch.setattr(Path, "hardlink_to", refuse)
@@ -120,7 +123,7 @@ def test_where_the_disk_knows_no_links_a_copy_is_written(blobs, monkeypatch):
     assert blobs.get_bytes("c/d") == b"x"
 
 
-def test_the_keys_under_a_folder_are_its_own_and_no_others(either):
+def test_the_keys_under_a_folder_are_its_own_and_no_others(either: Blobs) -> None:
     for key in ("maps/one/work/pairs-b.json", "maps/one/work/pairs-a.json", "maps/one2/work/pairs-c.json"):
         either.put_bytes(key, b"[]")
     assert either.under(blob_keys.map_work("one")) == [
@@ -142,11 +145,11 @@ def test_the_keys_under_a_folder_are_its_own_and_no_others(either):
         ("späť.ply", "sp_.ply"),
     ],
 )
-def test_a_file_name_becomes_one_harmless_part_of_a_key(given, kept):
+def test_a_file_name_becomes_one_harmless_part_of_a_key(given: Any, kept: str) -> None:
     assert blob_keys.safe_name(given) == kept
 
 
-def test_a_description_belongs_to_one_model():
+def test_a_description_belongs_to_one_model() -> None:
     key = blob_keys.map_embedding("lobby", "spicd-net/1", "0123456789abcdef")
     assert key == "maps/lobby/description-spicd-net-1-0123456789ab.npz"
     assert key != blob_keys.map_embedding("lobby", "spicd-net/2", "0123456789abcdef")

@@ -25,14 +25,14 @@ def open_and_ping(address: str) -> None:
     database.ping()
 
 
-def test_the_migrations_make_the_tables_that_the_code_expects(tmp_path):
+def test_the_migrations_make_the_tables_that_the_code_expects(tmp_path: Path) -> None:
     database = Database(url(tmp_path))
     database.upgrade()
     with database.engine.connect() as connection:
         assert compare_metadata(MigrationContext.configure(connection), Base.metadata) == []
 
 
-def test_three_processes_may_upgrade_one_new_database_at_once(tmp_path):
+def test_three_processes_may_upgrade_one_new_database_at_once(tmp_path: Path) -> None:
     context = multiprocessing.get_context("spawn")
     processes = [context.Process(target=open_and_ping, args=(url(tmp_path),)) for _ in range(3)]
     for process in processes:
@@ -42,14 +42,14 @@ def test_three_processes_may_upgrade_one_new_database_at_once(tmp_path):
     assert [process.exitcode for process in processes] == [0] * 3
 
 
-def test_sqlite_runs_with_wal_and_foreign_keys(tmp_path):
+def test_sqlite_runs_with_wal_and_foreign_keys(tmp_path: Path) -> None:
     database = Database(url(tmp_path))
     with database.read() as session:
         assert session.scalar(text("PRAGMA journal_mode")) == "wal"
         assert session.scalar(text("PRAGMA foreign_keys")) == 1
 
 
-def test_a_row_without_its_parent_is_refused(tmp_path):
+def test_a_row_without_its_parent_is_refused(tmp_path: Path) -> None:
     database = Database(url(tmp_path))
     database.upgrade()
     with pytest.raises(IntegrityError), database.write() as session:
@@ -58,7 +58,7 @@ def test_a_row_without_its_parent_is_refused(tmp_path):
         )
 
 
-def test_a_write_that_raises_leaves_nothing(tmp_path):
+def test_a_write_that_raises_leaves_nothing(tmp_path: Path) -> None:
     database = Database(url(tmp_path))
     database.upgrade()
     insert = (

@@ -7,7 +7,8 @@ from threading import Barrier
 
 import pytest
 
-from service.catalog.records import Problem
+from service.catalog.catalog import Catalog
+from service.catalog.records import JobStatus, Problem
 from service.errors import Conflict, NotFound
 from tests.support.samples import add_map, add_survey
 
@@ -15,11 +16,11 @@ PROBLEM = Problem(code="registration_failed", detail="scan hall.pcd: fitness 0.1
 
 
 @pytest.fixture
-def job_id(catalog):
+def job_id(catalog: Catalog) -> str:
     return add_map(catalog, ready=False)
 
 
-def test_a_job_waits_then_runs_then_succeeds_with_its_map(catalog, job_id):
+def test_a_job_waits_then_runs_then_succeeds_with_its_map(catalog: Catalog, job_id: str) -> None:
     assert catalog.jobs.get(job_id).status == "accepted"
     assert catalog.jobs.start(job_id)
     running = catalog.jobs.get(job_id)
@@ -27,18 +28,20 @@ def test_a_job_waits_then_runs_then_succeeds_with_its_map(catalog, job_id):
     assert catalog.jobs.succeed(job_id)
     done = catalog.jobs.get(job_id)
     assert (done.status, done.progress, done.started) == ("successful", 100, running.started)
+    assert done.started is not None
+    assert done.finished is not None
     assert done.created <= done.started <= done.finished == done.updated
     assert catalog.maps.get("lobby").status == "ready"
 
 
-def test_a_second_start_keeps_the_first_instant(catalog, job_id):
+def test_a_second_start_keeps_the_first_instant(catalog: Catalog, job_id: str) -> None:
     catalog.jobs.start(job_id)
     first = catalog.jobs.get(job_id).started
     assert catalog.jobs.start(job_id)
     assert catalog.jobs.get(job_id).started == first
 
 
-def test_progress_is_the_share_in_percent_and_never_falls(catalog, job_id):
+def test_progress_is_the_share_in_percent_and_never_falls(catalog: Catalog, job_id: str) -> None:
     catalog.jobs.start(job_id)
     shown = []
     for share in (0.1, 0.424, 0.2, 1.7, -1):
@@ -47,7 +50,7 @@ def test_progress_is_the_share_in_percent_and_never_falls(catalog, job_id):
     assert shown == [10, 42, 42, 100, 100]
 
 
-def test_a_failed_job_carries_its_problem_and_fails_its_map(catalog, job_id):
+def test_a_failed_job_carries_its_problem_and_fails_its_map(catalog: Catalog, job_id: str) -> None:
     catalog.jobs.start(job_id)
     assert catalog.jobs.fail(job_id, PROBLEM)
     assert catalog.jobs.get(job_id).problem == PROBLEM
@@ -55,7 +58,7 @@ def test_a_failed_job_carries_its_problem_and_fails_its_map(catalog, job_id):
     assert (failed.status, failed.problem) == ("failed", PROBLEM)
 
 
-def test_a_failed_survey_leaves_its_map_ready(catalog):
+def test_a_failed_survey_leaves_its_map_ready(catalog: Catalog) -> None:
     add_map(catalog)
     survey_id, job_id = add_survey(catalog, ready=False)
     catalog.jobs.fail(job_id, PROBLEM)
@@ -71,7 +74,7 @@ END = {
 
 
 @pytest.mark.parametrize("status", END)
-def test_nothing_leaves_a_terminal_state(catalog, job_id, status):
+def test_nothing_leaves_a_terminal_state(catalog: Catalog, job_id: str, status: JobStatus) -> None:
     END[status](catalog.jobs, job_id)
     ended = catalog.jobs.get(job_id)
     assert ended.status == status
@@ -88,7 +91,7 @@ def test_nothing_leaves_a_terminal_state(catalog, job_id, status):
     assert catalog.jobs.is_dismissed(job_id) == (status == "dismissed")
 
 
-def test_of_many_that_end_a_job_at_once_exactly_one_does(catalog, job_id):
+def test_of_many_that_end_a_job_at_once_exactly_one_does(catalog: Catalog, job_id: str) -> None:
     catalog.jobs.start(job_id)
     together = Barrier(8)
 
@@ -107,7 +110,7 @@ def test_of_many_that_end_a_job_at_once_exactly_one_does(catalog, job_id):
     assert catalog.maps.get("lobby").status == ("ready" if winner % 2 else "failed")
 
 
-def test_reports_that_race_with_a_dismissal_never_undo_it(catalog, job_id):
+def test_reports_that_race_with_a_dismissal_never_undo_it(catalog: Catalog, job_id: str) -> None:
     catalog.jobs.start(job_id)
     together = Barrier(5)
 
@@ -130,7 +133,7 @@ def test_reports_that_race_with_a_dismissal_never_undo_it(catalog, job_id):
     assert catalog.maps.get("lobby").status == "failed"
 
 
-def test_a_job_that_is_gone_tells_its_worker_to_stop(catalog, job_id):
+def test_a_job_that_is_gone_tells_its_worker_to_stop(catalog: Catalog, job_id: str) -> None:
     catalog.maps.delete("lobby")
     assert catalog.jobs.is_dismissed(job_id)
     assert not catalog.jobs.start(job_id)
@@ -140,12 +143,12 @@ def test_a_job_that_is_gone_tells_its_worker_to_stop(catalog, job_id):
         catalog.jobs.get(job_id)
 
 
-def test_jobs_are_counted_by_state(catalog, job_id):
+def test_jobs_are_counted_by_state(catalog: Catalog, job_id: str) -> None:
     add_map(catalog, "hall")
     assert catalog.jobs.counts() == {"accepted": 1, "successful": 1}
 
 
-def test_an_unexpected_error_shows_its_type_alone():
+def test_an_unexpected_error_shows_its_type_alone() -> None:
     problem = Problem.of(RuntimeError("postgresql://user:secret@host"))
     assert problem.code == "internal"
     assert "RuntimeError" in problem.detail

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from datetime import timedelta
+from pathlib import Path
+from typing import Any
 
 import pytest
 from pydantic import ValidationError
 
 from service.catalog import blob_keys
-from service.catalog.records import Bounds, ScanOutcome, TileRecord
+from service.catalog.catalog import Catalog
+from service.catalog.records import Bounds, ScanOutcome, ScanRecord, TileRecord, TileState
 from service.errors import BadRequest, Conflict, NotFound, NotReady
 from tests.support.samples import IDENTITY, MODEL, NOON, add_map, add_scan, add_survey, ply, tile
 
@@ -19,14 +22,14 @@ def accepted(scan_id: str, fitness: float) -> ScanOutcome:
     )
 
 
-def test_a_map_lists_its_scans_in_the_order_asked_for(catalog):
+def test_a_map_lists_its_scans_in_the_order_asked_for(catalog: Catalog) -> None:
     ids = [add_scan(catalog, name).scan_id for name in ("b", "a", "c")]
     catalog.maps.create(scan_ids=ids, model=MODEL, map_id="hall")
     assert [scan.scan_id for scan in catalog.maps.get("hall").scans] == ids
     assert {scan.accepted for scan in catalog.maps.get("hall").scans} == {None}
 
 
-def test_a_result_saved_twice_is_the_second_result(catalog):
+def test_a_result_saved_twice_is_the_second_result(catalog: Catalog) -> None:
     job_id = add_map(catalog, ready=False)
     scan_id = catalog.maps.get("lobby").scans[0].scan_id
     for fitness in (0.7, 0.9):
@@ -38,11 +41,12 @@ def test_a_result_saved_twice_is_the_second_result(catalog):
         )
     found = catalog.maps.get("lobby")
     assert [scan.fitness for scan in found.scans] == [0.9]
+    assert found.bounds is not None
     assert (found.bounds.max[0], found.counts) == (0.9, {"tiles": 9})
     assert found.status == "building"  # only the end of the job makes it ready
 
 
-def test_outcomes_of_a_failed_map_are_kept(catalog):
+def test_outcomes_of_a_failed_map_are_kept(catalog: Catalog) -> None:
     job_id = add_map(catalog, ready=False)
     scan_id = catalog.maps.get("lobby").scans[0].scan_id
     left_out = ScanOutcome(scan_id=scan_id, accepted=False, fitness=0.1, rmse=0.04, reason="fitness 0.10")
@@ -50,13 +54,13 @@ def test_outcomes_of_a_failed_map_are_kept(catalog):
     assert catalog.maps.get("lobby").scans == (left_out,)
 
 
-def test_an_outcome_of_a_foreign_scan_is_a_mistake(catalog):
+def test_an_outcome_of_a_foreign_scan_is_a_mistake(catalog: Catalog) -> None:
     job_id = add_map(catalog, ready=False)
     with pytest.raises(ValueError, match="elsewhere"):
         catalog.versions.save_outcomes(job_id, [accepted("elsewhere", 1)])
 
 
-def test_an_id_is_taken_once_and_the_second_leaves_no_job(catalog):
+def test_an_id_is_taken_once_and_the_second_leaves_no_job(catalog: Catalog) -> None:
     add_map(catalog)
     scan = add_scan(catalog, "other")
     with pytest.raises(Conflict, match="lobby"):
@@ -64,19 +68,19 @@ def test_an_id_is_taken_once_and_the_second_leaves_no_job(catalog):
     assert len(catalog.jobs.page().items) == 1
 
 
-def test_unknown_scans_are_named_all(catalog):
+def test_unknown_scans_are_named_all(catalog: Catalog) -> None:
     with pytest.raises(NotFound, match="'x', 'y'"):
         catalog.maps.create(scan_ids=["x", add_scan(catalog).scan_id, "y"], model=MODEL)
     assert catalog.maps.page().items == []
 
 
 @pytest.mark.parametrize("scan_ids", [[], ["twice", "twice"]])
-def test_a_map_needs_scans_each_once(catalog, scan_ids):
+def test_a_map_needs_scans_each_once(catalog: Catalog, scan_ids: list[str]) -> None:
     with pytest.raises(BadRequest):
         catalog.maps.create(scan_ids=scan_ids, model=MODEL)
 
 
-def test_a_survey_saved_twice_has_its_tiles_once_and_counts_them(catalog):
+def test_a_survey_saved_twice_has_its_tiles_once_and_counts_them(catalog: Catalog) -> None:
     add_map(catalog)
     survey_id, _ = add_survey(catalog, ready=False)
     catalog.surveys.save_result(survey_id, tiles=[tile(i, 0) for i in range(5)], threshold=0.4)
@@ -99,7 +103,7 @@ def test_a_survey_saved_twice_has_its_tiles_once_and_counts_them(catalog):
     }
 
 
-def test_a_survey_is_as_late_as_its_latest_scan(catalog):
+def test_a_survey_is_as_late_as_its_latest_scan(catalog: Catalog) -> None:
     add_map(catalog)
     ids = [
         add_scan(catalog, str(hour), captured_at=NOON + timedelta(hours=hour)).scan_id for hour in (2, 5, 3)
@@ -109,7 +113,7 @@ def test_a_survey_is_as_late_as_its_latest_scan(catalog):
 
 
 @pytest.mark.parametrize("ended", [False, True])
-def test_a_survey_needs_a_map_that_is_ready(catalog, ended):
+def test_a_survey_needs_a_map_that_is_ready(catalog: Catalog, ended: Any) -> None:
     job_id = add_map(catalog, ready=False)
     if ended:
         catalog.jobs.dismiss(job_id)
@@ -117,10 +121,12 @@ def test_a_survey_needs_a_map_that_is_ready(catalog, ended):
         catalog.surveys.create("lobby", scan_ids=[add_scan(catalog).scan_id], model=MODEL)
 
 
-def test_a_scan_deleted_while_the_same_bytes_come_again_leaves_the_new_file(catalog, monkeypatch):
+def test_a_scan_deleted_while_the_same_bytes_come_again_leaves_the_new_file(
+    catalog: Catalog, monkeypatch: pytest.MonkeyPatch
+) -> None:
     first = add_scan(catalog)
     forget = catalog.blobs.delete_prefix
-    again = []
+    again: list[ScanRecord] = []
 
     def late(prefix: str) -> None:
         """The row is gone and the file is not yet: now the same upload comes."""
@@ -135,10 +141,13 @@ def test_a_scan_deleted_while_the_same_bytes_come_again_leaves_the_new_file(cata
     assert not catalog.blobs.exists(first.key)
 
 
-def test_of_two_uploads_of_the_same_bytes_at_once_one_file_is_kept(catalog, monkeypatch):
-    put, first = catalog.blobs.put_file, []
+def test_of_two_uploads_of_the_same_bytes_at_once_one_file_is_kept(
+    catalog: Catalog, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    put = catalog.blobs.put_file
+    first: list[ScanRecord | None] = []
 
-    def late(key, path, *, move):
+    def late(key: str, path: Path, *, move: bool) -> None:
         if not first:
             first.append(None)
             first[0] = add_scan(catalog)
@@ -146,12 +155,14 @@ def test_of_two_uploads_of_the_same_bytes_at_once_one_file_is_kept(catalog, monk
         put(key, path, move=move)
 
     monkeypatch.setattr(catalog.blobs, "put_file", late)
-    assert add_scan(catalog) == first[0]
-    files = [path for path in (catalog.blobs._root / "scans").rglob("*") if path.is_file()]
-    assert files == [catalog.blobs._root / first[0].key]
+    kept = add_scan(catalog)
+    assert kept == first[0]
+    root = catalog.blobs._root
+    assert root is not None
+    assert [path for path in (root / "scans").rglob("*") if path.is_file()] == [root / kept.key]
 
 
-def test_a_deleted_map_takes_its_surveys_jobs_and_blobs_and_leaves_its_scans(catalog):
+def test_a_deleted_map_takes_its_surveys_jobs_and_blobs_and_leaves_its_scans(catalog: Catalog) -> None:
     built_by = add_map(catalog)
     add_map(catalog, "hall")
     survey_id, job_id = add_survey(catalog, [tile(0, 0)])
@@ -172,7 +183,7 @@ def test_a_deleted_map_takes_its_surveys_jobs_and_blobs_and_leaves_its_scans(cat
     assert [found.map_id for found in catalog.maps.page().items] == ["hall"]
 
 
-def test_a_late_step_of_a_deleted_map_touches_nothing_of_the_map_that_took_its_id(catalog):
+def test_a_late_step_of_a_deleted_map_touches_nothing_of_the_map_that_took_its_id(catalog: Catalog) -> None:
     old = add_map(catalog, ready=False)
     catalog.maps.delete("lobby")
     new = add_map(catalog)
@@ -189,14 +200,14 @@ def test_a_late_step_of_a_deleted_map_touches_nothing_of_the_map_that_took_its_i
     assert catalog.maps.get("lobby") == before
 
 
-def test_the_same_bytes_from_the_same_device_are_one_scan(catalog):
+def test_the_same_bytes_from_the_same_device_are_one_scan(catalog: Catalog) -> None:
     first = add_scan(catalog, "hall", device_id="robot-1")
     assert add_scan(catalog, "hall", device_id="robot-1") == first
     assert add_scan(catalog, "hall", device_id="robot-2").scan_id != first.scan_id
     assert add_scan(catalog, "hall").scan_id != first.scan_id
 
 
-def test_a_scan_in_use_stays(catalog):
+def test_a_scan_in_use_stays(catalog: Catalog) -> None:
     add_map(catalog)
     scan_id = catalog.maps.get("lobby").scans[0].scan_id
     with pytest.raises(Conflict):
@@ -210,7 +221,9 @@ def test_a_scan_in_use_stays(catalog):
 @pytest.mark.parametrize(
     ("state", "score"), [("changed", None), ("unobserved", 0.4), ("changed", float("nan"))]
 )
-def test_a_tile_has_a_finite_score_exactly_where_it_was_observed(state, score):
+def test_a_tile_has_a_finite_score_exactly_where_it_was_observed(
+    state: TileState, score: float | None
+) -> None:
     with pytest.raises(ValidationError):
         TileRecord(
             tile_id="tile_000_000_000",

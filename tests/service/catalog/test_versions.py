@@ -7,6 +7,7 @@ from threading import Barrier
 
 import pytest
 
+from service.catalog.catalog import Catalog
 from service.catalog.records import Problem, ScanOutcome
 from service.errors import Conflict, NotFound, NotReady
 from tests.support.samples import BOUNDS, IDENTITY, add_map, add_scan, add_survey, add_version, tile
@@ -22,7 +23,7 @@ SURE = ScanOutcome(
 )
 
 
-def test_of_many_versions_asked_for_at_once_exactly_one_is_made(catalog):
+def test_of_many_versions_asked_for_at_once_exactly_one_is_made(catalog: Catalog) -> None:
     add_map(catalog)
     scan_ids = [add_scan(catalog, f"s{number}").scan_id for number in range(6)]
     together = Barrier(6)
@@ -41,7 +42,7 @@ def test_of_many_versions_asked_for_at_once_exactly_one_is_made(catalog):
     assert len(catalog.jobs.page().items) == 2
 
 
-def test_how_certain_a_scan_is_and_the_way_to_it_come_back_as_saved(catalog):
+def test_how_certain_a_scan_is_and_the_way_to_it_come_back_as_saved(catalog: Catalog) -> None:
     ids = [add_scan(catalog, name).scan_id for name in "abc"]
     _, job = catalog.maps.create(scan_ids=ids, model="m/1", map_id="hall")
     outcomes = [
@@ -56,7 +57,7 @@ def test_how_certain_a_scan_is_and_the_way_to_it_come_back_as_saved(catalog):
     assert catalog.versions.of_job(job.job_id).scans == found.scans
 
 
-def test_of_a_survey_no_way_is_told_and_its_certainty_goes_on_into_the_version(catalog):
+def test_of_a_survey_no_way_is_told_and_its_certainty_goes_on_into_the_version(catalog: Catalog) -> None:
     add_map(catalog)
     survey_id, _ = add_survey(catalog, [tile(0, 0)])
     (scan,) = catalog.surveys.get(survey_id).scans
@@ -67,7 +68,7 @@ def test_of_a_survey_no_way_is_told_and_its_certainty_goes_on_into_the_version(c
     assert version.scans[-1] == sure
 
 
-def test_a_scan_of_a_survey_that_was_left_out_is_left_out_of_the_version(catalog):
+def test_a_scan_of_a_survey_that_was_left_out_is_left_out_of_the_version(catalog: Catalog) -> None:
     add_map(catalog)
     ids = [add_scan(catalog, name).scan_id for name in ("seen", "astray")]
     survey, job = catalog.surveys.create("lobby", scan_ids=ids, model="m/1")
@@ -78,7 +79,7 @@ def test_a_scan_of_a_survey_that_was_left_out_is_left_out_of_the_version(catalog
     assert [scan.scan_id for scan in version.scans][1:] == ids[:1]
 
 
-def test_a_later_version_keeps_what_the_first_left_out_out(catalog):
+def test_a_later_version_keeps_what_the_first_left_out_out(catalog: Catalog) -> None:
     first = add_map(catalog)
     (scan,) = catalog.maps.get("lobby").scans
     second = add_version(catalog)
@@ -90,7 +91,7 @@ def test_a_later_version_keeps_what_the_first_left_out_out(catalog):
     assert catalog.versions.of_job(first).scans == (scan,)
 
 
-def test_a_late_step_of_a_deleted_version_touches_nothing(catalog):
+def test_a_late_step_of_a_deleted_version_touches_nothing(catalog: Catalog) -> None:
     add_map(catalog)
     late = add_version(catalog, ready=False)
     catalog.jobs.fail(late, Problem(code="map_failed", detail="-"))
@@ -104,7 +105,7 @@ def test_a_late_step_of_a_deleted_version_touches_nothing(catalog):
     assert catalog.maps.get("lobby") == before
 
 
-def test_a_map_whose_first_version_failed_is_deleted_as_a_whole_and_not_by_version(catalog):
+def test_a_map_whose_first_version_failed_is_deleted_as_a_whole_and_not_by_version(catalog: Catalog) -> None:
     job_id = add_map(catalog, ready=False)
     catalog.jobs.fail(job_id, Problem(code="map_failed", detail="-"))
     with pytest.raises(Conflict):
@@ -116,7 +117,7 @@ def test_a_map_whose_first_version_failed_is_deleted_as_a_whole_and_not_by_versi
         catalog.versions.page("lobby")
 
 
-def test_an_anchor_moves_when_the_map_was_last_changed_and_nothing_else(catalog):
+def test_an_anchor_moves_when_the_map_was_last_changed_and_nothing_else(catalog: Catalog) -> None:
     from service.catalog.records import Anchor
 
     add_map(catalog)

@@ -12,6 +12,7 @@ from typing import Any
 import httpx
 import pytest
 from rich.console import Console
+from rich.progress import TextColumn
 
 from service.cli import main, terminal
 from service.cli.terminal import Terminal
@@ -22,7 +23,7 @@ from service.up import launcher
 Answer = Callable[[httpx.Request], httpx.Response]
 
 SCAN = {"scan_id": "scan-1", "filename": "hall.pcd", "size": 9, "sha256": "ab" * 32}
-MAP = {
+MAP: dict[str, Any] = {
     "map_id": "lobby",
     "name": "Lobby",
     "status": "ready",
@@ -254,7 +255,9 @@ def test_a_bar_shows_a_file_name_that_looks_like_markup_as_it_is(name: str) -> N
     shown = Terminal(url="", as_json=False, err=Console(file=io.StringIO(), force_terminal=True))
     with shown._bar(terminal._description()) as bar:
         bar.add_task(name)
-        assert bar.columns[0].render(bar.tasks[0]).plain == name
+        column = bar.columns[0]
+        assert isinstance(column, TextColumn)
+        assert column.render(bar.tasks[0]).plain == name
 
 
 def test_a_file_that_cannot_be_read_is_one_sentence(
