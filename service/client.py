@@ -52,7 +52,7 @@ class JobFailed(ClientError):
 
 
 def sentence(problem: Document) -> str:
-    """A problem document as one sentence."""
+    """Write a problem document as one sentence."""
     title, detail = problem.get("title"), problem.get("detail")
     return f"{title}: {detail}" if title and detail else str(detail or title or "the service gave no reason")
 
@@ -116,11 +116,11 @@ class Client:
         return self._json("POST", "/maps", json={**about, "scan_ids": list(scan_ids)})
 
     def maps(self) -> list[Document]:
-        """Every map."""
+        """Return every map."""
         return self._all("/maps", "maps")
 
     def map(self, map_id: str) -> Document:
-        """One map as its version in use, with its scans."""
+        """Return one map as its version in use, with its scans."""
         return self._json("GET", f"/maps/{_quoted(map_id)}")
 
     def delete_map(self, map_id: str) -> None:
@@ -142,11 +142,11 @@ class Client:
         return self._json("POST", f"/maps/{_quoted(map_id)}/versions", json=body)
 
     def versions(self, map_id: str) -> list[Document]:
-        """Every version of a map, newest first."""
+        """Return every version of a map, newest first."""
         return self._all(f"/maps/{_quoted(map_id)}/versions", "versions")
 
     def version(self, map_id: str, version: int) -> Document:
-        """One version of a map with its scans."""
+        """Return one version of a map with its scans."""
         return self._json("GET", f"/maps/{_quoted(map_id)}/versions/{version}")
 
     def delete_version(self, map_id: str, version: int) -> None:
@@ -171,29 +171,29 @@ class Client:
         return self._json("POST", f"/maps/{_quoted(map_id)}/surveys", json=body)
 
     def surveys(self, map_id: str) -> list[Document]:
-        """Every survey of a map."""
+        """Return every survey of a map."""
         return self._all(f"/maps/{_quoted(map_id)}/surveys", "surveys")
 
     def survey(self, survey_id: str) -> Document:
-        """One survey with its scans and counts."""
+        """Return one survey with its scans and counts."""
         return self._json("GET", f"/surveys/{_quoted(survey_id)}")
 
     def tiles(self, survey_id: str) -> Document:
-        """Every tile of a survey, a FeatureCollection."""
+        """Return every tile of a survey, a FeatureCollection."""
         return self._json("GET", f"/surveys/{_quoted(survey_id)}/tiles")
 
     def changes(self, map_id: str, **filters: Any) -> Document:
-        """One page of changed tiles; filters are those of the API: `survey bbox datetime min_score limit`."""
+        """Return one page of changed tiles; filters are those of the API: `survey bbox datetime min_score limit`."""
         return self._json("GET", f"/maps/{_quoted(map_id)}/changes", params=_given(**filters))
 
     # jobs and models
 
     def jobs(self) -> list[Document]:
-        """Every job, newest first."""
+        """Return every job, newest first."""
         return self._all("/jobs", "jobs")
 
     def job(self, job_id: str) -> Document:
-        """One job."""
+        """Return one job."""
         return self._json("GET", f"/jobs/{_quoted(job_id)}")
 
     def dismiss(self, job_id: str) -> Document:
@@ -201,7 +201,7 @@ class Client:
         return self._json("DELETE", f"/jobs/{_quoted(job_id)}")
 
     def wait(self, job_id: str, on_progress: OnProgress | None = None, *, every_s: float = 0.3) -> Document:
-        """The job's document once it was successful; raises `JobFailed` when it ended otherwise."""
+        """Return a job's document once it was successful. Raises `JobFailed` when it ended otherwise."""
         while True:
             job = self.job(job_id)
             if on_progress is not None:
@@ -213,7 +213,7 @@ class Client:
             time.sleep(every_s)
 
     def models(self) -> list[Document]:
-        """The cards of the models."""
+        """Return the cards of the models."""
         return self._all("/models", "models")
 
     def train_model(
@@ -230,7 +230,7 @@ class Client:
         return self._json("POST", f"/maps/{_quoted(map_id)}/models", json=body)
 
     def model(self, model: str) -> Document:
-        """The card of `name/version`."""
+        """Return the card of `name/version`."""
         name, _, version = model.partition("/")
         return self._json("GET", f"/models/{_quoted(name)}", params=_given(version=version or None))
 
@@ -268,7 +268,7 @@ class Client:
         return document
 
     def _all(self, path: str, name: str) -> list[Document]:
-        """The list `name` of a document and of the pages that follow it."""
+        """Return the list `name` of a document and of the pages that follow it."""
         items: list[Document] = []
         following: str | None = path
         while following:
@@ -292,7 +292,7 @@ def _given(**values: Any) -> dict[str, Any]:
 
 
 def _quoted(name: str) -> str:
-    """An id as one segment of a path, whatever was typed."""
+    """Quote an id as one segment of a path, whatever was typed."""
     return quote(name, safe="")
 
 

@@ -29,7 +29,7 @@ KEPT_S = 24 * 3600  #: how long rq remembers a step that ended; the catalog keep
 
 
 def step_id(job_id: str, step: Step) -> str:
-    """The name of one step in the queue. rq admits letters, digits, `_` and `-`; a step's name has no `-`."""
+    """Return the name of one step in the queue. rq admits letters, digits, `_` and `-`; a step's name has no `-`."""
     return f"{job_id}-{step.name}"
 
 
@@ -77,7 +77,7 @@ class JobQueue:
             pipe.execute()
 
     def holds(self, job_id: str, kind: JobKind) -> bool:
-        """Whether a step of the job waits for a worker, or a worker has its claim on one.
+        """Tell whether a step of the job waits for a worker, or a worker has its claim on one.
 
         A claim outlives its worker by about a minute; then another worker finds it and asks what to do.
         """
@@ -115,7 +115,7 @@ class JobQueue:
         self._redis.close()
 
     def _holds(self, job_id: str, kind: JobKind) -> bool:
-        """Looks in the order in which a step moves on, so that none slips by between two looks."""
+        """Look in the order in which a step moves on, so that none slips by between two looks."""
         for step in self._steps[kind]:
             queue, name = self._queue(step.queue), step_id(job_id, step)
             for waiting in (queue.key, queue.intermediate_queue_key):
@@ -126,7 +126,7 @@ class JobQueue:
         return False
 
     def _left(self, job_id: str, kind: JobKind) -> Sequence[Step]:
-        """The steps from the first that has not finished; all of them where none is known, or none is left."""
+        """Return the steps from the first that has not finished; all of them where none is known, or none is left."""
         steps = self._steps[kind]
         ids = [step_id(job_id, step) for step in steps]
         known = Job.fetch_many(ids, connection=self._redis, serializer=JSONSerializer)
@@ -136,7 +136,7 @@ class JobQueue:
         return steps
 
     def _chain(self, job_id: str, steps: Sequence[Step]) -> list[Job]:
-        """The steps as rq jobs, each waiting for the one before."""
+        """Return the steps as rq jobs, each waiting for the one before."""
         jobs: list[Job] = []
         for step in steps:
             jobs.append(
@@ -157,7 +157,7 @@ class JobQueue:
 
     @staticmethod
     def _forget(job: Job, pipe: Any) -> None:
-        """What an earlier submission left of a step."""
+        """Remove what an earlier submission left of a step."""
         pipe.delete(job.key, job.dependents_key, job.dependencies_key, job.execution_registry.key)
         for registry in (job.finished_job_registry, job.failed_job_registry):
             pipe.zrem(registry.key, job.id)

@@ -10,7 +10,7 @@ from pydantic_settings import BaseSettings, SettingsConfigDict
 
 
 def _model_store() -> Path:
-    """The folder beside this package in a checkout, wherever the process was started."""
+    """Return the folder beside this package in a checkout, wherever the process was started."""
     beside = Path(__file__).resolve().parents[1] / "model_store"
     return beside if beside.is_dir() else Path("model_store")
 
@@ -52,7 +52,7 @@ class Settings(BaseSettings):
     log_level: Literal["debug", "info", "warning", "error"] = Field("info", description="of every process")
 
     def resolved_database_url(self) -> str:
-        """The database that is used, embedded or not."""
+        """Return the database that is used, embedded or not."""
         if self.database_url is not None:
             return self.database_url
         path = str((self.data_dir / "spicd.sqlite").absolute())
@@ -61,13 +61,13 @@ class Settings(BaseSettings):
         )  # the two that a URL reads otherwise
 
     def resolved_blob_url(self) -> str:
-        """The blob store that is used, embedded or not."""
+        """Return the blob store that is used, embedded or not."""
         return self.blob_url or (self.data_dir / "blobs").absolute().as_uri()
 
     def most_training_minutes(self) -> float:
-        """So long a training may be, and end well before its step is stopped."""
+        """Return how long a training may be and still end well before its step is stopped."""
         return min(self.max_training_minutes, 0.8 * self.job_timeout_s / 60)
 
     def scratch_dir(self) -> Path:
-        """Where steps write aside: on the disk of embedded blobs, so that keeping a file is a rename."""
+        """Return where steps write aside: on the disk of embedded blobs, so that keeping a file is a rename."""
         return self.data_dir.absolute() / "scratch"

@@ -1,7 +1,7 @@
 """Tiles as features: OGC Features and Geometries JSON 1.0 (JSON-FG, OGC 21-045r1), which is GeoJSON as well.
 
-A tile is a Prism in the map's own frame: metres, z up. GeoJSON's `geometry` admits WGS 84 alone (RFC 7946, Section 4), so it
-is null where nobody said where the map lies. Plain JSON values: the API checks and answers with them
+A tile is a Prism in the map's own frame: metres, z up. GeoJSON's `geometry` admits WGS 84 alone (RFC 7946, Section 4),
+so it is null where nobody said where the map lies. Plain JSON values: the API checks and answers with them
 (`service.api.features`), `spicd-worker detect` writes them to a file.
 """
 

@@ -77,7 +77,7 @@ class Api(FastAPI):
 
 
 def create_app(settings: Settings, *, queue: Queue | None = None) -> FastAPI:
-    """The API under `settings`. `queue` is the one to submit to; left out, it is made from `settings.redis_url`."""
+    """Return the API under `settings`. `queue` is the one to submit to; left out: that at `settings.redis_url`."""
     app = Api(
         title="SPICD",
         version=_version(),

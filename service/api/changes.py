@@ -29,7 +29,7 @@ Span = tuple[datetime | None, datetime | None]  #: first and last instant, None 
 
 
 def bounds_of(bbox: str) -> Bounds:
-    """Four numbers (x and y) or six (x, y and z): the minimum corner, then the maximum. Raises ValueError."""
+    """Read four numbers (x and y) or six (x, y and z): the minimum corner, then the maximum. Raises ValueError."""
     try:
         numbers = [float(part) for part in bbox.split(",")]
     except ValueError:
@@ -46,7 +46,7 @@ def bounds_of(bbox: str) -> Bounds:
 
 
 def span_of(interval: str) -> Span:
-    """An instant, or an interval with `..` (or nothing) for an open end (OGC API - Features, `datetime`).
+    """Read an instant, or an interval with `..` (or nothing) for an open end (OGC API - Features, `datetime`).
 
     Raises ValueError.
     """
@@ -64,7 +64,7 @@ def span_of(interval: str) -> Span:
 
 
 def readable(read: Callable[[str], object]) -> AfterValidator:
-    """A text that `read` can read; it stays a text, for a query parameter of many parts is taken for a list."""
+    """Check a text with `read`, and leave it a text: a query parameter of many parts is taken for a list."""
 
     def check(text: str) -> str:
         read(text)

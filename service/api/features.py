@@ -1,6 +1,6 @@
 """Tiles as documents of the API: `service.tile_features`, checked, and with a footprint on the Earth.
 
-The footprint lies at the height of the tile's floor where the map has a geo-anchor, and is null where nobody said where it lies.
+The footprint lies at the height of the tile's floor where the map has a geo-anchor, and is null without one.
 """
 
 from __future__ import annotations
@@ -119,7 +119,7 @@ class FeatureResponse(Response):
 def feature_response(
     changes: Iterable[ChangeRecord], *, matched: int, links: Iterable[Link], anchor: Anchor | None
 ) -> FeatureResponse:
-    """A collection of tiles of a map that lies at `anchor`; `matched` counts those of every page."""
+    """Answer with tiles of a map that lies at `anchor`; `matched` counts those of every page."""
     convert = None if anchor is None else to_wgs84(anchor)
     collection = tile_collection((feature(change, convert) for change in changes), matched=matched)
     collection |= {"timeStamp": rfc3339(now()), "links": list(links)}
@@ -144,6 +144,6 @@ def on_earth(ring: Ring, lower: float, convert: ToWgs84) -> dict[str, Any]:
 
 
 def documented() -> dict[int | str, dict[str, Any]]:
-    """The 200 of a route that answers with features, for the generated API description."""
+    """Return the 200 of a route that answers with features, for the generated API description."""
     schema = {"$ref": f"#/components/schemas/{TileCollection.__name__}"}
     return {200: {"description": "A JSON-FG FeatureCollection", "content": {MEDIA_TYPE: {"schema": schema}}}}

@@ -1,7 +1,8 @@
 """From a map's frame to WGS 84: a tangent plane at the map's origin, through Earth-centred coordinates, exactly.
 
 The ellipsoid is that of NIMA TR8350.2 (WGS 84); from Earth-centred to geodetic by the usual fixed point
-(Hofmann-Wellenhof and Moritz, Physical Geodesy), with a height that stays well defined at the poles. See docs/decisions/0011.
+(Hofmann-Wellenhof and Moritz, Physical Geodesy), with a height that stays well defined at the poles. See
+docs/decisions/0011.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ ToWgs84 = Callable[
 
 
 def to_wgs84(anchor: Anchor) -> ToWgs84:
-    """The function from the frame of a map that lies at `anchor` to WGS 84; the height is above the ellipsoid.
+    """Return the function from the frame of a map that lies at `anchor` to WGS 84; the height is above the ellipsoid.
 
     The longitude stays within half a turn of the anchor's, so that a footprint on the antimeridian is not torn apart.
     """
@@ -38,19 +39,19 @@ def to_wgs84(anchor: Anchor) -> ToWgs84:
         x, y, up = point
         east, north = x * sin_h - y * cos_h, x * cos_h + y * sin_h
         out = cos_lat * up - sin_lat * north  # away from the Earth's axis, in the anchor's meridian
-        found = to_geodetic(
+        lon, lat, height = to_geodetic(
             x0 + cos_lon * out - sin_lon * east,
             y0 + sin_lon * out + cos_lon * east,
             z0 + cos_lat * north + sin_lat * up,
         )
-        turned = math.degrees(math.remainder(found[0] - longitude, math.tau))
-        return anchor.longitude + turned, math.degrees(found[1]), found[2]
+        turned = math.degrees(math.remainder(lon - longitude, math.tau))
+        return anchor.longitude + turned, math.degrees(lat), height
 
     return convert
 
 
 def to_ecef(longitude: float, latitude: float, height: float) -> Vector3:
-    """Earth-centred, Earth-fixed x, y, z (metres) of a geodetic position (radians, metres)."""
+    """Return Earth-centred, Earth-fixed x, y, z (metres) of a geodetic position (radians, metres)."""
     normal = _normal(latitude)
     out = (normal + height) * math.cos(latitude)
     along = (normal * (1 - _E2) + height) * math.sin(latitude)
@@ -58,7 +59,7 @@ def to_ecef(longitude: float, latitude: float, height: float) -> Vector3:
 
 
 def to_geodetic(x: float, y: float, z: float) -> Vector3:
-    """Longitude, latitude (radians) and height (metres) of an Earth-centred position near the Earth's surface."""
+    """Return longitude, latitude (radians) and height (metres) of an Earth-centred position near the Earth's surface."""
     out = math.hypot(x, y)
     latitude = math.atan2(z, out * (1 - _E2))
     for _ in range(_ROUNDS):
@@ -69,5 +70,5 @@ def to_geodetic(x: float, y: float, z: float) -> Vector3:
 
 
 def _normal(latitude: float) -> float:
-    """Radius of curvature in the prime vertical, metres."""
+    """Return the radius of curvature in the prime vertical, metres."""
     return _SEMI_MAJOR / math.sqrt(1 - _E2 * math.sin(latitude) ** 2)

@@ -34,7 +34,7 @@ class Blobs:
     """A key-value store of files; keys come from `service.catalog.blob_keys`."""
 
     def __init__(self, url: str) -> None:
-        """`url` is `file:///folder` (made when absent) or anything that obstore opens, such as `s3://bucket/prefix`."""
+        """`url` is `file:///folder` (made when absent) or what else obstore opens, such as `s3://bucket/prefix`."""
         parts = urlsplit(url)
         self._store: ObjectStore
         if parts.scheme == "file":
@@ -68,15 +68,15 @@ class Blobs:
             self.put_file(to, source)
 
     def under(self, prefix: str) -> list[str]:
-        """The keys that start with the folder `prefix`, in order; what is still being written is not among them."""
+        """Return the keys under the folder `prefix`, in order; what is still being written is not among them."""
         return sorted(str(entry["path"]) for page in obstore.list(self._store, prefix) for entry in page)
 
     def get_bytes(self, key: str) -> bytes:
-        """The bytes under `key`. Raises FileNotFoundError."""
+        """Return the bytes under `key`. Raises FileNotFoundError."""
         return bytes(obstore.get(self._store, key).bytes())
 
     def exists(self, key: str) -> bool:
-        """Whether something complete lies under `key`."""
+        """Tell whether something complete lies under `key`."""
         try:
             obstore.head(self._store, key)
         except FileNotFoundError:
@@ -84,23 +84,23 @@ class Blobs:
         return True
 
     def path(self, key: str) -> Path | None:
-        """Where the blob lies on this machine, or None when it is elsewhere. Raises FileNotFoundError."""
+        """Return where the blob lies on this machine, or None when it is elsewhere. Raises FileNotFoundError."""
         if self._root is None:
             return None
-        found = self._root / key
-        if not found.is_file():
+        path = self._root / key
+        if not path.is_file():
             raise FileNotFoundError(key)
-        return found
+        return path
 
     @contextlib.contextmanager
     def local(self, key: str) -> Iterator[Path]:
-        """A path to read the blob from: the file itself in a local folder, else a copy that goes at the end.
+        """Yield a path to read the blob from: the file itself in a local folder, else a copy that goes at the end.
 
         Raises FileNotFoundError.
         """
-        found = self.path(key)
-        if found is not None:
-            yield found
+        path = self.path(key)
+        if path is not None:
+            yield path
             return
         with tempfile.TemporaryDirectory(prefix="spicd-blob-") as folder:
             copy = Path(folder) / key.rsplit("/", 1)[-1]
@@ -110,12 +110,12 @@ class Blobs:
             yield copy
 
     def stream(self, key: str) -> Iterator[bytes]:
-        """The bytes under `key` in pieces of about 1 MiB. Raises FileNotFoundError at the call, not later."""
+        """Return the bytes under `key` in pieces of about 1 MiB. Raises FileNotFoundError at the call, not later."""
         result = obstore.get(self._store, key)
         return (bytes(chunk) for chunk in result.stream(min_chunk_size=CHUNK))
 
     def size(self, key: str) -> int:
-        """Bytes under `key`. Raises FileNotFoundError."""
+        """Return the number of bytes under `key`. Raises FileNotFoundError."""
         return int(obstore.head(self._store, key)["size"])
 
     def delete_prefix(self, prefix: str) -> None:

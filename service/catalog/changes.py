@@ -55,7 +55,7 @@ class Changes:
     def page(
         self, wanted: ChangeFilter, *, after: ChangePosition | None = None, limit: int = 100
     ) -> ChangePage:
-        """Changed tiles of surveys that are ready."""
+        """Return changed tiles of surveys that are ready."""
         query = _matching(wanted)
         count = select(func.count()).select_from(query.subquery())
         rows = query if after is None else query.where(_behind(after))
@@ -64,14 +64,14 @@ class Changes:
         ).limit(limit + 1)
         with self._database.read() as session:
             matched = session.scalar(count) or 0
-            found = [_record(tile, survey) for tile, survey in session.execute(rows)]
-        items = tuple(found[:limit])
+            records = [_record(tile, survey) for tile, survey in session.execute(rows)]
+        items = tuple(records[:limit])
         return ChangePage(
-            items=items, matched=matched, following=_position(items[-1]) if len(found) > limit else None
+            items=items, matched=matched, following=_position(items[-1]) if len(records) > limit else None
         )
 
     def of_survey(self, survey_id: str) -> tuple[ChangeRecord, ...]:
-        """Every tile of a survey, unobserved ones too, in the order of the grid."""
+        """Return every tile of a survey, unobserved ones too, in the order of the grid."""
         query = (
             select(_TILE, _SURVEY)
             .join(_SURVEY, _SURVEY.survey_id == _TILE.survey_id)

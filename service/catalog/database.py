@@ -28,7 +28,7 @@ _MIGRATION_LOCK = 0x53504943  #: any number that every process of ours agrees on
 
 
 class Database:
-    """An engine and its sessions; `write()` takes the write lock at once, so that no read turns stale before its write."""
+    """An engine and its sessions; `write()` takes the lock at once, so that no read turns stale before its write."""
 
     def __init__(self, url: str) -> None:
         """`url` is `sqlite:///file` or `postgresql://...`; nothing is opened before it is needed."""
@@ -37,13 +37,13 @@ class Database:
 
     @contextlib.contextmanager
     def read(self) -> Iterator[Session]:
-        """A session that sees one state of the database and changes nothing."""
+        """Open a session that sees one state of the database and changes nothing."""
         with Session(self.engine) as session:
             yield session
 
     @contextlib.contextmanager
     def write(self) -> Iterator[Session]:
-        """A session in one transaction: all of it is kept, or, when the block raises, none."""
+        """Open a session in one transaction: all of it is kept, or, when the block raises, none."""
         with Session(self._writer) as session, session.begin():
             yield session
 

@@ -33,7 +33,7 @@ class Jobs:
         self._database = database
 
     def get(self, job_id: str) -> JobRecord:
-        """One job. Raises NotFound."""
+        """Return one job. Raises NotFound."""
         with self._database.read() as session:
             return JobRecord.of_row(_row(session, job_id))
 
@@ -45,7 +45,7 @@ class Jobs:
         after: Position | None = None,
         limit: int = 100,
     ) -> Page[JobRecord]:
-        """Jobs, newest first."""
+        """Return jobs, newest first."""
         query = select(tables.Job)
         if status is not None:
             query = query.where(tables.Job.status == status)
@@ -63,13 +63,13 @@ class Jobs:
             return tuple(JobRecord.of_row(row) for row in session.scalars(query))
 
     def counts(self) -> dict[str, int]:
-        """How many jobs are in each state; states without a job are left out."""
+        """Count the jobs in each state; states without a job are left out."""
         query = select(tables.Job.status, func.count()).group_by(tables.Job.status)
         with self._database.read() as session:
             return dict(session.execute(query).all())
 
     def start(self, job_id: str) -> bool:
-        """The job runs from now on; False when it has ended or gone, and the step has nothing to do."""
+        """Mark the job as running; False when it has ended or gone, and the step has nothing to do."""
         return self._advance(job_id, **_started())
 
     def report(self, job_id: str, *, message: str, progress: float) -> bool:
@@ -84,17 +84,17 @@ class Jobs:
         )
 
     def is_dismissed(self, job_id: str) -> bool:
-        """Whether the work should stop: the job was dismissed, or deleted with its map."""
+        """Tell whether the work should stop: the job was dismissed, or deleted with its map."""
         with self._database.read() as session:
             status = session.scalar(select(tables.Job.status).where(tables.Job.job_id == job_id))
         return status is None or status == "dismissed"
 
     def succeed(self, job_id: str) -> bool:
-        """The job is done and its map's version, survey or model ready; False when it had ended or gone before."""
+        """Mark the job as done and its map's version, survey or model as ready; False when it had ended or gone."""
         return self._end(job_id, "successful", message="done", progress=100)
 
     def fail(self, job_id: str, problem: Problem) -> bool:
-        """The job and its map's version, survey or model failed; False when it had ended or gone before."""
+        """Mark the job and its map's version, survey or model as failed; False when it had ended or gone."""
         return self._end(job_id, "failed", message=problem.detail, problem=problem.model_dump())
 
     def dismiss(self, job_id: str) -> JobRecord:
@@ -156,7 +156,7 @@ class Jobs:
 def new_job(
     kind: JobKind, map_id: str, survey_id: str | None = None, *, model: str | None = None
 ) -> tables.Job:
-    """A job that waits; the caller records it in the transaction of its map, survey or model."""
+    """Return a job that waits; the caller records it in the transaction of its map, survey or model."""
     instant = now()
     return tables.Job(
         job_id=new_id("job"),
@@ -180,7 +180,7 @@ def _started(message: str | None = None) -> dict[str, object]:
 
 
 def _subject(session: Session, job: tables.Job) -> tables.MapVersion | tables.Survey | tables.Model | None:
-    """What the job is there for; None where it was deleted since."""
+    """Return what the job is there for; None where it was deleted since."""
     if job.survey_id is not None:
         return session.get(tables.Survey, job.survey_id)
     if job.kind == "model":

@@ -36,7 +36,10 @@ class Maps:
         settings: Mapping[str, Any] | None = None,
         anchor: Anchor | None = None,
     ) -> tuple[MapRecord, JobRecord]:
-        """Record a map, its version 1 and the job of that together. Raises NotFound (a scan), Conflict (the id), BadRequest (the scans)."""
+        """Record a map, its version 1 and the job of that together.
+
+        Raises NotFound (a scan), Conflict (the id), BadRequest (the scans).
+        """
         scan_ids = checked_scan_ids(scan_ids)
         map_id = map_id or new_id("map")
         job = new_job("map", map_id)
@@ -62,18 +65,18 @@ class Maps:
             raise Conflict(f"map {map_id!r} exists; choose another id or delete that map") from error
 
     def get(self, map_id: str) -> MapRecord:
-        """One map, as its version in use. Raises NotFound."""
+        """Return one map, as its version in use. Raises NotFound."""
         with self._database.read() as session:
             return _record(shown_version(session, map_id))
 
     def ready(self, map_id: str) -> MapRecord:
-        """One map that has a version to use. Raises NotFound and NotReady."""
+        """Return one map that has a version to use. Raises NotFound and NotReady."""
         record = self.get(map_id)
         check_ready(record.status, f"map {map_id!r}", record.job_id)
         return record
 
     def page(self, *, after: Position | None = None, limit: int = 100) -> Page[MapRecord]:
-        """Maps, newest first."""
+        """Return maps, newest first."""
         created, key = tables.Map.created, tables.Map.map_id
         return self._database.page(versions_in_use(), created, key, _record, after=after, limit=limit)
 
@@ -86,7 +89,7 @@ class Maps:
         return self.get(map_id)
 
     def delete(self, map_id: str) -> None:
-        """Forget a map with its versions, surveys, models, jobs and files; the scans stay. Raises NotFound."""
+        """Delete a map with its versions, surveys, models, jobs and files; the scans stay. Raises NotFound."""
         versions = select(tables.MapVersion.job_id).where(tables.MapVersion.map_id == map_id)
         surveys = select(tables.Survey.survey_id).where(tables.Survey.map_id == map_id)
         models = select(tables.Model.job_id).where(tables.Model.map_id == map_id)

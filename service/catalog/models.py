@@ -65,7 +65,7 @@ class Models:
             raise Conflict(f"another training took the name {name!r} just now; try again") from error
 
     def find(self, name: str, version: int | None = None) -> ModelRecord | None:
-        """One model in whatever state, by default the newest that is ready, else the newest; None if there is none."""
+        """Find one model in whatever state, by default the newest that is ready, else the newest; None without one."""
         query = select(Model).where(Model.name == name)
         if version is not None:
             query = query.where(Model.version == version)
@@ -75,12 +75,12 @@ class Models:
             return None if row is None else ModelRecord.of_row(row)
 
     def of_job(self, job_id: str) -> ModelRecord:
-        """The model that a job trains. Raises NotFound, also where it was deleted since."""
+        """Return the model that a job trains. Raises NotFound, also where it was deleted since."""
         with self._database.read() as session:
             return ModelRecord.of_row(_row(session, job_id))
 
     def ready(self) -> tuple[ModelRecord, ...]:
-        """Every model that can score, by name, the newest of each first."""
+        """Return every model that can score, by name, the newest of each first."""
         query = select(Model).where(Model.status == "ready")
         with self._database.read() as session:
             rows = session.scalars(query.order_by(Model.name, Model.version.desc()))
@@ -94,14 +94,14 @@ class Models:
             row.updated = now()
 
     def take_back(self, job_id: str) -> None:
-        """Forget a model whose job never reached the queue."""
+        """Delete a model whose job never reached the queue."""
         with self._database.write() as session:
             session.execute(delete(tables.Job).where(tables.Job.job_id == job_id))
             session.delete(_row(session, job_id))
 
 
 def name_for(map_id: str) -> str:
-    """The name of a map's models where none was given: `lobby-net`."""
+    """Return the name of a map's models where none was given: `lobby-net`."""
     return f"{re.sub('^[^A-Za-z0-9]+', '', map_id)[:60] or 'site'}-net"
 
 

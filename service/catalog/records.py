@@ -59,7 +59,10 @@ class Problem(Record):
 
     @classmethod
     def of(cls, error: BaseException) -> Self:
-        """The problem of an error that carries a `code`; any other shows its type alone, for its text may tell too much."""
+        """Return the problem of an error that carries a `code`.
+
+        Any other error shows its type alone, for its text may tell too much.
+        """
         code = getattr(error, "code", None)
         if isinstance(code, str):
             return cls(code=code, detail=str(error))

@@ -1,4 +1,4 @@
-"""Scans: uploaded files, known by their content and the device they came from, and their outcomes in maps and surveys."""
+"""Scans: uploaded files, known by their content and their device, and what became of them in maps and surveys."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Row = TypeVar("Row", tables.VersionScan, tables.SurveyScan)
 
 
 def scan_id_of(sha256: str, device_id: str | None) -> str:
-    """The id of these bytes from this device: the same upload twice is one scan."""
+    """Return the id of these bytes from this device: the same upload twice is one scan."""
     digest = hashlib.sha256(f"{sha256}\n{device_id or ''}".encode()).hexdigest()
     return f"scan-{digest[:32]}"
 
@@ -108,24 +108,24 @@ class Scans:
             return ScanRecord.of_row(row)
 
     def get(self, scan_id: str) -> ScanRecord:
-        """One scan. Raises NotFound."""
+        """Return one scan. Raises NotFound."""
         with self._database.read() as session:
             return ScanRecord.of_row(_row(session, scan_id))
 
     def many(self, scan_ids: Sequence[str]) -> tuple[ScanRecord, ...]:
-        """Several scans, in the order asked for. Raises NotFound naming every id that is unknown."""
+        """Return several scans, in the order asked for. Raises NotFound naming every id that is unknown."""
         with self._database.read() as session:
             return scans_in_order(session, scan_ids)
 
     def page(self, *, after: Position | None = None, limit: int = 100) -> Page[ScanRecord]:
-        """Scans, newest first."""
+        """Return scans, newest first."""
         table = tables.Scan
         return self._database.page(
             select(table), table.created, table.scan_id, ScanRecord.of_row, after=after, limit=limit
         )
 
     def delete(self, scan_id: str) -> None:
-        """Forget a scan and its file. Raises NotFound, and Conflict while a map or survey rests on it."""
+        """Delete a scan and its file. Raises NotFound, and Conflict while a map or survey rests on it."""
         try:
             if not self._forget(tables.Scan.scan_id == scan_id):
                 raise NotFound(f"no scan {scan_id!r}")
@@ -133,7 +133,7 @@ class Scans:
             raise Conflict(f"scan {scan_id!r} belongs to a map or survey; delete that first") from error
 
     def take_back(self, added: ScanRecord) -> None:
-        """Forget a scan that `add` said was new, unless somebody else sent it again or uses it by now."""
+        """Delete a scan that `add` said was new, unless somebody else sent it again or uses it by now."""
         with contextlib.suppress(IntegrityError):
             self._forget(tables.Scan.key == added.key, tables.Scan.resent.is_(None))
 
@@ -147,7 +147,7 @@ class Scans:
         return True
 
     def _sent_again(self, scan_id: str) -> ScanRecord | None:
-        """The scan of this id, with the note that one more client relies on it; None where there is none."""
+        """Return the scan of this id, with the note that one more client relies on it; None where there is none."""
         statement = update(tables.Scan).where(tables.Scan.scan_id == scan_id).values(resent=tables.now())
         with self._database.write() as session:
             row = session.scalar(statement.returning(tables.Scan))

@@ -39,7 +39,7 @@ STEPS: dict[JobKind, tuple[Step, ...]] = {
     ),
 }
 
-#: A step that a release before 0.2 left in the queue calls `encode_map` so; it is still run.
+#: The name of `encode_map` in steps that an earlier build left in the queue; they are still run.
 _FORMER_FUNCTIONS = ("worker.jobs.describe_map",)
 
 ALLOWED_FUNCTIONS = frozenset(step.function for steps in STEPS.values() for step in steps).union(

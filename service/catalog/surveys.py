@@ -77,12 +77,12 @@ class Surveys:
             return SurveyRecord.of_row(row), JobRecord.of_row(job)
 
     def get(self, survey_id: str) -> SurveyRecord:
-        """One survey. Raises NotFound."""
+        """Return one survey. Raises NotFound."""
         with self._database.read() as session:
             return SurveyRecord.of_row(_row(session, survey_id))
 
     def ready(self, survey_id: str) -> SurveyRecord:
-        """One survey that is done. Raises NotFound and NotReady."""
+        """Return one survey that is done. Raises NotFound and NotReady."""
         survey = self.get(survey_id)
         if survey.status == "running":
             raise NotReady(f"survey {survey_id!r} is still running; follow job {survey.job_id}")
@@ -91,7 +91,7 @@ class Surveys:
         return survey
 
     def page(self, map_id: str, *, after: Position | None = None, limit: int = 100) -> Page[SurveyRecord]:
-        """Surveys of a map, newest first."""
+        """Return surveys of a map, newest first."""
         query = select(Survey).where(Survey.map_id == map_id)
         query = query.options(selectinload(Survey.scans), selectinload(Survey.job))
         created, key = Survey.created, Survey.survey_id
@@ -144,7 +144,7 @@ class Surveys:
 
 
 def _check_unused(session: Session, row: Survey) -> None:
-    """Raises Conflict while a version of the map is being built of the survey."""
+    """Raise Conflict while a version of the map is being built of the survey."""
     version = tables.MapVersion
     query = select(version).where(version.map_id == row.map_id, version.survey_id == row.survey_id)
     built = session.scalar(query.where(version.status == "building"))

@@ -51,7 +51,7 @@ def _options(
 
 
 def _hoisted(words: list[str]) -> list[str]:
-    """The same words with the global options first, so that `spicd maps list --json` works as well."""
+    """Return the same words with the global options first, so that `spicd maps list --json` works as well."""
     first: list[str] = []
     rest: list[str] = []
     waiting = iter(words)

@@ -55,7 +55,7 @@ class Terminal:
 
     @contextmanager
     def client(self) -> Iterator[Client]:
-        """The API, for the length of a command."""
+        """Open the API for the length of a command."""
         with Client(self.url) as client:
             yield client
 
@@ -115,7 +115,7 @@ class Terminal:
                 raise ClientError(f"{path}: the file cannot be read ({error.strerror})") from error
 
     def scan_ids(self, client: Client, names: Sequence[str], **about: Any) -> list[str]:
-        """Ids of the named scans: files are uploaded first, other names are taken as ids."""
+        """Return ids of the named scans: files are uploaded first, other names are taken as ids."""
         wrong = [name for name in names if not Path(name).is_file() and not _ID.fullmatch(name)]
         if wrong:
             raise ClientError(f"{', '.join(wrong)}: no such file, and not the id of a scan")
@@ -151,7 +151,7 @@ class Terminal:
 
 
 def _description() -> TextColumn:
-    """What a bar is about, as it is: a file name may look like markup."""
+    """Return the column that says what a bar is about, as it is: a file name may look like markup."""
     return TextColumn("{task.description}", style="bold", markup=False)
 
 
@@ -165,7 +165,7 @@ def _advance(bar: Progress) -> OnProgress:
 
 
 def read_pose(path: Path) -> Pose:
-    """A pose from a file: a JSON 4x4, or sixteen numbers with spaces, row by row. Raises `ClientError`."""
+    """Read a pose from a file: a JSON 4x4, or sixteen numbers with spaces, row by row. Raises `ClientError`."""
     try:
         text = path.read_text()
         if text.lstrip().startswith("["):

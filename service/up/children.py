@@ -59,15 +59,15 @@ class WorkerPool:
         self.stop()
 
     def check(self) -> None:
-        """Bury the dead and start those that are due again; call a few times a second."""
+        """Reap children that have exited, and start those that are due again; call a few times a second."""
         for worker in self.workers:
             if worker.process is not None and (status := worker.process.poll()) is not None:
-                self._bury(worker, status)
+                self._reap(worker, status)
             if worker.process is None and time.monotonic() >= worker.due:
                 self._start(worker)
 
     def stop(self) -> None:
-        """SIGTERM to all, and SIGKILL to who is left after the grace; a killed worker takes its step along."""
+        """Send SIGTERM to all, and SIGKILL to who is left after the grace; a killed worker takes its step along."""
         living = [worker.process for worker in self.workers if worker.process is not None]
         for process in living:
             process.terminate()
@@ -80,7 +80,7 @@ class WorkerPool:
                 process.wait()
 
     def kill(self) -> None:
-        """SIGKILL to all, now."""
+        """Send SIGKILL to all, now."""
         for worker in self.workers:
             if worker.process is not None:
                 worker.process.kill()
@@ -96,7 +96,7 @@ class WorkerPool:
         )
         worker.started = time.monotonic()
 
-    def _bury(self, worker: WorkerProcess, status: int) -> None:
+    def _reap(self, worker: WorkerProcess, status: int) -> None:
         lived = time.monotonic() - worker.started
         worker.deaths = 0 if lived > _HEALTHY_S else worker.deaths + 1
         wait = min(2.0**worker.deaths - 1, _LONGEST_WAIT_S)

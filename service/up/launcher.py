@@ -49,7 +49,7 @@ class Running:
     workers: list[dict[str, Any]]  #: `queue` and `pid` of each
 
     def document(self) -> dict[str, Any]:
-        """As a JSON object."""
+        """Return it as a JSON object."""
         return asdict(self)
 
     def write(self, path: Path) -> None:
@@ -103,14 +103,14 @@ def sweep_scratch(folder: Path) -> None:
 
 
 def _release_claims(redis: EmbeddedRedis) -> None:
-    """No worker of an earlier start is alive: they end with their launcher, and it with the server's lock."""
+    """Release the claims of earlier workers: all ended with their launcher, and that with the server's lock."""
     queue = JobQueue(redis.url)
     queue.release_claims()
     queue.close()
 
 
 def environment_of(settings: Settings) -> dict[str, str]:
-    """This process's environment with every setting spelled out, for the workers."""
+    """Return this process's environment with every setting spelled out, for the workers."""
     values = settings.model_dump(mode="json", exclude_none=True)
     return {**os.environ, **{f"SPICD_{name.upper()}": str(value) for name, value in values.items()}}
 
@@ -140,7 +140,7 @@ class _Signals:
 
 @contextmanager
 def _listen(host: str, port: int) -> Iterator[socket.socket]:
-    """A bound socket: a port that is taken is told before anything else starts."""
+    """Bind a socket, so that a port that is taken is told before anything else starts."""
     try:
         family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
         listening = socket.socket(family, kind, protocol)
@@ -156,7 +156,7 @@ def _listen(host: str, port: int) -> Iterator[socket.socket]:
 
 @contextmanager
 def _serve(app: FastAPI, listening: socket.socket) -> Iterator[threading.Thread]:
-    """The API in a thread, from its first answer on."""
+    """Serve the API in a thread, from its first answer on."""
     config = uvicorn.Config(app, log_config=None, access_log=False, timeout_graceful_shutdown=2)
     server = uvicorn.Server(config)
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listening]}, name="api", daemon=True)
@@ -174,7 +174,7 @@ def _serve(app: FastAPI, listening: socket.socket) -> Iterator[threading.Thread]
 
 
 def _app(settings: Settings) -> FastAPI:
-    """The service's own API; imported here, for tests of the launcher bring another."""
+    """Return the service's own API; imported here, for tests of the launcher bring another."""
     from service.api.app import create_app  # noqa: PLC0415
 
     return create_app(settings)
@@ -192,7 +192,7 @@ def _require_worker_packages(settings: Settings) -> None:
 
 
 def _resolve(settings: Settings, redis: EmbeddedRedis | None, listening: socket.socket) -> Settings:
-    """The settings with nothing left open, so that every process reads the same."""
+    """Return the settings with nothing left open, so that every process reads the same."""
     return settings.model_copy(
         update={
             "port": listening.getsockname()[1],
@@ -205,7 +205,7 @@ def _resolve(settings: Settings, redis: EmbeddedRedis | None, listening: socket.
 
 
 def _migrate(settings: Settings) -> None:
-    """Once, before the API and the workers look at the tables."""
+    """Migrate the database once, before the API and the workers look at the tables."""
     try:
         database = Database(settings.resolved_database_url())
         database.upgrade()

@@ -30,7 +30,7 @@ os.execv(sys.argv[2], sys.argv[2:])
 
 
 def command_ending_with_parent(command: Sequence[str]) -> list[str]:
-    """The same command, started so that it gets SIGTERM when the calling process ends (Linux only)."""
+    """Return the same command, started so that it gets SIGTERM when the calling process ends (Linux only)."""
     return [sys.executable, "-I", "-S", "-c", _WRAPPER, str(os.getpid()), *command]
 
 

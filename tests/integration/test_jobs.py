@@ -346,7 +346,7 @@ def test_what_a_step_is_in_the_middle_of_lies_in_the_scratch_folder(
     assert list(Settings().scratch_dir().iterdir()) == []
 
 
-def test_the_last_step_of_a_map_that_a_former_release_queued_is_the_one_of_today() -> None:
+def test_the_last_step_of_a_map_that_an_earlier_build_queued_is_the_one_of_today() -> None:
     assert jobs.describe_map is jobs.encode_map
     assert {step.function.removeprefix("worker.jobs.") for steps in STEPS.values() for step in steps} <= set(
         jobs.__all__

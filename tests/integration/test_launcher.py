@@ -21,7 +21,7 @@ from service.up.children import WorkerPool
 from service.up.embedded_redis import LaunchFailed
 from service.up.launcher import environment_of, up
 
-LAUNCH = Path(__file__).parent / "launch.py"
+LAUNCH = Path(__file__).parents[1] / "support" / "launch.py"
 ROOT = Path(__file__).parents[2]
 
 # A worker that ends by itself, and one that does not listen to SIGTERM.

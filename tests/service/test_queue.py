@@ -175,7 +175,7 @@ def test_a_server_that_accepts_and_says_nothing_does_not_hold_the_request() -> N
         JobQueue(f"redis://127.0.0.1:{silent.getsockname()[1]}").ping()
 
 
-#: The steps of a map as releases before 0.2 queued them.
+#: The steps of a map as earlier builds queued them.
 FORMER: dict[JobKind, tuple[Step, ...]] = {
     "map": (
         STEPS["map"][0],
@@ -184,7 +184,7 @@ FORMER: dict[JobKind, tuple[Step, ...]] = {
 }
 
 
-def test_a_map_that_a_former_release_queued_goes_on_with_the_step_that_it_queued(
+def test_a_map_that_an_earlier_build_queued_goes_on_with_the_step_that_it_queued(
     server: EmbeddedRedis, queue: JobQueue
 ) -> None:
     former = JobQueue(server.url, steps=FORMER)
@@ -194,7 +194,7 @@ def test_a_map_that_a_former_release_queued_goes_on_with_the_step_that_it_queued
     assert {step.function for step in FORMER["map"]} <= ALLOWED_FUNCTIONS
 
 
-def test_a_map_whose_last_step_a_former_release_queued_gets_the_step_of_today_beside_it(
+def test_a_map_whose_last_step_an_earlier_build_queued_gets_the_step_of_today_beside_it(
     server: EmbeddedRedis, queue: JobQueue, redis: Redis
 ) -> None:
     former = JobQueue(server.url, steps=FORMER)

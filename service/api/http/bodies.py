@@ -54,7 +54,7 @@ async def received(
     files: str = "scans",
     filename: str | None = None,
 ) -> AsyncIterator[Body]:
-    """The body of a request in one of the media types `takes`.
+    """Receive the body of a request in one of the media types `takes`.
 
     `files` names the form field of files; `filename` that of a raw body. Raises WrongMediaType, TooLarge,
     BadRequest, ScanUnreadable; leaves nothing behind whichever way it ends.
@@ -94,7 +94,7 @@ def documented(
     form: type[BaseModel] | None = None,
     file: str = "file",
 ) -> dict[str, Any]:
-    """Return the `openapi_extra` of a route that reads its body by hand; `file` is the form field of the file or files."""
+    """Return the `openapi_extra` of a route that reads its body by hand; `file` is the form field of files."""
     content: dict[str, Any] = {}
     binary = {"type": "string", "format": "binary"}
     if raw:
@@ -186,7 +186,7 @@ class Form:
             raise BadRequest(f"the multipart body cannot be read: {error}") from error
 
     def finish(self) -> None:
-        """The body has ended. Raises BadRequest when the form has not."""
+        """Note that the body has ended. Raises BadRequest when the form has not."""
         if not self._ended:
             raise BadRequest("the multipart body ends before its last boundary; send it again")
 

@@ -1,4 +1,4 @@
-"""The cards of models, of the release and of the site, passed on as they are; the workers are who reads them closely."""
+"""The cards of models, of the release and of the site, passed on as they are; the workers read them closely."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class Cards:
         raise NotReady(f"model {model.model!r} {state}; look at job {model.job_id}")
 
     def check(self, model: str) -> str:
-        """Return `model` (`name/version`) when it can be used. Raises NotReady, and BadRequest naming those there are."""
+        """Return `model` (`name/version`) if it can be used. Raises NotReady, and BadRequest naming those there are."""
         try:
             self.of(*model.split("/", 1))
         except NotFound:

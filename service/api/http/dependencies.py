@@ -20,13 +20,13 @@ class Queue(Protocol):
         """Hand a job to the workers, unless they have it. Raises QueueUnavailable."""
 
     def holds(self, job_id: str, kind: JobKind) -> bool:
-        """Whether the job waits for a worker or has one. Raises QueueUnavailable."""
+        """Tell whether the job waits for a worker or has one. Raises QueueUnavailable."""
 
     def dismiss(self, job_id: str, kind: JobKind) -> None:
         """Stop a job that waits or runs. Raises QueueUnavailable."""
 
     def ping(self) -> None:
-        """Raises QueueUnavailable."""
+        """Ask the queue for a sign of life. Raises QueueUnavailable."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

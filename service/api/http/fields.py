@@ -19,7 +19,7 @@ _RFC3339 = re.compile(r"\d{4}-\d\d-\d\d[Tt ]\d\d:\d\d:\d\d(\.\d+)?([Zz]|[+-]\d\d
 
 
 def instant(value: object) -> datetime:
-    """An RFC 3339 date and time, zone included: a time without a zone is nobody's. Raises ValueError."""
+    """Read an RFC 3339 date and time, zone included: a time without a zone is ambiguous. Raises ValueError."""
     if isinstance(value, datetime):
         return value
     if not isinstance(value, str) or not _RFC3339.fullmatch(value):
@@ -31,7 +31,7 @@ def instant(value: object) -> datetime:
 
 
 def from_text(value: Any) -> Any:
-    """A form field or query parameter that holds JSON; other values pass."""
+    """Read a form field or query parameter that holds JSON; other values pass."""
     if not isinstance(value, str):
         return value
     try:
@@ -41,7 +41,7 @@ def from_text(value: Any) -> Any:
 
 
 def names_from_text(value: Any) -> Any:
-    """A list of names in a form: repeated fields, a JSON list, or names with commas between."""
+    """Read a list of names in a form: repeated fields, a JSON list, or names with commas between."""
     if not isinstance(value, str):
         return value
     if value.lstrip().startswith("["):
@@ -50,7 +50,7 @@ def names_from_text(value: Any) -> Any:
 
 
 def rigid(matrix: Matrix) -> Matrix:
-    """A rotation and a shift. Raises ValueError with the number that is off."""
+    """Check that a matrix is a rotation and a shift. Raises ValueError with the number that is off."""
     if any(abs(a - b) > 1e-6 for a, b in zip(matrix[3], (0, 0, 0, 1), strict=True)):
         raise ValueError("the last row of a pose is 0, 0, 0, 1; the matrix is row-major")
     rows = [row[:3] for row in matrix[:3]]

@@ -11,7 +11,7 @@ from service.errors import NotFound
 
 
 def blob_response(blobs: Blobs, key: str, *, media_type: str, filename: str | None = None) -> Response:
-    """The blob under `key`, as a download when it has a `filename`. Raises NotFound."""
+    """Answer with the blob under `key`, as a download when it has a `filename`. Raises NotFound."""
     try:
         path = blobs.path(key)
         if path is not None:
@@ -25,6 +25,6 @@ def blob_response(blobs: Blobs, key: str, *, media_type: str, filename: str | No
 
 
 def documented(media_type: str, what: str) -> dict[int | str, dict[str, Any]]:
-    """The 200 of a route that answers with a file, for the generated API description."""
+    """Return the 200 of a route that answers with a file, for the generated API description."""
     schema = {"type": "string", "format": "binary"}
     return {200: {"description": what, "content": {media_type: {"schema": schema}}}}

@@ -26,7 +26,7 @@ class PageRequest(Request):
     cursor: Cursor = None
 
     def after(self) -> Position | None:
-        """Where to go on. Raises BadRequest."""
+        """Return where to go on. Raises BadRequest."""
         if self.cursor is None:
             return None
         created, key = decoded(self.cursor, instant, str)
@@ -34,7 +34,7 @@ class PageRequest(Request):
 
 
 def list_links(request: HttpRequest, page: Page[Any], position: Callable[[Any], Position]) -> list[Link]:
-    """`self`, and `next` while there is more."""
+    """Return the links `self`, and `next` while there is more."""
     links = [Link(href=_here(request), rel="self")]
     if page.more:
         created, key = position(page.items[-1])
@@ -43,13 +43,13 @@ def list_links(request: HttpRequest, page: Page[Any], position: Callable[[Any], 
 
 
 def next_link(request: HttpRequest, cursor: str, media_type: str = "application/json") -> Link:
-    """The same request, further on."""
+    """Return the link to the same request, further on."""
     url = request.url.include_query_params(cursor=cursor)
     return link(request, f"{_path(request)}?{url.query}", "next", media_type)
 
 
 def encoded(*parts: str) -> str:
-    """An opaque cursor of these parts."""
+    """Return an opaque cursor of these parts."""
     return base64.urlsafe_b64encode(json.dumps(parts).encode()).decode().rstrip("=")
 
 

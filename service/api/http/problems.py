@@ -92,7 +92,7 @@ BODY = ("incomplete_body", "too_large", "wrong_media_type", "bad_request", "inva
 def response(
     code: str, detail: str, *, headers: dict[str, str] | None = None, **members: Any
 ) -> JSONResponse:
-    """The answer to a request that ended in `code`; `members` extend the document (RFC 9457, Section 3.2)."""
+    """Answer a request that ended in `code`; `members` extend the document (RFC 9457, Section 3.2)."""
     status, title = PROBLEMS[code]
     status = 500 if status is None else status
     content = {"type": _type(code), "title": title, "status": status, "detail": detail, **members}
@@ -100,22 +100,22 @@ def response(
 
 
 def documented(*codes: str) -> dict[int | str, dict[str, Any]]:
-    """The `responses` of a route that may end in these codes, for the generated API description."""
+    """Return the `responses` of a route that may end in these codes, for the generated API description."""
     answers: dict[int | str, dict[str, Any]] = {}
     for code in codes:
         status, title = PROBLEMS[code]
         if status is None:
             raise ValueError(f"{code} is the problem of a job, not of a request")
-        told = f"{title} (`{_type(code)}`)"
+        meaning = f"{title} (`{_type(code)}`)"
         known = answers.get(status)
         answers[status] = {
-            "description": told if known is None else f"{known['description']}; {told}",
+            "description": meaning if known is None else f"{known['description']}; {meaning}",
             "content": {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/ProblemDocument"}}},
         }
     return answers
 
 
-#: The answers of a route that names one thing, that lists, and that gives a file or tiles of something that a job makes.
+#: The answers of a route that names one thing, of one that lists, and of one that gives what a job makes.
 NAMED = documented("not_found", "invalid_request")
 LISTED = documented("invalid_request", "bad_request")
 MADE = documented("not_found", "not_ready", "invalid_request")
@@ -136,8 +136,8 @@ def _service_error(_request: Request, error: Exception) -> Response:
 
 
 def _invalid(_request: Request, error: Exception) -> Response:
-    found: Sequence[Any] = error.errors() if isinstance(error, RequestValidationError) else ()
-    errors = [_invalid_value(entry) for entry in found]
+    entries: Sequence[Any] = error.errors() if isinstance(error, RequestValidationError) else ()
+    errors = [_invalid_value(entry) for entry in entries]
     first = errors[0] if errors else {"place": "request", "detail": "it does not match"}
     return response("invalid_request", f"{first['place']}: {first['detail']}", errors=errors)
 
@@ -157,7 +157,7 @@ def _invalid_value(entry: dict[str, Any]) -> dict[str, Any]:
 
 
 def _encodable(text: str) -> str:
-    """A lone surrogate, which JSON can spell and UTF-8 cannot, becomes a question mark."""
+    """Replace a lone surrogate, which JSON can spell and UTF-8 cannot, by a question mark."""
     return text.encode("utf-8", "replace").decode()
 
 

@@ -56,7 +56,7 @@ class Incoming:
         self._size += len(data)
 
     def finish(self) -> Upload:
-        """The whole file. Raises ScanUnreadable when it is neither PLY nor PCD."""
+        """Return the whole file. Raises ScanUnreadable when it is neither PLY nor PCD."""
         self._file.close()
         return Upload(
             path=self._path,

@@ -21,8 +21,9 @@ depends_on = None
 
 def upgrade() -> None:
     """Make every table."""
-    op.create_table(
+    _make(
         "scans",
+        ("id",),
         *_texts("id filename format sha256 key"),
         sa.Column("size", sa.BigInteger(), nullable=False),
         sa.Column("device_id", sa.String()),
@@ -30,21 +31,21 @@ def upgrade() -> None:
         _json("pose"),
         *_instants("created"),
         sa.Column("resent", UtcDateTime()),
-        _key("scans", "id"),
     )
     _index("scans", "created", "id")
-    op.create_table(
+    _make(
         "maps",
+        ("id",),
         *_texts("id model"),
         sa.Column("name", sa.String()),
         _json("settings", nullable=False),
         _json("anchor"),
         *_instants("created updated"),
-        _key("maps", "id"),
     )
     _index("maps", "created", "id")
-    op.create_table(
+    _make(
         "map_versions",
+        ("job_id",),
         *_texts("job_id map_id status"),
         *_integers("number"),
         sa.Column("base_version", sa.Integer()),
@@ -53,38 +54,38 @@ def upgrade() -> None:
         _json("counts", nullable=False),
         _json("registration"),
         *_instants("created updated"),
-        _key("map_versions", "job_id"),
         _foreign_key("map_versions", "map_id", "maps.id"),
         sa.UniqueConstraint("map_id", "number", name=op.f("uq_map_versions_map_id_number")),
     )
     _index("map_versions", "map_id", "created", "job_id")
-    op.create_table(
+    _make(
         "surveys",
+        ("id",),
         *_texts("id map_id status model job_id"),
         sa.Column("map_version", sa.Integer(), nullable=False, server_default="1"),
         sa.Column("threshold", sa.Double()),
         sa.Column("device_id", sa.String()),
         _json("counts", nullable=False),
         *_instants("captured_at created updated"),
-        _key("surveys", "id"),
         _foreign_key("surveys", "map_id", "maps.id"),
     )
     _index("surveys", "map_id", "captured_at", "id")
     _index("surveys", "map_id", "created", "id")
-    op.create_table(
+    _make(
         "survey_tiles",
+        ("survey_id", "tile_id"),
         *_texts("survey_id tile_id state"),
         *_integers("i j k n_reference n_current"),
         *(sa.Column(name, sa.Double(), nullable=False) for name in _BOX),
         *(sa.Column(name, sa.Double()) for name in ("score", "p_unchanged", "p_changed", "p_different")),
-        _key("survey_tiles", "survey_id", "tile_id"),
         _foreign_key("survey_tiles", "survey_id", "surveys.id"),
     )
     _index("survey_tiles", "survey_id", "state", "score")
     _make_outcomes("version_scans", "job_id", "map_versions.job_id")
     _make_outcomes("survey_scans", "survey_id", "surveys.id")
-    op.create_table(
+    _make(
         "models",
+        ("job_id",),
         *_texts("job_id map_id name status"),
         *_integers("map_version number"),
         sa.Column("base", sa.String()),
@@ -92,13 +93,13 @@ def upgrade() -> None:
         sa.Column("epochs", sa.Integer()),
         _json("card"),
         *_instants("created updated"),
-        _key("models", "job_id"),
         _foreign_key("models", "map_id", "maps.id"),
         sa.UniqueConstraint("name", "number", name=op.f("uq_models_name_number")),
     )
     _index("models", "map_id")
-    op.create_table(
+    _make(
         "jobs",
+        ("id",),
         *_texts("id kind map_id status message"),
         sa.Column("survey_id", sa.String()),
         sa.Column("model", sa.String()),
@@ -108,7 +109,6 @@ def upgrade() -> None:
         *_instants("created updated"),
         sa.Column("started", UtcDateTime()),
         sa.Column("finished", UtcDateTime()),
-        _key("jobs", "id"),
         _foreign_key("jobs", "map_id", "maps.id"),
         _foreign_key("jobs", "survey_id", "surveys.id"),
     )
@@ -128,10 +128,15 @@ def downgrade() -> None:
 _BOX = ("min_x", "min_y", "min_z", "max_x", "max_y", "max_z")
 
 
+def _make(table: str, key: tuple[str, ...], *parts: sa.Column[Any] | sa.Constraint) -> None:
+    op.create_table(table, *parts, sa.PrimaryKeyConstraint(*key, name=op.f(f"pk_{table}")))
+
+
 def _make_outcomes(table: str, owner: str, target: str) -> None:
     """Make the table of what became of each scan of a version or a survey."""
-    op.create_table(
+    _make(
         table,
+        (owner, "scan_id"),
         *_texts(f"{owner} scan_id"),
         *_integers("ordinal"),
         sa.Column("accepted", sa.Boolean()),
@@ -142,7 +147,6 @@ def _make_outcomes(table: str, owner: str, target: str) -> None:
         _json("map_from_scan"),
         _json("path"),
         sa.Column("reason", sa.String()),
-        _key(table, owner, "scan_id"),
         _foreign_key(table, owner, target),
         _foreign_key(table, "scan_id", "scans.id", cascade=False),
     )
@@ -163,10 +167,6 @@ def _instants(names: str) -> list[sa.Column[Any]]:
 
 def _json(name: str, *, nullable: bool = True) -> sa.Column[Any]:
     return sa.Column(name, sa.JSON(none_as_null=True), nullable=nullable)
-
-
-def _key(table: str, *columns: str) -> sa.PrimaryKeyConstraint:
-    return sa.PrimaryKeyConstraint(*columns, name=op.f(f"pk_{table}"))
 
 
 def _foreign_key(table: str, column: str, target: str, *, cascade: bool = True) -> sa.ForeignKeyConstraint:
