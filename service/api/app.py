@@ -67,10 +67,7 @@ class Api(FastAPI):
                 pairs = [(model, mode) for model in unseen]
                 _, derived = models_json_schema(pairs, ref_template="#/components/schemas/{model}")
                 schemas.update(derived["$defs"])
-            for replaced in (
-                "HTTPValidationError",
-                "ValidationError",
-            ):  # a bad value is answered with a problem
+            for replaced in ("HTTPValidationError", "ValidationError"):  # by problems
                 schemas.pop(replaced, None)
             self.openapi_schema = document
         return self.openapi_schema

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from datetime import datetime
 from typing import Annotated, Literal
 
 from fastapi import APIRouter, Path, Query, Request
@@ -16,6 +15,7 @@ from service.api.http.problems import LISTED, NAMED, JobProblem, documented
 from service.api.http.submission import dismiss
 from service.api.models import model_path
 from service.catalog.records import JobRecord, JobStatus
+from service.catalog.steps import JobKind
 
 RESULTS = "http://www.opengis.net/def/rel/ogc/1.0/results"  #: OGC 18-062r2, Section 7.11
 
@@ -30,23 +30,13 @@ class JobsRequest(PageRequest):
     map_id: Id | None = None
 
 
-class JobDocument(Document):
+class JobDocument(JobRecord, Document):
     """The status of a job (OGC API - Processes - Part 1, statusInfo), with what it works on."""
 
-    jobID: str = Field(examples=["job-5f0c"])  # noqa: N815 - the standard's name
-    processID: Literal["map", "survey", "model"]  # noqa: N815 - the standard's name
+    job_id: str = Field(serialization_alias="jobID", examples=["job-5f0c"])  # the standard's name
+    kind: JobKind = Field(serialization_alias="processID")  # the standard's name
     type: Literal["process"] = "process"
-    status: JobStatus
-    message: str = Field(description="the stage", examples=["registering"])
-    progress: int = Field(ge=0, le=100, examples=[40])
-    created: datetime
-    started: datetime | None
-    finished: datetime | None
-    updated: datetime
-    map_id: str
-    survey_id: str | None
-    model: str | None = Field(description="that a training makes", examples=[None])
-    problem: JobProblem
+    problem: JobProblem  # type: ignore[assignment]  # as RFC 9457 has it
     links: list[Link]
 
 
@@ -92,7 +82,7 @@ def job_document(record: JobRecord, request: Request) -> JobDocument:
     links = [link(request, f"/jobs/{record.job_id}", "self")]
     if record.status == "successful":
         links.append(link(request, _result(record), RESULTS))
-    return JobDocument(jobID=record.job_id, processID=record.kind, links=links, **dict(record))
+    return JobDocument(links=links, **dict(record))
 
 
 def _result(record: JobRecord) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 
 _UNSAFE = re.compile(r"[^A-Za-z0-9._-]+")
 
@@ -34,6 +35,11 @@ def probe(token: str) -> str:
     return f"health/{token}"
 
 
+def _within(folder: Callable[[str], str], name: str) -> Callable[[str], str]:
+    """Return what names a file, or a folder, in the folder of an id."""
+    return lambda owner: folder(owner) + name
+
+
 def map_folder(job_id: str) -> str:
     """Name the prefix of everything kept for a version of a map.
 
@@ -43,19 +49,11 @@ def map_folder(job_id: str) -> str:
     return f"maps/{job_id}/"
 
 
-def map_cloud(job_id: str) -> str:
-    """Name the fused reference map, PLY."""
-    return map_folder(job_id) + "cloud.ply"
-
-
-def map_reference(job_id: str) -> str:
-    """Name what surveys are registered to: points and normals of the reference map."""
-    return map_folder(job_id) + "reference.npz"
-
-
-def map_tiles(job_id: str) -> str:
-    """Name the dense points of the map's tiles."""
-    return map_folder(job_id) + "tiles.npz"
+map_cloud = _within(map_folder, "cloud.ply")  #: the fused reference map
+map_reference = _within(map_folder, "reference.npz")  #: points and normals, which surveys are registered to
+map_tiles = _within(map_folder, "tiles.npz")  #: the dense points of the map's tiles
+map_manifest = _within(map_folder, "manifest.json")  #: the tile manifest (paper, Table A1)
+map_work = _within(map_folder, "work/")  #: what the building of a map remembers of itself while it lasts
 
 
 def map_embedding(job_id: str, model: str, sha256: str | None) -> str:
@@ -68,19 +66,9 @@ def map_embedding(job_id: str, model: str, sha256: str | None) -> str:
     return f"{map_folder(job_id)}description-{safe_name(made_by)}.npz"
 
 
-def map_manifest(job_id: str) -> str:
-    """Name the tile manifest (paper, Table A1), JSON."""
-    return map_folder(job_id) + "manifest.json"
-
-
 def map_scan(job_id: str, scan_id: str) -> str:
     """Name the points, pose and sensor origin of one accepted scan of the map."""
     return f"{map_folder(job_id)}scans/{scan_id}.npz"
-
-
-def map_work(job_id: str) -> str:
-    """Name the prefix of what the building of a map remembers of itself while it lasts."""
-    return map_folder(job_id) + "work/"
 
 
 def map_pairs(job_id: str, token: str) -> str:
@@ -93,24 +81,10 @@ def model_folder(job_id: str) -> str:
     return f"models/{job_id}/"
 
 
-def model_weights(job_id: str) -> str:
-    """Name the weights that the model's card vouches for."""
-    return model_folder(job_id) + "weights.safetensors"
-
-
-def model_log(job_id: str) -> str:
-    """Name the log of the training, CSV, a row an epoch."""
-    return model_folder(job_id) + "epochs.csv"
-
-
-def model_work(job_id: str) -> str:
-    """Name the prefix of what a training remembers of itself while it lasts."""
-    return model_folder(job_id) + "work/"
-
-
-def model_tiles(job_id: str) -> str:
-    """Name the training set."""
-    return model_work(job_id) + "tiles.npz"
+model_weights = _within(model_folder, "weights.safetensors")  #: the card has their digest
+model_log = _within(model_folder, "epochs.csv")  #: of the training, a row an epoch
+model_work = _within(model_folder, "work/")  #: what a training remembers of itself while it lasts
+model_tiles = _within(model_work, "tiles.npz")  #: the training set
 
 
 def model_checkpoint(job_id: str, name: str) -> str:
@@ -123,29 +97,11 @@ def survey_folder(survey_id: str) -> str:
     return f"surveys/{survey_id}/"
 
 
-def survey_pairs(survey_id: str) -> str:
-    """Name the survey's tiles beside those of the map."""
-    return survey_folder(survey_id) + "pairs.npz"
-
-
-def survey_current(survey_id: str) -> str:
-    """Name the survey's scans fused in the map frame."""
-    return survey_folder(survey_id) + "current.npz"
-
-
-def survey_scores(survey_id: str) -> str:
-    """Name the class probabilities of every tile."""
-    return survey_folder(survey_id) + "scores.npz"
-
-
-def survey_cloud(survey_id: str) -> str:
-    """Name the current map coloured by result, PLY."""
-    return survey_folder(survey_id) + "cloud.ply"
-
-
-def survey_picture(survey_id: str) -> str:
-    """Name the top view with tiles by state, PNG."""
-    return survey_folder(survey_id) + "picture.png"
+survey_pairs = _within(survey_folder, "pairs.npz")  #: the survey's tiles beside those of the map
+survey_current = _within(survey_folder, "current.npz")  #: the survey's scans fused in the map frame
+survey_scores = _within(survey_folder, "scores.npz")  #: the class probabilities of every tile
+survey_cloud = _within(survey_folder, "cloud.ply")  #: the current map coloured by result
+survey_picture = _within(survey_folder, "picture.png")  #: the top view with tiles by state
 
 
 def survey_scan(survey_id: str, scan_id: str) -> str:

@@ -68,8 +68,15 @@ class Database:
         return Page(items=records[:limit], more=len(records) > limit)
 
     def upgrade(self) -> None:
-        """Bring the tables up to date; several processes may do so at once."""
-        upgrade(self.engine)
+        """Bring the tables up to date; several processes may do so at once. Raises WrongRevision."""
+        config = Config()
+        config.set_main_option("script_location", "service.catalog:migrations")
+        with _migration_lock(self.engine):
+            with self.engine.connect() as connection:
+                _check_revision(MigrationContext.configure(connection).get_current_revision(), config)
+            with self.engine.connect() as connection:
+                config.attributes["connection"] = connection
+                command.upgrade(config, "head")
 
     def ping(self) -> None:
         """Ask the tables something. Raises what the driver raises."""
@@ -83,18 +90,6 @@ class Database:
 
 class WrongRevision(Exception):
     """The database has tables that this release cannot bring up to date; `str()` says what to do."""
-
-
-def upgrade(engine: Engine) -> None:
-    """Run the migrations that are missing, one process at a time. Raises WrongRevision."""
-    config = Config()
-    config.set_main_option("script_location", "service.catalog:migrations")
-    with _migration_lock(engine):
-        with engine.connect() as connection:
-            _check_revision(MigrationContext.configure(connection).get_current_revision(), config)
-        with engine.connect() as connection:
-            config.attributes["connection"] = connection
-            command.upgrade(config, "head")
 
 
 def _check_revision(revision: str | None, config: Config) -> None:

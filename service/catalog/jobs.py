@@ -83,12 +83,6 @@ class Jobs:
             job_id, message=message, progress=largest(tables.Job.progress, percent), updated=now()
         )
 
-    def is_dismissed(self, job_id: str) -> bool:
-        """Tell whether the work should stop: the job was dismissed, or deleted with its map."""
-        with self._database.read() as session:
-            status = session.scalar(select(tables.Job.status).where(tables.Job.job_id == job_id))
-        return status is None or status == "dismissed"
-
     def succeed(self, job_id: str) -> bool:
         """Mark the job as done and its map's version, survey or model as ready; False when it had ended or gone."""
         return self._end(job_id, "successful", message="done", progress=100)

@@ -228,17 +228,17 @@ class JobRecord(Record):
 
     job_id: str
     kind: JobKind
-    map_id: str
-    survey_id: str | None
-    model: str | None  #: `name/version` of the model that it trains
     status: JobStatus
-    message: str  #: the stage
-    progress: int = Field(ge=0, le=100)
-    problem: Problem | None
+    message: str = Field(description="the stage", examples=["registering"])
+    progress: int = Field(ge=0, le=100, examples=[40])
     created: Utc
     started: Utc | None
     finished: Utc | None
     updated: Utc
+    map_id: str
+    survey_id: str | None
+    model: str | None = Field(description="that a training makes", examples=[None])  #: `name/version`
+    problem: Problem | None
 
 
 class ChangeRecord(Record):

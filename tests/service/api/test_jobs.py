@@ -79,7 +79,7 @@ def test_a_dismissal_stands_without_a_queue(
     job_id = add_map(catalog, ready=False)
     queue.down = True
     assert client.delete(f"/jobs/{job_id}").status_code == 200
-    assert catalog.jobs.is_dismissed(job_id)
+    assert catalog.jobs.get(job_id).status == "dismissed"
 
 
 def test_a_job_that_ended_by_itself_cannot_be_dismissed(

@@ -13,6 +13,8 @@ from service.catalog import blob_keys
 from service.catalog.catalog import Catalog, open_catalog
 from service.catalog.database import Database, WrongRevision
 from service.settings import Settings
+from service.up.embedded_redis import LaunchFailed
+from service.up.launcher import _migrate
 from tests.support.samples import BOUNDS, IDENTITY, add_survey, tile
 
 WRITTEN = Path(__file__).with_name("release_0_1_0.sql")
@@ -128,3 +130,11 @@ def test_what_is_refused_stays_as_it_was(old: Settings) -> None:
     with pytest.raises(WrongRevision):
         open_catalog(old)
     assert list(sqlite3.connect(file).iterdump()) == before
+
+
+def test_spicd_up_says_in_one_sentence_why_it_does_not_start(old: Settings) -> None:
+    run(old, "UPDATE alembic_version SET version_num = '0003'")
+    with pytest.raises(
+        LaunchFailed, match=r"cannot be opened: its tables are at revision 0003.*empty data folder"
+    ):
+        _migrate(old)
