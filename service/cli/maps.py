@@ -9,18 +9,13 @@ from rich.console import Group
 from rich.table import Table
 
 from service.cli.tables import columns, counts, facts, point, scan_table
-from service.cli.terminal import Captured, Device, Model, Scans, Terminal, Wait
+from service.cli.terminal import Captured, Device, Model, Scans, Terminal, Wait, add_group
 from service.client import Document
 
 
 def register(commands: typer.Typer) -> None:
     """Add `maps` to the command line."""
-    group = typer.Typer(no_args_is_help=True, help="Reference maps.")
-    group.command("create")(create)
-    group.command("list")(list_)
-    group.command("show")(show)
-    group.command("delete")(delete)
-    commands.add_typer(group, name="maps")
+    add_group(commands, "maps", "Reference maps.", create, list_, show, delete)
 
 
 def create(

@@ -10,17 +10,13 @@ from rich.console import Group
 from rich.table import Table
 
 from service.cli.tables import columns, counts, facts, number, point, scan_table
-from service.cli.terminal import Captured, Device, Model, Scans, Terminal, Wait
+from service.cli.terminal import Captured, Device, Model, Scans, Terminal, Wait, add_group
 from service.client import Document
 
 
 def register(commands: typer.Typer) -> None:
     """Add `surveys` and `changes` to the command line."""
-    group = typer.Typer(no_args_is_help=True, help="Later visits of a mapped space.")
-    group.command("submit")(submit)
-    group.command("list")(list_)
-    group.command("show")(show)
-    commands.add_typer(group, name="surveys")
+    add_group(commands, "surveys", "Later visits of a mapped space.", submit, list_, show)
     commands.command("changes")(changes)
 
 

@@ -39,6 +39,14 @@ PIPE_WIDTH = 160  #: characters; where nobody says how wide the place is that st
 _ID = re.compile(r"[A-Za-z0-9_-]{1,64}")
 
 
+def add_group(commands: typer.Typer, name: str, help_text: str, *group: Callable[..., None]) -> None:
+    """Add a group of commands to the command line, each under the name of its function."""
+    added = typer.Typer(no_args_is_help=True, help=help_text)
+    for command in group:
+        added.command(command.__name__.rstrip("_"))(command)
+    commands.add_typer(added, name=name)
+
+
 @dataclass(kw_only=True, slots=True)
 class Terminal:
     """The global options and the two consoles; a command finds it as `ctx.obj`."""

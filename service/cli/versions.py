@@ -9,7 +9,7 @@ from rich.console import Group
 from rich.table import Table
 
 from service.cli.tables import columns, counts, facts, scan_table
-from service.cli.terminal import Captured, Device, Terminal, Wait
+from service.cli.terminal import Captured, Device, Terminal, Wait, add_group
 from service.client import Document
 
 Further = Annotated[
@@ -19,12 +19,7 @@ Further = Annotated[
 
 def register(commands: typer.Typer) -> None:
     """Add `versions` to the command line."""
-    group = typer.Typer(no_args_is_help=True, help="Versions of a map.")
-    group.command("add")(add)
-    group.command("list")(list_)
-    group.command("show")(show)
-    group.command("delete")(delete)
-    commands.add_typer(group, name="versions")
+    add_group(commands, "versions", "Versions of a map.", add, list_, show, delete)
 
 
 def add(
