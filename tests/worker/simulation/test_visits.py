@@ -80,6 +80,7 @@ def test_merged_scans_without_noise_lie_on_the_scene():
     assert scene.caster.distances(points).max() < 1e-3
 
 
+@pytest.mark.slow
 def test_a_corridor_of_25_scans_holds_about_as_many_tiles_as_the_paper():
     points = merged(visit(corridor(1), 25, seed=5))
     voxels = np.unique(np.floor(points / 0.05).astype(np.int64), axis=0)
