@@ -76,8 +76,8 @@ def changed(house: House, survey_id: str) -> Indices:
 
 def test_the_first_version_tells_how_its_scans_were_registered(house: House) -> None:
     first = version(house, 1)
-    found = house.catalog.maps.get(MAP)
-    assert first.registration == found.registration is not None
+    assert first.registration is not None
+    assert first.registration == house.catalog.maps.get(MAP).registration
     assert (first.registration["scans"], first.registration["accepted"]) == (2, 2)
     ids = [scan.scan_id for scan in first.scans]
     assert first.registration["reference"] in ids
