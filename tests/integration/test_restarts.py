@@ -8,7 +8,8 @@ import time
 
 import pytest
 
-from tests.support.bench import Bench, QueueName
+from service.catalog.steps import Queue
+from tests.support.bench import Bench
 from tests.support.processes import running, until
 
 
@@ -27,7 +28,7 @@ def test_a_step_that_crashes_every_time_is_given_up_after_three_and_the_worker_g
 
 @pytest.mark.parametrize("kind", ["geometry", "inference"])
 def test_a_step_that_is_killed_once_runs_again_and_then_the_steps_behind_it(
-    bench: Bench, kind: QueueName
+    bench: Bench, kind: Queue
 ) -> None:
     worker = bench.worker(kind)
     bench.submit("m1", ("hold", kind), ("second", kind), ("third", "geometry"))
@@ -89,7 +90,7 @@ def test_a_killed_worker_takes_its_step_along_and_the_next_one_starts_it_again(b
 
 @pytest.mark.parametrize("kind", ["geometry", "inference"])
 def test_a_step_stopped_with_its_worker_goes_on_with_the_next_and_lost_no_attempt(
-    bench: Bench, kind: QueueName
+    bench: Bench, kind: Queue
 ) -> None:
     worker = bench.worker(kind, grace=0.3)
     bench.submit("m1", ("hold", kind), ("second", kind))

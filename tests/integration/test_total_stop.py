@@ -16,12 +16,13 @@ from sqlalchemy import select
 
 from service.api.app import create_app
 from service.catalog import tables
+from service.catalog.steps import Queue
 from service.up.embedded_redis import EmbeddedRedis
-from tests.support.bench import Bench, QueueName, add_map
+from tests.support.bench import Bench, add_map
 from tests.support.processes import running, until
 from tests.support.samples import catalog_of, settings_in
 
-STEPS: tuple[tuple[str, QueueName], ...] = (("hold", "geometry"), ("finish", "geometry"))
+STEPS: tuple[tuple[str, Queue], ...] = (("hold", "geometry"), ("finish", "geometry"))
 
 
 class Service:
@@ -34,7 +35,7 @@ class Service:
         self.bench = Bench(folder, self.redis.url, self.settings.resolved_database_url())
         self.open_api()
 
-    def open_api(self, steps: tuple[tuple[str, QueueName], ...] = STEPS) -> None:
+    def open_api(self, steps: tuple[tuple[str, Queue], ...] = STEPS) -> None:
         self.queue = self.bench.queue(*steps)
         self.api = TestClient(create_app(self.settings, queue=self.queue))
         self.api.__enter__()

@@ -17,7 +17,7 @@ from worker.cloud.tiling import Tiles, inside_tiles, tile_id
 from worker.cloud.types import Indices, Points
 from worker.jobs import versions
 from worker.pipeline import archive
-from worker.pipeline.flow import NoScanAccepted
+from worker.pipeline.flow import NoScanAccepted, build_map
 from worker.pipeline.map_update import without
 from worker.pipeline.registration.results import RegisteredScan
 
@@ -210,7 +210,7 @@ def test_a_build_that_is_killed_goes_on_from_its_pairs_and_leaves_none_behind(
     house: House, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     remembered: list[int] = []
-    real = versions.build_map
+    real = build_map
 
     def build(files: Any, *, pairs: Any, **more: Any) -> Any:
         remembered.append(len(list(pairs.load())))

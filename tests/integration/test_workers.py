@@ -13,10 +13,11 @@ import pytest
 from rq import Queue
 from rq.serializers import JSONSerializer
 
+from service.catalog import steps
 from service.catalog.catalog import open_catalog
 from service.settings import Settings
 from service.up.launcher import environment_of
-from tests.support.bench import ROOT, STANDIN, Bench, QueueName, add_map
+from tests.support.bench import ROOT, STANDIN, Bench, add_map
 from tests.support.processes import running, until
 from worker.rq_workers import GeometryWorker
 
@@ -53,7 +54,7 @@ def test_a_dismissed_step_is_killed_and_the_worker_goes_on(bench: Bench) -> None
 
 
 @pytest.mark.parametrize("kind", ["geometry", "inference"])
-def test_a_function_that_is_not_ours_is_refused_and_never_called(bench: Bench, kind: QueueName) -> None:
+def test_a_function_that_is_not_ours_is_refused_and_never_called(bench: Bench, kind: steps.Queue) -> None:
     trace = bench.folder / "trace"
     worker = bench.worker(kind)
     queue = Queue(kind, connection=bench.redis, serializer=JSONSerializer)
@@ -89,7 +90,7 @@ def test_a_stop_that_comes_when_the_step_is_over_kills_nobody(
 
 
 @pytest.mark.parametrize("kind", ["geometry", "inference"])
-def test_a_step_that_takes_too_long_is_ended_and_says_so(bench: Bench, kind: QueueName) -> None:
+def test_a_step_that_takes_too_long_is_ended_and_says_so(bench: Bench, kind: steps.Queue) -> None:
     worker = bench.worker(kind)
     bench.submit("m1", ("busy", kind), timeout_s=1)
     bench.wait_for("died m1 timed_out")

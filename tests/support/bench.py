@@ -7,19 +7,17 @@ import os
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from redis import Redis
 
 from service.catalog.catalog import Catalog
-from service.catalog.steps import Step
+from service.catalog.steps import Queue, Step
 from service.queue import JobQueue
 from tests.support.processes import until
 
 STANDIN = "tests.support.standin"  #: the module of the workers and their steps
 ROOT = Path(__file__).parents[2]
-
-QueueName = Literal["geometry", "inference"]
 
 
 class Bench:
@@ -36,12 +34,12 @@ class Bench:
         self.workers.append(subprocess.Popen(command, env=environment, cwd=ROOT, start_new_session=True))
         return self.workers[-1]
 
-    def submit(self, job_id: str, *steps: tuple[str, QueueName], timeout_s: int = 60) -> JobQueue:
+    def submit(self, job_id: str, *steps: tuple[str, Queue], timeout_s: int = 60) -> JobQueue:
         queue = self.queue(*steps, timeout_s=timeout_s)
         queue.submit(job_id, "map")
         return queue
 
-    def queue(self, *steps: tuple[str, QueueName], timeout_s: int = 60) -> JobQueue:
+    def queue(self, *steps: tuple[str, Queue], timeout_s: int = 60) -> JobQueue:
         table = tuple(Step(name=name, function=f"{STANDIN}.{name}", queue=queue) for name, queue in steps)
         return JobQueue(self.redis_url, timeout_s=timeout_s, steps={"map": table})
 
