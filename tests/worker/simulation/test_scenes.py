@@ -52,6 +52,7 @@ def test_the_office_measures_ten_by_eight_by_two_point_six_inside():
     assert scene["ceiling-1"].mesh.bounds[0, 2] == pytest.approx(2.6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", [small_office, corridor, corridor_with_loop, random_room])
 def test_no_ray_leaves_a_building(make):
     scene = make(2)

@@ -10,6 +10,7 @@ from worker.simulation.sensor import PERFECT
 from worker.simulation.visits import CLEARANCE, drifted, drifted_within, merged, stops, visit
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("make", "count"), [(small_office, 25), (corridor, 25), (corridor_with_loop, 42)])
 @pytest.mark.parametrize("seed", [0, 7])
 def test_stops_are_in_rooms_and_clear_of_everything(make, count, seed):

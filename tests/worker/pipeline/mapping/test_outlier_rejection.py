@@ -57,6 +57,7 @@ def test_without_a_contradiction_nobody_is_accused() -> None:
     assert most_accused(scans, edges, [], SETTINGS) is None
 
 
+@pytest.mark.slow
 def test_a_scan_turned_about_in_its_room_contradicts_the_others_and_nobody_else_does(
     room: Room, tmp_path: Path
 ) -> None:

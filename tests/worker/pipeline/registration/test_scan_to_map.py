@@ -88,7 +88,6 @@ def test_a_placement_carries_the_numbers_of_the_registration_and_the_sensors_pla
     assert placement_of(found, None).sensor_origin is None
 
 
-@pytest.mark.slow
 def test_a_scan_of_another_place_is_rejected_with_its_numbers(room: Room) -> None:
     elsewhere = visit(random_room(11), 1, seed=5)[0]
     with pytest.raises(
@@ -147,7 +146,6 @@ def _map_of(scans: tuple[SimulatedScan, ...]) -> Surface:
     return surface_of(functools.reduce(Voxels.merged, parts), SETTINGS)
 
 
-@pytest.mark.slow
 def test_a_wall_seen_from_its_other_side_does_not_pull_the_scan_over(
     office: tuple[SimulatedScan, ...],
 ) -> None:
@@ -157,7 +155,6 @@ def test_a_wall_seen_from_its_other_side_does_not_pull_the_scan_over(
     assert _off(found, scan.world_from_sensor)[0] < 2.0
 
 
-@pytest.mark.slow
 def test_a_good_prior_is_not_dragged_away_where_the_map_shares_little_with_the_scan(
     office: tuple[SimulatedScan, ...],
 ) -> None:
@@ -189,7 +186,6 @@ REAL_PAIRS = {
 }
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("pair", REAL_PAIRS)
 def test_real_pairs_land_within_3_cm_and_half_a_degree_with_no_start(shared_data: Path, pair: str) -> None:
     folder = shared_data / pair.split(maxsplit=1)[0]
