@@ -1,7 +1,9 @@
-"""A worker with steps of its own, for tests: `python -m tests.support.standin geometry|inference REDIS_URL FOLDER [GRACE]`.
+"""A worker with steps of its own, for tests.
 
-What the steps did and how they ended stands in FOLDER/record, one line an event. Where STANDIN_CATALOG names a database,
-the steps begin and end their job there, and the worker tells it what it tells the catalog.
+    python -m tests.support.standin geometry|inference REDIS_URL FOLDER [GRACE]
+
+What the steps did and how they ended stands in FOLDER/record, one line an event. Where STANDIN_CATALOG names a
+database, the steps begin and end their job there, and the worker tells it what it tells the catalog.
 """
 
 from __future__ import annotations

@@ -32,14 +32,15 @@ from worker.cloud.formats.fields import (
 from worker.cloud.types import Colors, Points
 from worker.errors import ScanError
 
-SHORT_NAMES = {
-    "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4", "double": "f8",
+_SHORT_NAMES = {
+    "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4",
+    "float": "f4", "double": "f8",
 }  # fmt: skip
 _LONG_NAMES = {
     "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4",
     "float32": "f4", "float64": "f8",
 }  # fmt: skip
-_TYPES = SHORT_NAMES | _LONG_NAMES
+_TYPES = _SHORT_NAMES | _LONG_NAMES
 _ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 _LIST_ROWS_LIMIT = 5_000_000  #: rows with lists that are walked one by one in Python, about 0.5 us each
 
@@ -263,7 +264,7 @@ def write_ply(
         columns[name] = _scalar(name, np.asarray(values))
     if any(column.shape != (len(points),) for column in columns.values()):
         raise ValueError(f"columns of {[len(c) for c in columns.values()]} values for {len(points)} points")
-    words = {code: word for word, code in SHORT_NAMES.items()}
+    words = {code: word for word, code in _SHORT_NAMES.items()}
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}"]
     header += [f"property {words[column.dtype.str[1:]]} {name}" for name, column in columns.items()]
     rows = np.empty(len(points), np.dtype([(name, column.dtype) for name, column in columns.items()]))
