@@ -21,12 +21,16 @@ SLOW = (
     "acceptance",
     "integration",
     "service/test_api_memory.py",
+    "service/test_catalog_migrations.py",
+    "service/test_embedded_redis.py",
     "worker/benchmarks/paper/test_benchmark.py",
     "worker/benchmarks/paper/test_pictures.py",
     "worker/benchmarks/registration/test_benchmark.py",
     "worker/benchmarks/registration/test_plain.py",
     "worker/benchmarks/revisit/test_benchmark.py",
+    "worker/benchmarks/revisit/test_methods.py",
     "worker/benchmarks/revisit/test_visits.py",
+    "worker/benchmarks/test_plain_inference.py",
     "worker/benchmarks/test_speed.py",
     "worker/pipeline/mapping/test_map_registration.py",
     "worker/pipeline/mapping/test_multiview_refinement.py",
@@ -34,6 +38,8 @@ SLOW = (
     "worker/pipeline/mapping/test_relocalization.py",
     "worker/pipeline/mapping/test_survey_registration.py",
     "worker/pipeline/registration/test_ambiguity.py",
+    "worker/pipeline/registration/test_fpfh_ransac.py",
+    "worker/pipeline/registration/test_preprocessing.py",
     "worker/pipeline/registration/test_scan_to_map.py",
     "worker/pipeline/registration/test_scan_to_scan.py",
     "worker/pipeline/results/test_picture.py",
@@ -45,6 +51,7 @@ SLOW = (
     "worker/training/test_publish.py",
     "worker/training/test_trainer.py",
 )
+SLOW_PATHS = frozenset(TESTS / name for name in SLOW)
 NO_REAL_SCANS = "real scans are missing"  #: how the reason of each such skip begins
 
 
@@ -63,11 +70,21 @@ def shared_data() -> Path:
     return folder
 
 
+def is_slow(path: Path) -> bool:
+    """Whether a folder or file is named in SLOW, or lies in a folder that is."""
+    return not {path, *path.parents}.isdisjoint(SLOW_PATHS)
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Import no slow file where only fast tests are asked for: that takes seconds in each process."""
+    return True if config.getoption("markexpr") == "fast" and is_slow(collection_path) else None
+
+
 @pytest.hookimpl(tryfirst=True)  # before -m selects
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark each test `fast` that is not `slow`, and `real_data` each that asks for real scans."""
     for item in items:
-        if any(item.path.is_relative_to(TESTS / name) for name in SLOW):
+        if is_slow(item.path):
             item.add_marker("slow")
         if item.get_closest_marker("slow") is None:
             item.add_marker("fast")

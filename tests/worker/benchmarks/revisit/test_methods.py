@@ -24,7 +24,6 @@ def test_a_model_of_the_store_comes_with_the_threshold_of_its_card():
     assert (method.name, method.stated) == (MODEL, open_card(MODEL_STORE, MODEL).threshold)
 
 
-@pytest.mark.slow
 def test_a_checkpoint_scores_with_its_own_weights_and_states_no_threshold(tmp_path: Path, walked):
     path = tmp_path / "run" / "best.pt"
     path.parent.mkdir()

@@ -223,6 +223,7 @@ def small_files() -> dict[str, bytes]:
     }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", small_files())
 def test_no_damage_ends_in_anything_but_a_scan_or_a_scan_error(tmp_path, kind):
     whole = small_files()[kind]
