@@ -13,6 +13,7 @@ from service.client import Client
 
 
 def main(client: Client, before: Path, after: Path) -> None:
+    """Have two scans compared by the service."""
     earlier, later = (client.upload_scan(path)["scan_id"] for path in (before, after))
     building = client.create_map([earlier])
     client.wait(building["job_id"], lambda job: print(job["progress"], job["message"]))

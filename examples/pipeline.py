@@ -47,6 +47,7 @@ def simulated_visits(folder: Path) -> list[ScanFile]:
 
 
 def main(names: list[str]) -> None:
+    """Compare the named files, or two simulated visits."""
     with tempfile.TemporaryDirectory() as folder:
         files = [ScanFile(name=name, path=Path(name)) for name in names] or simulated_visits(Path(folder))
         for tile in changed_tiles(files[:1], files[1:], Path("changes.ply")):

@@ -116,11 +116,14 @@ def pytest_runtest_call() -> Iterator[None]:
         return (yield)
 
 
-def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+@pytest.hookimpl(wrapper=True, tryfirst=True)  # after pytest's own summary
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> Iterator[None]:
     """Say in one line how many tests were skipped for want of real scans."""
+    yield
     skipped = [str(report.longrepr) for report in terminalreporter.stats.get("skipped", ())]
     wanting = sum(NO_REAL_SCANS in reason for reason in skipped)
     if wanting:
+        tests = "1 test was" if wanting == 1 else f"{wanting} tests were"
         terminalreporter.write_line(
-            f"{wanting} tests were skipped for want of real scans; docs/test-data.md says where to get them"
+            f"{tests} skipped for want of real scans; docs/test-data.md says where to get them"
         )

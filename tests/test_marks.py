@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -28,3 +31,18 @@ def test_a_missing_file_of_the_real_scans_skips_and_any_other_fails(
     expected = pytest.skip.Exception if skipped else FileNotFoundError
     with pytest.raises(expected), marks.skipped_without_its_file():
         (tmp_path / missing).read_bytes()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("processes", ["0", "2"])
+def test_the_end_of_a_run_tells_what_was_skipped_for_want_of_real_scans(
+    tmp_path: Path, processes: str
+) -> None:
+    command = [sys.executable, "-m", "pytest", "-n", processes, "-m", "real_data", "tests/test_docs.py"]
+    environment = {**os.environ, "SPICD_TEST_DATA": str(tmp_path / "nowhere")}
+    run = subprocess.run(
+        command, cwd=marks.TESTS.parent, env=environment, capture_output=True, text=True, check=False
+    )
+    assert run.returncode == 0, run.stdout
+    *_, line, _last = run.stdout.splitlines()
+    assert line == "1 test was skipped for want of real scans; docs/test-data.md says where to get them"
