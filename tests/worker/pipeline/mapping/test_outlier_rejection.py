@@ -57,6 +57,7 @@ def test_without_a_contradiction_nobody_is_accused() -> None:
     assert most_accused(scans, edges, [], SETTINGS) is None
 
 
+@pytest.mark.slow
 def test_a_scan_turned_about_in_its_room_contradicts_the_others_and_nobody_else_does(
     room: Room, tmp_path: Path
 ) -> None:
@@ -72,6 +73,7 @@ def test_a_scan_turned_about_in_its_room_contradicts_the_others_and_nobody_else_
     assert {2 in (each.target, each.source) for each in found(wrong)} == {True}
 
 
+@pytest.mark.slow
 def test_an_accused_registration_is_solved_without_and_told_as_contradicted(
     room: Room, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
