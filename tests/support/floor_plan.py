@@ -40,7 +40,7 @@ def main() -> None:
 
 
 def _print_rooms(root: Path) -> None:
-    rows = defaultdict(lambda: [0, 0, 0])
+    rows: defaultdict[str, list[int]] = defaultdict(lambda: [0, 0, 0])
     lengths: list[tuple[int, str]] = []
     between: Counter[tuple[str, str]] = Counter()
     sources = {
