@@ -10,9 +10,8 @@ from worker.cloud.formats.scan import Scan
 from worker.cloud.types import Matrix4, Points
 from worker.cloud.voxels import Voxels
 from worker.detectors.detector import TileScores
-from worker.pipeline.registration.icp import Surface
-from worker.pipeline.registration.preprocessing import surface_of
 from worker.pipeline.registration.settings import RegistrationSettings
+from worker.pipeline.registration.surface import Surface, surface_of
 from worker.simulation.scenes import random_room
 from worker.simulation.sensor import SimulatedScan
 from worker.simulation.visits import visit

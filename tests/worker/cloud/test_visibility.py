@@ -9,9 +9,10 @@ from tests.support.graphs import shifted
 from tests.support.rooms import Room, as_scan
 from worker.cloud.poses import inverse
 from worker.cloud.visibility import ENOUGH, RangeImage, share_in_front
-from worker.pipeline.registration.icp import Surface
-from worker.pipeline.registration.preprocessing import ROBOT, PreparedScan, free_space_violation, prepare
+from worker.pipeline.registration.preprocessing import PreparedScan, prepare
 from worker.pipeline.registration.settings import RegistrationSettings
+from worker.pipeline.registration.surface import Surface
+from worker.pipeline.registration.verification import ROBOT, free_space_violation
 from worker.simulation.visits import merged
 
 SETTINGS = RegistrationSettings()

@@ -8,18 +8,15 @@ import pytest
 
 from tests.support.graphs import shifted
 from tests.support.rooms import Room, as_scan
-from tests.support.walks import corridor_points, prepared_folder, spread
+from tests.support.walks import corridor_points, joint_settings, prepared_folder, spread
 from worker.cloud.poses import difference, exponential, inverse
 from worker.cloud.types import Matrix4, Points
 from worker.pipeline.mapping.multiview_refinement import FLOOR, Refined, refine_jointly, uncertainties
 from worker.pipeline.mapping.pose_graph_optimization import Factor, covariances
-from worker.pipeline.mapping.settings import MapSettings
-from worker.pipeline.mapping.tasks import Folder, LinearizedPair, linearised_pair, thin
+from worker.pipeline.mapping.tasks import Folder, LinearizedPair, Workspace, downsample, linearize_pair
 from worker.pipeline.registration.preprocessing import PreparedScan, prepare
 from worker.pipeline.registration.settings import RegistrationSettings
 from worker.processes import Processes
-
-SETTINGS = MapSettings()
 
 
 @pytest.fixture(scope="module")
@@ -40,18 +37,18 @@ def refined(
     *,
     fixed: int = 0,
     rounds: int = 3,
-    also: Sequence[tuple[int, int]] = (),
+    ties: Sequence[tuple[int, int]] = (),
     told: list[float] | None = None,
 ) -> Refined:
     folder, points = scans
     return refine_jointly(
         poses,
         {number: points[number] for number in poses},
+        Workspace(
+            folder=folder, processes=Processes(None), settings=joint_settings(refinement_rounds=rounds)
+        ),
         fixed=fixed,
-        also=also,
-        folder=folder,
-        processes=Processes(None),
-        settings=SETTINGS.model_copy(update={"refinement_rounds": rounds}),
+        ties=ties,
         progress=lambda share: None if told is None else told.append(share),
     )
 
@@ -140,7 +137,7 @@ def test_pairs_that_are_named_are_refined_though_their_boxes_share_nothing(
     start = perturbed({number: truth[number] for number in (0, 1)})
     alone = refined(start, (folder, apart))
     assert alone.poses[1].tolist() == start[1].tolist()
-    tied = refined(start, (folder, apart), also=[(1, 0), (7, 1)])
+    tied = refined(start, (folder, apart), ties=[(1, 0), (7, 1)])
     assert spread(tied.poses, {number: truth[number] for number in (0, 1)}) < 0.012
 
 
@@ -156,14 +153,14 @@ def corridor(*, ends: bool, seed: int) -> PreparedScan:
     return prepare(as_scan(corridor_points(ends=ends, seed=seed)), RegistrationSettings(min_eigenvalue=0.0))
 
 
-def corridor_term(*, ends: bool) -> LinearizedPair:
+def corridor_pair(*, ends: bool) -> LinearizedPair:
     a, b = (corridor(ends=ends, seed=seed) for seed in (0, 1))
-    return linearised_pair((0, 1), b.surface, a.surface, np.eye(4), within=0.05, every=1)
+    return linearize_pair((0, 1), b.surface, a.surface, np.eye(4), max_correspondence_distance=0.05, every=1)
 
 
 def test_a_bare_corridor_is_unsure_along_its_axis_and_sure_across_it() -> None:
-    term = corridor_term(ends=False)
-    block = covariances([0, 1], [term.term], fixed=0, variance=1e-4)[1]
+    pair = corridor_pair(ends=False)
+    block = covariances([0, 1], [pair.factor], fixed=0, variance=1e-4)[1]
     along, across, up = np.sqrt(np.diag(block)[3:])
     assert along > 5 * across
     assert along > 5 * up
@@ -172,7 +169,7 @@ def test_a_bare_corridor_is_unsure_along_its_axis_and_sure_across_it() -> None:
 def test_end_walls_make_a_corridor_sure() -> None:
     poses = {0: np.eye(4), 1: np.eye(4)}
     bare, ended = (
-        uncertainties(poses, [corridor_term(ends=ends)], fixed=0)[1].translation for ends in (False, True)
+        uncertainties(poses, [corridor_pair(ends=ends)], fixed=0)[1].translation for ends in (False, True)
     )
     assert ended < 0.01
     assert bare > 2 * ended
@@ -180,14 +177,20 @@ def test_end_walls_make_a_corridor_sure() -> None:
 
 def test_a_scan_far_from_the_maps_origin_is_as_sure_as_one_near_it() -> None:
     """Twists act about the map's origin: 360 m from it a turn moves a place far, and the shift takes that back."""
-    term = corridor_term(ends=True)
-    here = uncertainties({0: np.eye(4), 1: np.eye(4)}, [term], fixed=0)[1]
+    pair = corridor_pair(ends=True)
+    here = uncertainties({0: np.eye(4), 1: np.eye(4)}, [pair], fixed=0)[1]
     a, b = (corridor(ends=True, seed=seed) for seed in (0, 1))
     away = shifted(300.0, -200.0, yaw=0.4)
-    far_term = linearised_pair(
-        (0, 1), b.surface, a.surface, np.eye(4), within=0.05, every=1, map_from_target=away
+    far_pair = linearize_pair(
+        (0, 1),
+        b.surface,
+        a.surface,
+        np.eye(4),
+        max_correspondence_distance=0.05,
+        every=1,
+        map_from_target=away,
     )
-    there = uncertainties({0: away, 1: away}, [far_term], fixed=0)[1]
+    there = uncertainties({0: away, 1: away}, [far_pair], fixed=0)[1]
     assert there.translation == pytest.approx(here.translation, rel=0.02)
     assert there.rotation == pytest.approx(here.rotation, rel=0.02)
 
@@ -196,18 +199,20 @@ def test_gradient_and_information_are_those_of_the_squared_distances() -> None:
     """A source that stands 1 cm off the walls of its target: the step of the quadratic lays it on them."""
     a, b = corridor(ends=True, seed=0), corridor(ends=True, seed=1)
     by = shifted(0.01, -0.012, 0.008, yaw=0.002)
-    term: Factor = linearised_pair((0, 1), b.surface, a.surface, by, within=0.1, every=1).term
-    step = -np.linalg.solve(term.information, term.gradient)
+    factor: Factor = linearize_pair(
+        (0, 1), b.surface, a.surface, by, max_correspondence_distance=0.1, every=1
+    ).factor
+    step = -np.linalg.solve(factor.information, factor.gradient)
     metres, radians = difference(exponential(step) @ by, np.eye(4))
     assert metres < 0.004
     assert radians < 0.0005
     less = exponential(0.5 * step)
     twist = np.r_[0.5 * step]
-    promised = twist @ term.information @ twist + 2 * term.gradient @ twist
+    promised = twist @ factor.information @ twist + 2 * factor.gradient @ twist
     costs = [
         (each.num_inliers, each.square_residual)
         for each in (
-            linearised_pair((0, 1), b.surface, a.surface, pose, within=0.1, every=1)
+            linearize_pair((0, 1), b.surface, a.surface, pose, max_correspondence_distance=0.1, every=1)
             for pose in (by, less @ by)
         )
     ]
@@ -217,7 +222,7 @@ def test_gradient_and_information_are_those_of_the_squared_distances() -> None:
 
 
 def test_thinned_points_of_a_scan_are_one_in_half_a_metre() -> None:
-    points = thin(corridor(ends=True, seed=0).surface.points)
+    points = downsample(corridor(ends=True, seed=0).surface.points)
     assert 100 < len(points) < 1500
 
 
@@ -228,7 +233,7 @@ def test_a_round_undoes_a_turn_as_well_far_from_the_maps_origin(tmp_path: Path) 
     parts = {number: corridor(ends=True, seed=number) for number in (0, 1)}
     for number, part in parts.items():
         part.save(folder.path(number))
-    points = {number: thin(part.surface.points) for number, part in parts.items()}
+    points = {number: downsample(part.surface.points) for number, part in parts.items()}
     left = []
     for origin in (np.eye(4), shifted(300.0, -200.0, yaw=0.4)):
         found = refined({0: origin, 1: origin @ off}, (folder, points), rounds=1)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from worker.cloud.poses import exponential
-from worker.pipeline.registration.icp import Surface
-from worker.pipeline.registration.verification import TwoWayInliers, agreement
+from worker.pipeline.registration.surface import Surface
+from worker.pipeline.registration.verification import TwoWayInliers, two_way_inliers
 
 
 def floor(*, up: float = 1.0, oriented: bool = True, extra: np.ndarray | None = None) -> Surface:
@@ -24,7 +24,7 @@ def moved(x: float = 0.0, y: float = 0.0, z: float = 0.0) -> np.ndarray:
 
 def compared(source: Surface, target: Surface, pose: np.ndarray | None = None) -> TwoWayInliers:
     pose = np.eye(4) if pose is None else pose
-    return agreement(source, target, pose, reach=0.3, surface_distance=0.05)
+    return two_way_inliers(source, target, pose, surface_distance=0.05)
 
 
 @pytest.mark.parametrize(
@@ -40,7 +40,6 @@ def test_a_floor_shifted_by_half_its_length_agrees_where_both_have_something() -
     found = compared(floor(), floor(), moved(x=1.0))
     assert found.overlap == pytest.approx((20 + 5.5) / 40, abs=0.026)  # half, and 30 cm beyond the edge
     assert (found.forward, found.backward) == (1.0, 1.0)
-    assert found.score == found.overlap
 
 
 def test_the_other_side_of_a_floor_is_not_seen_by_the_map() -> None:
@@ -48,7 +47,7 @@ def test_the_other_side_of_a_floor_is_not_seen_by_the_map() -> None:
 
 
 def test_a_floor_seen_from_nowhere_known_agrees_with_both_sides() -> None:
-    assert compared(floor(up=-1.0, oriented=False), floor()).mutual == 1.0
+    assert compared(floor(up=-1.0, oriented=False), floor()).ratio == 1.0
 
 
 def test_a_board_in_the_scan_alone_disagrees_forward_and_in_the_map_alone_backward() -> None:
@@ -58,7 +57,7 @@ def test_a_board_in_the_scan_alone_disagrees_forward_and_in_the_map_alone_backwa
     assert (scan_has_it.forward, scan_has_it.backward) == (0.8, 1.0)
     map_has_it = compared(floor(), floor(extra=board))
     assert (map_has_it.forward, map_has_it.backward) == (1.0, 0.8)
-    assert scan_has_it.mutual == map_has_it.mutual == 0.8
+    assert scan_has_it.ratio == map_has_it.ratio == 0.8
 
 
 def test_the_pose_is_target_from_source() -> None:
@@ -66,10 +65,11 @@ def test_the_pose_is_target_from_source() -> None:
     away = floor()
     away = Surface.of(away.points + np.array([[3.0, 0, 0]]), away.normals, away.oriented)
     pose = exponential(np.array([0, 0, np.pi / 2, 4.95, 0, 0]))
-    assert compared(floor(), away, pose).score == 1.0
-    assert compared(away, floor(), pose).score == 0.0
+    there = compared(floor(), away, pose)
+    assert (there.overlap, there.ratio) == (1.0, 1.0)
+    assert compared(away, floor(), pose).overlap == 0.0
 
 
-def test_score_is_agreement_times_overlap_and_the_worse_direction_counts() -> None:
-    found = TwoWayInliers(overlap=0.5, forward=0.9, backward=0.6)
-    assert (found.mutual, found.score) == (0.6, 0.3)
+def test_the_ratio_is_that_of_the_worse_direction() -> None:
+    assert TwoWayInliers(overlap=0.5, forward=0.9, backward=0.6).ratio == 0.6
+    assert TwoWayInliers(overlap=0.5, forward=0.6, backward=0.9).ratio == 0.6
