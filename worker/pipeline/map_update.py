@@ -48,7 +48,7 @@ def extend_map(
     scans = itertools.chain((load() for load in base.scans), accepted_scans(files, outcomes, settings))
     fused = fused_scans(scans, len(base.scans) + len(files), settings, progress)
     reference, tiles = tiled_map(fused, base.grid, outcomes, settings, progress)
-    return BuiltMap(reference=reference, tiles=tiles, outcomes=outcomes, report=MapReport.of_survey(outcomes))
+    return BuiltMap(reference=reference, tiles=tiles, outcomes=outcomes, report=MapReport.of(outcomes))
 
 
 def renew_map(

@@ -54,49 +54,40 @@ class MapReport:
     reference: int | None  #: index of the reference scan; None where the map was there before
 
     @classmethod
-    def of_map(
+    def of(
         cls,
         results: Sequence[ScanResult],
-        pairs: Sequence[PairResult],
-        kept: Sequence[PairResult],
-        reference: int,
+        *,
+        pairs: Sequence[PairResult] | None = None,
+        kept: Sequence[PairResult] = (),
+        reference: int | None = None,
     ) -> Self:
-        """Count a map; `pairs` are all that were tried, `kept` those that it rests on."""
-        possible = len(results) * (len(results) - 1) // 2
-        accepted = sum(pair.accepted for pair in pairs)
-        return cls._of(results, (possible, len(pairs), accepted), kept, reference)
+        """Count results; `pairs` are all that were tried, `kept` those that the map rests on.
 
-    @classmethod
-    def of_survey(cls, results: Sequence[ScanResult]) -> Self:
-        """Count scans that were registered to a map that was there: each has one registration, to the map."""
-        kept = [result for result in results if result.registration is not None]
-        return cls._of(results, (len(results), len(results), len(kept)), kept, None)
-
-    @classmethod
-    def _of(
-        cls,
-        results: Sequence[ScanResult],
-        pairs: tuple[int, int, int],
-        kept: Sequence[PairResult] | Sequence[ScanResult],
-        reference: int | None,
-    ) -> Self:
-        possible, tried, agreed = pairs
-        accepted = sum(result.registration is not None for result in results)
-        rmse = np.array([item.inlier_rmse for item in kept], np.float64)
-        fitness = np.array([item.fitness for item in kept], np.float64)
+        Without pairs the scans were registered to a map that was there: each has one registration, to the map.
+        """
+        accepted = [result for result in results if result.registration is not None]
+        if pairs is None:
+            possible = tried = len(results)
+            agreed, edges = len(accepted), [(scan.fitness, scan.inlier_rmse) for scan in accepted]
+        else:
+            possible, tried = len(results) * (len(results) - 1) // 2, len(pairs)
+            agreed = sum(pair.accepted for pair in pairs)
+            edges = [(pair.fitness, pair.inlier_rmse) for pair in kept]
+        fitness, rmse = np.array(edges, np.float64).reshape(-1, 2).T
         return cls(
             scans=len(results),
-            accepted=accepted,
-            discarded=len(results) - accepted,
+            accepted=len(accepted),
+            discarded=len(results) - len(accepted),
             pairs_possible=possible,
             pairs_tried=tried,
             calls_saved=1 - tried / possible if possible else 0.0,
             pairs_accepted=agreed,
-            pairs_contradicted=agreed - len(kept),
-            mean_rmse=float(rmse.mean()) if kept else None,
-            std_rmse=float(rmse.std()) if kept else None,
-            mean_fitness=float(fitness.mean()) if kept else None,
-            std_fitness=float(fitness.std()) if kept else None,
+            pairs_contradicted=agreed - len(edges),
+            mean_rmse=float(rmse.mean()) if edges else None,
+            std_rmse=float(rmse.std()) if edges else None,
+            mean_fitness=float(fitness.mean()) if edges else None,
+            std_fitness=float(fitness.std()) if edges else None,
             reference=reference,
         )
 
@@ -156,7 +147,7 @@ class _Build:
         refined, relocalized = self._refine_and_relocalize(scans, graph)
         kept = tuple(edge for edge in graph.kept if refined.poses.keys() >= set(edge.pair))
         results = self._results(prepared, replace(graph, kept=kept), refined, relocalized)
-        report = MapReport.of_map(results, pairs, kept, graph.reference)
+        report = MapReport.of(results, pairs=pairs, kept=kept, reference=graph.reference)
         return MapRegistration(outcomes=results, report=report, kept=kept, rejected=graph.rejected)
 
     def _prepare(self) -> dict[int, ValidScan | ScanError | ScanRejected]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -93,7 +93,7 @@ def _linearize(
         for target, near in sources.items()
     ]
     linearized = {
-        (pair.factor.target, pair.factor.source): pair
+        (pair.target, pair.source): pair
         for batch in workspace.processes.each(linearize, tasks)
         for pair in batch
     }
@@ -107,8 +107,8 @@ def uncertainties(
     result = {fixed: FLOOR}
     if len(poses) < 2:
         return result
-    inliers = np.array([pair.num_inliers for pair in linearized])
-    squares = np.array([pair.square_residual for pair in linearized])
+    inliers = np.array([pair.equations.num_inliers for pair in linearized])
+    squares = np.array([pair.equations.square_residual for pair in linearized])
     variance = float((inliers * squares).sum() / max(inliers.sum(), 1)) * CORRELATED
     blocks = covariances(list(poses), _damped(linearized, poses), fixed=fixed, variance=variance)
     for scan, block in blocks.items():
@@ -145,18 +145,25 @@ def _damped(linearized: Sequence[LinearizedPair], poses: Mapping[int, Matrix4]) 
     """
     damped = []
     for pair in linearized:
-        factor, here = pair.factor, np.eye(4)
-        here[:3, 3] = poses[factor.source][:3, 3]
+        information, here = pair.equations.information, np.eye(4)
+        here[:3, 3] = poses[pair.source][:3, 3]
         there, back = adjoint(here), adjoint(inverse(here))
-        strength = float(np.trace(there.T @ factor.information @ there)) / 6
+        strength = float(np.trace(there.T @ information @ there)) / 6
         damping = _DAMPING * max(strength, 1.0) * (back.T @ back)
-        damped.append(replace(factor, information=factor.information + damping))
+        damped.append(
+            Factor(
+                target=pair.target,
+                source=pair.source,
+                information=information + damping,
+                gradient=pair.equations.gradient,
+            )
+        )
     return damped
 
 
 def _mean_violations(poses: Mapping[int, Matrix4], linearized: Sequence[LinearizedPair]) -> dict[int, float]:
     by_scan = defaultdict(list)
     for pair in linearized:
-        for scan in (pair.factor.target, pair.factor.source):
+        for scan in (pair.target, pair.source):
             by_scan[scan].append(pair.free_space_violation)
     return {scan: float(np.mean(by_scan[scan])) if by_scan[scan] else 0.0 for scan in poses}

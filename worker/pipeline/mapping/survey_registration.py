@@ -17,13 +17,14 @@ from worker.errors import ScanError
 from worker.pipeline.mapping.multiview_refinement import Refined, refine_jointly, uncertainties
 from worker.pipeline.mapping.settings import JointRegistrationSettings
 from worker.pipeline.mapping.tasks import (
+    LinearizedPair,
     Workspace,
     downsample,
     lay_together,
-    linearize_pair,
     open_workspace,
 )
 from worker.pipeline.registration.hypothesis import Hypothesis
+from worker.pipeline.registration.icp import normal_equations
 from worker.pipeline.registration.preprocessing import PreparedScan, prepare
 from worker.pipeline.registration.results import RegistrationResult, ScanFile, ScanRejected, ScanResult
 from worker.pipeline.registration.scan_to_map import register, registration_result
@@ -158,17 +159,13 @@ class _Visit:
     def _alone(self, scans: Scans, hypotheses: Hypotheses) -> Refined:
         """One scan or none: its registration to the map stands, and gives its uncertainty."""
         poses = _poses(hypotheses)
-        pairs = [
-            linearize_pair(
-                (MAP, index),
-                scans[index].surface,
-                self.target,
-                pose,
-                max_correspondence_distance=_DISTANCE,
-                every=_EVERY,
+        pairs = []
+        for index, pose in poses.items():
+            surface = scans[index].surface
+            equations = normal_equations(
+                surface, self.target, pose, max_correspondence_distance=_DISTANCE, every=_EVERY
             )
-            for index, pose in poses.items()
-        ]
+            pairs.append(LinearizedPair(target=MAP, source=index, equations=equations))
         sigmas = uncertainties({MAP: np.eye(4)} | poses, pairs, fixed=MAP)
         return Refined(poses=poses, uncertainties=sigmas, free_space_violation=dict.fromkeys(poses, 0.0))
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -15,10 +15,9 @@ from worker.cloud.poses import inverse, transformed
 from worker.cloud.types import Floats, Matrix4, Points
 from worker.cloud.voxels import Voxels
 from worker.errors import ScanError
-from worker.pipeline.mapping.pose_graph_optimization import Factor
 from worker.pipeline.mapping.settings import JointRegistrationSettings
 from worker.pipeline.registration import bev_correlation
-from worker.pipeline.registration.icp import normal_equations
+from worker.pipeline.registration.icp import NormalEquations, normal_equations
 from worker.pipeline.registration.preprocessing import PreparedScan, prepare
 from worker.pipeline.registration.refinement import CoarsePose, by_score
 from worker.pipeline.registration.results import ScanFile, ScanRejected
@@ -197,64 +196,35 @@ class LinearizeTask:
 class LinearizedPair:
     """What the points of two scans ask of their poses, and whether free space contradicts them."""
 
-    factor: Factor
-    num_inliers: int
-    square_residual: float  #: square metres, mean
+    target: int
+    source: int
+    equations: NormalEquations  #: point to plane, map frame
     free_space_violation: float = 0.0  #: 0..1, the worse direction; 0 where it was not asked
 
 
 def linearize(task: LinearizeTask) -> list[LinearizedPair]:
-    """Return the point-to-plane factors in the map frame."""
+    """Return the point-to-plane equations of each source with the target, in the map frame."""
     target_index, map_from_target = task.target
     target = task.folder.load(target_index)
     results = []
     for index, map_from_source in task.sources:
         source = task.folder.load(index)
         target_from_source = inverse(map_from_target) @ map_from_source
-        pair = linearize_pair(
-            (target_index, index),
+        equations = normal_equations(
             source.surface,
             target.surface,
             target_from_source,
             max_correspondence_distance=task.max_correspondence_distance,
             every=task.every,
-            map_from_target=map_from_target,
+            frame_from_target=map_from_target,
         )
-        if task.check_free_space:
-            violation = free_space_violation(source, target, target_from_source)
-            pair = replace(pair, free_space_violation=violation)
-        results.append(pair)
+        violation = free_space_violation(source, target, target_from_source) if task.check_free_space else 0.0
+        results.append(
+            LinearizedPair(
+                target=target_index, source=index, equations=equations, free_space_violation=violation
+            )
+        )
     return results
-
-
-def linearize_pair(
-    indices: tuple[int, int],
-    source: Surface,
-    target: Surface,
-    target_from_source: Matrix4,
-    *,
-    max_correspondence_distance: float,
-    every: int,
-    map_from_target: Matrix4 | None = None,
-) -> LinearizedPair:
-    """Return the point-to-plane factor of target and source; the target's frame is the map's if none is given."""
-    equations = normal_equations(
-        source,
-        target,
-        target_from_source,
-        max_correspondence_distance=max_correspondence_distance,
-        every=every,
-        frame_from_target=map_from_target,
-    )
-    factor = Factor(
-        target=indices[0],
-        source=indices[1],
-        information=equations.information,
-        gradient=equations.gradient,
-    )
-    return LinearizedPair(
-        factor=factor, num_inliers=equations.num_inliers, square_residual=equations.square_residual
-    )
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -26,7 +26,7 @@ from worker.pipeline.registration.surface import Surface
 CELL = 0.3  #: metres, a pixel
 PAIR_SIZE = 80  #: pixels, 24 m: two scans of a sensor that sees 10 m
 YAWS = 90  #: turns tried, 4 degrees apart
-_SPLIT = 0.8  #: metres above the cloud's own zero: what is below and above has a picture each
+_SPLIT = 0.8  #: metres above the cloud's own zero: what is below and above has an image each
 _SATURATED = 4  #: points, from which a pixel is full
 _WHITENING = 0.8  #: 0 correlates plainly, 1 takes the phases alone
 _STEEP, _FLAT = 0.4, 0.8  # |z| of the normals of walls, of floors and ceilings

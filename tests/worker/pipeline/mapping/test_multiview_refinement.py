@@ -13,7 +13,8 @@ from worker.cloud.poses import difference, exponential, inverse
 from worker.cloud.types import Matrix4, Points
 from worker.pipeline.mapping.multiview_refinement import FLOOR, Refined, refine_jointly, uncertainties
 from worker.pipeline.mapping.pose_graph_optimization import Factor, covariances
-from worker.pipeline.mapping.tasks import Folder, LinearizedPair, Workspace, downsample, linearize_pair
+from worker.pipeline.mapping.tasks import Folder, LinearizedPair, Workspace, downsample
+from worker.pipeline.registration.icp import NormalEquations, normal_equations
 from worker.pipeline.registration.preprocessing import PreparedScan, prepare
 from worker.pipeline.registration.settings import RegistrationSettings
 from worker.processes import Processes
@@ -153,14 +154,33 @@ def corridor(*, ends: bool, seed: int) -> PreparedScan:
     return prepare(as_scan(corridor_points(ends=ends, seed=seed)), RegistrationSettings(min_eigenvalue=0.0))
 
 
-def corridor_pair(*, ends: bool) -> LinearizedPair:
+def corridor_equations(
+    target_from_source: Matrix4 | None = None,
+    *,
+    ends: bool = True,
+    within: float = 0.05,
+    frame_from_target: Matrix4 | None = None,
+) -> NormalEquations:
+    """Of two scans of one corridor, at identity if no pose is given."""
     a, b = (corridor(ends=ends, seed=seed) for seed in (0, 1))
-    return linearize_pair((0, 1), b.surface, a.surface, np.eye(4), max_correspondence_distance=0.05, every=1)
+    pose = np.eye(4) if target_from_source is None else target_from_source
+    return normal_equations(
+        b.surface,
+        a.surface,
+        pose,
+        max_correspondence_distance=within,
+        frame_from_target=frame_from_target,
+    )
+
+
+def pair_of(equations: NormalEquations) -> LinearizedPair:
+    return LinearizedPair(target=0, source=1, equations=equations)
 
 
 def test_a_bare_corridor_is_unsure_along_its_axis_and_sure_across_it() -> None:
-    pair = corridor_pair(ends=False)
-    block = covariances([0, 1], [pair.factor], fixed=0, variance=1e-4)[1]
+    bare = corridor_equations(ends=False)
+    factor = Factor(target=0, source=1, information=bare.information, gradient=bare.gradient)
+    block = covariances([0, 1], [factor], fixed=0, variance=1e-4)[1]
     along, across, up = np.sqrt(np.diag(block)[3:])
     assert along > 5 * across
     assert along > 5 * up
@@ -169,7 +189,8 @@ def test_a_bare_corridor_is_unsure_along_its_axis_and_sure_across_it() -> None:
 def test_end_walls_make_a_corridor_sure() -> None:
     poses = {0: np.eye(4), 1: np.eye(4)}
     bare, ended = (
-        uncertainties(poses, [corridor_pair(ends=ends)], fixed=0)[1].translation for ends in (False, True)
+        uncertainties(poses, [pair_of(corridor_equations(ends=ends))], fixed=0)[1].translation
+        for ends in (False, True)
     )
     assert ended < 0.01
     assert bare > 2 * ended
@@ -177,19 +198,9 @@ def test_end_walls_make_a_corridor_sure() -> None:
 
 def test_a_scan_far_from_the_maps_origin_is_as_sure_as_one_near_it() -> None:
     """Twists act about the map's origin: 360 m from it a turn moves a place far, and the shift takes that back."""
-    pair = corridor_pair(ends=True)
-    here = uncertainties({0: np.eye(4), 1: np.eye(4)}, [pair], fixed=0)[1]
-    a, b = (corridor(ends=True, seed=seed) for seed in (0, 1))
+    here = uncertainties({0: np.eye(4), 1: np.eye(4)}, [pair_of(corridor_equations())], fixed=0)[1]
     away = shifted(300.0, -200.0, yaw=0.4)
-    far_pair = linearize_pair(
-        (0, 1),
-        b.surface,
-        a.surface,
-        np.eye(4),
-        max_correspondence_distance=0.05,
-        every=1,
-        map_from_target=away,
-    )
+    far_pair = pair_of(corridor_equations(frame_from_target=away))
     there = uncertainties({0: away, 1: away}, [far_pair], fixed=0)[1]
     assert there.translation == pytest.approx(here.translation, rel=0.02)
     assert there.rotation == pytest.approx(here.rotation, rel=0.02)
@@ -197,26 +208,17 @@ def test_a_scan_far_from_the_maps_origin_is_as_sure_as_one_near_it() -> None:
 
 def test_gradient_and_information_are_those_of_the_squared_distances() -> None:
     """A source that stands 1 cm off the walls of its target: the step of the quadratic lays it on them."""
-    a, b = corridor(ends=True, seed=0), corridor(ends=True, seed=1)
     by = shifted(0.01, -0.012, 0.008, yaw=0.002)
-    factor: Factor = linearize_pair(
-        (0, 1), b.surface, a.surface, by, max_correspondence_distance=0.1, every=1
-    ).factor
-    step = -np.linalg.solve(factor.information, factor.gradient)
+    first = corridor_equations(by, within=0.1)
+    step = -np.linalg.solve(first.information, first.gradient)
     metres, radians = difference(exponential(step) @ by, np.eye(4))
     assert metres < 0.004
     assert radians < 0.0005
     less = exponential(0.5 * step)
     twist = np.r_[0.5 * step]
-    promised = twist @ factor.information @ twist + 2 * factor.gradient @ twist
-    costs = [
-        (each.num_inliers, each.square_residual)
-        for each in (
-            linearize_pair((0, 1), b.surface, a.surface, pose, max_correspondence_distance=0.1, every=1)
-            for pose in (by, less @ by)
-        )
-    ]
-    before, after = (count * square for count, square in costs)
+    promised = twist @ first.information @ twist + 2 * first.gradient @ twist
+    shifted_less = corridor_equations(less @ by, within=0.1)
+    before, after = (item.num_inliers * item.square_residual for item in (first, shifted_less))
     assert after - before == pytest.approx(promised, rel=0.1)
     assert promised < 0
 
