@@ -50,3 +50,9 @@ def simulated_room() -> Room:
 
 def scores_of(*rows: tuple[float, float, float]) -> TileScores:
     return TileScores(probabilities=np.array(rows, np.float32))
+
+
+def wall(x: float, *, y: tuple[float, float] = (-2.0, 2.0)) -> np.ndarray:
+    """4 m high, across the x axis, a point every 2 cm."""
+    across, up = np.meshgrid(np.arange(*y, 0.02), np.arange(-2, 2, 0.02))
+    return np.column_stack([np.full(across.size, x), across.ravel(), up.ravel()])

@@ -44,7 +44,7 @@ def skew(vector: Floats) -> Floats:
 
 
 def adjoint(pose: Matrix4) -> Floats:
-    """Return the (6, 6) matrix that writes a twist (rotation, translation) of one frame as the same motion in another."""
+    """Return the (6, 6) that writes a twist (rotation, translation) of one frame as the same motion in another."""
     result = np.zeros((6, 6))
     result[:3, :3] = result[3:, 3:] = pose[:3, :3]
     result[3:, :3] = skew(pose[:3, 3]) @ pose[:3, :3]
@@ -61,7 +61,7 @@ def difference(a: Matrix4, b: Matrix4) -> tuple[float, float]:
 
 
 def rigid_fit(source_points: Floats, target_points: Floats) -> Matrix4:
-    """Return the target_from_source of least squares between two lists of the same points, (N, 3) each (Kabsch 1976)."""
+    """Return the target_from_source of least squares between paired points, (N, 3) each (Kabsch 1976)."""
     source_mean, target_mean = source_points.mean(axis=0), target_points.mean(axis=0)
     rotation, _ = Rotation.align_vectors(target_points - target_mean, source_points - source_mean)
     result = np.eye(4)

@@ -56,7 +56,7 @@ def share_in_front(points: NDArray[Any], origin: NDArray[Any]) -> float:
 
 
 def _returns(points: NDArray[Any], origin: NDArray[Any]) -> tuple[Floats, NDArray[np.int64], Floats]:
-    """Ranges (K,) and cells (K,) of the points that are not the origin itself, and the least range of each cell."""
+    """Return ranges (K,) and cells (K,) of the points that are not the origin, and the least range of each cell."""
     rays = (points - origin).astype(np.float64)
     ranges = np.linalg.norm(rays, axis=1)
     away = ranges > 1e-3
@@ -80,7 +80,7 @@ def cube_cells(rays: NDArray[np.float64]) -> NDArray[np.int64]:
 
 
 def _eroded(nearest: Floats) -> Floats:
-    """The least of each cell and its eight neighbours on the same face; 0 where one of the middle is unknown."""
+    """Take the least of each cell and its eight neighbours on the same face; 0 where one of the middle is unknown."""
     faces = nearest.reshape(6, CELLS, CELLS)
     padded = np.pad(faces, ((0, 0), (1, 1), (1, 1)), constant_values=np.inf)
     shifts = [padded[:, i : i + CELLS, j : j + CELLS] for i in range(3) for j in range(3)]

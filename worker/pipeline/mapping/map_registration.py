@@ -33,6 +33,7 @@ _FEW = 4  # scans up to which processes cost more than they bring
 _FIRST_REFINEMENT, _REFINEMENTS = 0.6, 0.9  # of the stage's progress
 
 Scans = Mapping[int, ValidScan]  #: by index of the file
+Prepared = Mapping[int, ValidScan | ScanError | ScanRejected]  #: likewise; why a scan is not valid
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -150,8 +151,8 @@ class _Build:
         report = MapReport.of(results, pairs=pairs, kept=kept, reference=graph.reference)
         return MapRegistration(outcomes=results, report=report, kept=kept, rejected=graph.rejected)
 
-    def _prepare(self) -> dict[int, ValidScan | ScanError | ScanRejected]:
-        """Read every file; the scans that can hold a pose, and for the others why they cannot."""
+    def _prepare(self) -> Prepared:
+        """Read every file; return the scans that can hold a pose, and for the others why they cannot."""
         settings, folder = self.workspace.settings, self.workspace.folder
         tasks = [
             PrepareTask(folder=folder, index=index, file=file, settings=settings)
@@ -164,8 +165,8 @@ class _Build:
         self.progress("reading", 1.0)
         return dict(sorted(prepared.items()))
 
-    def _valid(self, prepared: Mapping[int, ValidScan | ScanError | ScanRejected]) -> Scans:
-        """The scans that can hold a pose; raises where there is none."""
+    def _valid(self, prepared: Prepared) -> Scans:
+        """Return the scans that can hold a pose; raise where there is none."""
         scans = {index: scan for index, scan in prepared.items() if isinstance(scan, ValidScan)}
         if scans:
             return scans
@@ -258,12 +259,12 @@ class _Build:
 
     def _results(
         self,
-        prepared: Mapping[int, ValidScan | ScanError | ScanRejected],
+        prepared: Prepared,
         graph: Solution,
         refined: Refined,
         relocalized: Mapping[int, Relocalized],
     ) -> tuple[ScanResult, ...]:
-        """What became of each file: registered in the map's frame, or left out with a reason."""
+        """Return what became of each file: registered in the map's frame, or left out with a reason."""
         priors = {
             index: scan.prior
             for index, scan in prepared.items()
@@ -290,7 +291,7 @@ class _Build:
     def _registration(
         self, index: int, graph: Solution, refined: Refined, late: Relocalized | None, frame: Matrix4
     ) -> RegistrationResult:
-        """The numbers of its own registrations, or of its relocalization, at the refined pose."""
+        """Return the numbers of its own registrations, or of its relocalization, at the refined pose."""
         pose = frame @ refined.poses[index]
         origin = self.workspace.folder.load(index).origin
         if late is not None and late.result.registration is not None:
@@ -309,7 +310,7 @@ class _Build:
 
 
 def _mean_of_edges(edges: Sequence[PairResult]) -> RegistrationResult:
-    """The numbers of a scan: means over its registrations, and the best cover."""
+    """Return the numbers of a scan: means over its registrations, and the best cover."""
     best = max(edges, key=lambda edge: edge.score, default=None)
     return RegistrationResult(
         map_from_scan=np.eye(4),

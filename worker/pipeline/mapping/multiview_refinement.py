@@ -138,7 +138,7 @@ def _pairs(
 
 
 def _damped(linearized: Sequence[LinearizedPair], poses: Mapping[int, Matrix4]) -> list[Factor]:
-    """The factors, each with a little of itself in every direction (damping): a free scan stays where it is.
+    """Return the factors, each with a little of itself in every direction (damping): a free scan stays where it is.
 
     A little as seen from the scan: about an origin that is far away, a turn of the scan looks like a long way, and
     damping that a little would hold the turn fast.

@@ -64,6 +64,6 @@ def most_voted(
 
 
 def _between(a: Sequence[int], b: Sequence[int]) -> list[frozenset[int]]:
-    """The links of a tree on the way from the end of one path from its root to the end of another."""
+    """Return the links of a tree on the way from the end of one path from its root to the end of another."""
     links = [{frozenset(link) for link in itertools.pairwise(path)} for path in (a, b)]
     return sorted(links[0] ^ links[1], key=sorted)

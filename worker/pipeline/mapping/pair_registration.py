@@ -77,7 +77,7 @@ class PairPlan:
         return best_pairs(self.indices, np.where(closed, 0.0, self.rank), settings.partners_across)
 
     def _mask(self, pairs: Iterable[Pair]) -> np.ndarray:
-        """(S, S) bool, symmetric, true for these pairs."""
+        """Return (S, S) bool, symmetric, true for these pairs."""
         row_of = {index: row for row, index in enumerate(self.indices)}
         mask = np.zeros_like(self.rank, dtype=bool)
         for a, b in pairs:
@@ -106,7 +106,7 @@ def plan_pairs(scans: Mapping[int, ValidScan], workspace: Workspace, *, progress
 def _search(
     scans: Mapping[int, ValidScan], lost: Collection[int], workspace: Workspace, *, progress: Share
 ) -> list[SearchResult]:
-    """Search every pair with a scan that has no prior once."""
+    """Search once every pair with a scan that has no prior."""
     tasks = []
     for source in sorted(scans):
         targets = [other for other in scans if other < source and (source in lost or other in lost)]

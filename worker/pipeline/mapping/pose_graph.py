@@ -87,7 +87,7 @@ def _costs(edges: Sequence[PairResult], settings: MapSettings) -> Floats:
 def _follow(
     scans: Sequence[int], edges: Sequence[PairResult], reference: int, before: NDArray[np.int32]
 ) -> Chains:
-    """Poses and paths from each scan's row to the row before it on the way to the reference."""
+    """Chain poses and paths; `before` is the row before each scan's on the way from the reference."""
     parent_of = {scan: scans[int(row)] for scan, row in zip(scans, before, strict=True) if row >= 0}
     between = {edge.pair: edge.target_from_source for edge in edges}
     between |= {(edge.source, edge.target): inverse(edge.target_from_source) for edge in edges}
@@ -191,7 +191,7 @@ def solve_graph(scans: Sequence[int], pairs: Sequence[PairResult], settings: Map
 
 
 def _plausible(poses: Poses, edges: Sequence[PairResult], settings: MapSettings) -> list[PairResult]:
-    """What may be true by these poses."""
+    """Return the edges that may be true by these poses."""
     return [edge for edge in edges if residual(poses, edge, settings) <= _PLAUSIBLE]
 
 

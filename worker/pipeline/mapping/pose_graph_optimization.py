@@ -113,7 +113,7 @@ def _factor(poses: Poses, edge: PairResult, weight: float) -> Factor:
 
 
 def _loose(scans: Sequence[int], factors: Sequence[Factor], fixed: int) -> list[int]:
-    """Scans that no chain of factors ties to the fixed one: they are held where they are, and are unsure."""
+    """Return the scans that no chain of factors ties to the fixed one: they are held where they are, and are unsure."""
     row_of = {scan: row for row, scan in enumerate(scans)}
     ends = ([row_of[factor.target] for factor in factors], [row_of[factor.source] for factor in factors])
     graph = scipy.sparse.csr_array((np.ones(len(factors)), ends), shape=(len(scans), len(scans)))

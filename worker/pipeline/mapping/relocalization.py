@@ -120,5 +120,5 @@ def _require_free_space(
 
 
 def _apart(a: Matrix4, b: Matrix4) -> float:
-    """Metres between two places."""
+    """Return the metres between two places."""
     return float(np.linalg.norm(a[:3, 3] - b[:3, 3]))

@@ -2,9 +2,9 @@
 
 Robots know where down is, so four numbers are missing: x, y, yaw, z. The first three are searched exhaustively: both
 clouds become images of their walls whose pixels are complex numbers, the direction that a wall faces; turning a cloud
-turns the image and its phases, and one inverse FFT then scores every shift at once. Images are whitened, so that what is
-singular (a corner, a niche, a cabinet) counts for more than a corridor's endless sides. z comes from floors and ceilings
-in the same way.
+turns the image and its phases, and one inverse FFT then scores every shift at once. Images are whitened, so that what
+is singular (a corner, a niche, a cabinet) counts for more than a corridor's endless sides. z comes from floors and
+ceilings in the same way.
 
 Ideas: correlative scan matching (Olson, ICRA 2009), phase-only correlation (Kuglin and Hines, 1975), correlation of
 oriented elements instead of occupancy. Measured against FPFH + RANSAC in docs/decisions/0013.
@@ -71,7 +71,7 @@ class BevImage:
 
 
 def image_size(*images: BevImage) -> int:
-    """Return the pixels along a side that hold the larger of these images; what is shifted over its edge wraps around."""
+    """Return the pixels a side that hold the largest of these images; what is shifted over its edge wraps around."""
     reach = max((image.reach for image in images), default=0.0)
     return int(scipy.fft.next_fast_len(max(int(2 * reach / CELL) + 8, 32)))
 
@@ -130,7 +130,7 @@ def bev_candidates(source: Surface, target: Surface, *, count: int) -> list[Matr
 
 
 def _pixels(places: Floats, facing: Floats, upper: Bools, size: int) -> Complexes:
-    """(2, size, size): in each pixel the mean direction of its walls, by how many points saw it."""
+    """Draw (2, size, size): in each pixel the mean direction of its walls, by how many points saw it."""
     pixel = np.floor(places / CELL).astype(np.int64) + size // 2
     inside = ((pixel >= 0) & (pixel < size)).all(axis=1)
     flat = (upper[inside] * size + pixel[inside, 0]) * size + pixel[inside, 1]

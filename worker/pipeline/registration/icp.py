@@ -115,7 +115,7 @@ def normal_equations(
 def _correspondences(
     source: Surface, target: Surface, target_from_source: Matrix4, within: float
 ) -> tuple[Floats, NDArray[np.intp], Floats]:
-    """Points (K, 3) of the source in the target's frame, and index (K,) and distance (K,) of their partners."""
+    """Return points (K, 3) of the source in the target's frame, and index (K,) and distance (K,) of their partners."""
     points = transformed(source.points, target_from_source)
     distance, index = target.nearest(points, within=within)
     paired = facing(source, target, target_from_source, index, np.isfinite(distance))
@@ -125,7 +125,7 @@ def _correspondences(
 def _linearized(
     points: Floats, target: Surface, index: NDArray[np.intp], frame_from_target: Matrix4 | None = None
 ) -> tuple[Floats, Floats]:
-    """Jacobian (K, 6) and residual (K,) of the distances to the tangent planes."""
+    """Return Jacobian (K, 6) and residual (K,) of the distances to the tangent planes."""
     normals = target.normals[index]
     residual = np.einsum("ij,ij->i", points - target.points[index], normals)
     if frame_from_target is not None:

@@ -27,11 +27,11 @@ class ScanFile:
     pose: Matrix4 | None = None  #: (4, 4) map_from_sensor as the client believes it, e.g. by odometry
 
     def read(self, *, max_points: int) -> Scan:
-        """Raises ScanError, whose message names the file."""
+        """Read the file; raises ScanError, whose message names it."""
         return read_scan(self.path, name=self.name, max_points=max_points)
 
     def prior(self, sensor_pose: Matrix4) -> Matrix4 | None:
-        """Return map_from_scan as the client's pose has it, which is the sensor's; the file may know where that stood."""
+        """Return map_from_scan by the client's pose, which is the sensor's; the file may know where that stood."""
         if self.pose is None:
             return None
         map_from_scan: Matrix4 = self.pose @ inverse(sensor_pose)

@@ -72,7 +72,7 @@ def global_registration(refinement: Refinement, best: Hypothesis | None) -> Hypo
 
 
 def _candidates(refinement: Refinement) -> Iterator[Matrix4]:
-    """Identity and BEV candidates, the best after coarse alignment; then, more slowly, FPFH candidates."""
+    """Yield identity and BEV candidates, the best after coarse alignment; then, more slowly, FPFH candidates."""
     source, target, settings = refinement.source, refinement.target, refinement.settings
     without_prior = refinement.prior is None
     starts = [np.eye(4)] if without_prior else []

@@ -142,7 +142,7 @@ def require_constrained(
 def require_unambiguous(
     name: str, best: Hypothesis, refine: Callable[[Matrix4], Hypothesis], settings: RegistrationSettings
 ) -> None:
-    """Raise ScanRejected where a perturbed pose ends elsewhere and as good: nothing then says which is the true one.
+    """Raise ScanRejected where a perturbed pose ends elsewhere and as good: nothing then says which is true.
 
     Asked where little is shared. A simulated scan that saw the map through a door fitted anywhere along 23 cm, inlier
     ratio 0.85 to 0.86 throughout.
