@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from worker.benchmarks.plain_inference import plain_scores
 from worker.cloud.formats.pcd import write_pcd
-from worker.cloud.poses import difference
+from worker.cloud.poses import difference, fit_poses
 from worker.cloud.tiling import TilePairs, Tiles, cut, grid_over, pair_tiles
 from worker.cloud.types import Arrays, Matrix4
 from worker.cloud.voxels import Voxels
@@ -31,11 +31,10 @@ from worker.detectors.spicd_net.detector import SpicdNet
 from worker.detectors.store import open_detector
 from worker.pipeline import archive
 from worker.pipeline.flow import PipelineSettings
-from worker.pipeline.mapping.frame import fitted
 from worker.pipeline.mapping.fusion import ReferenceMap, current_map, fuse, reference_map
 from worker.pipeline.mapping.map_registration import register_map_scans
 from worker.pipeline.mapping.survey_registration import register_survey_scans
-from worker.pipeline.registration.results import ScanFile, ScanResult, placed
+from worker.pipeline.registration.results import ScanFile, ScanResult, read_registered
 from worker.pipeline.results.changes import decide
 from worker.pipeline.results.export import tile_results, write_coloured_cloud
 from worker.pipeline.results.picture import draw_picture
@@ -122,11 +121,11 @@ class _Built:
     def map_from_world(self, scans: tuple[SimulatedScan, ...]) -> Matrix4:
         """By all scans together: a map has the frame of the priors, which drifted."""
         pairs = [
-            (scan.world_from_sensor, outcome.placement.map_from_scan)
+            (scan.world_from_sensor, outcome.registration.map_from_scan)
             for scan, outcome in zip(scans, self.outcomes, strict=True)
-            if outcome.placement
+            if outcome.registration
         ]
-        return fitted([world for world, _ in pairs], [found for _, found in pairs])
+        return fit_poses([world for world, _ in pairs], [pose for _, pose in pairs], arm=2.0)
 
 
 def _written(path: Path, scan: SimulatedScan) -> ScanFile:
@@ -137,12 +136,12 @@ def _written(path: Path, scan: SimulatedScan) -> ScanFile:
 def _map(files: list[ScanFile], detector: SpicdNet, settings: PipelineSettings, progress: Progress) -> _Built:
     watch = Stopwatch()
     with watch.stage("read and register"):
-        outcomes = register_map_scans(files, settings=settings.placing, progress=progress).outcomes
+        outcomes = register_map_scans(files, settings=settings.joint_registration, progress=progress).outcomes
     with watch.stage("read and fuse"):
         accepted = (
-            placed(file, outcome.placement, max_points=settings.max_scan_points)
+            read_registered(file, outcome.registration, max_points=settings.max_scan_points)
             for file, outcome in zip(files, outcomes, strict=True)
-            if outcome.placement
+            if outcome.registration
         )
         fused = fuse(accepted, voxel_size=settings.registration.voxel_size)
     with watch.stage("normals"):
@@ -171,11 +170,11 @@ def _survey(
         reference = archive.load_reference(scratch / "reference.npz")
         surface = reference.surface()
     with watch.stage("read and register"):
-        (outcome,) = register_survey_scans([file], surface, settings=settings.placing)
-    if outcome.placement is None:
+        (outcome,) = register_survey_scans([file], surface, settings=settings.joint_registration)
+    if outcome.registration is None:
         return {"rejected": outcome.reason, **watch.seconds}
     with watch.stage("fuse and tile"):
-        scan = placed(file, outcome.placement, max_points=settings.max_scan_points)
+        scan = read_registered(file, outcome.registration, max_points=settings.max_scan_points)
         current = current_map([scan], voxel_size=reference.voxel_size)
         pairs = pair_tiles(built.tiles, current.points, settings=settings.tiling)
     with watch.stage("score"):
@@ -205,9 +204,9 @@ def _pose_errors(
     scans: tuple[SimulatedScan, ...], outcomes: tuple[ScanResult, ...], map_from_world: Matrix4
 ) -> dict[str, Any]:
     off = [
-        difference(outcome.placement.map_from_scan, map_from_world @ scan.world_from_sensor)
+        difference(outcome.registration.map_from_scan, map_from_world @ scan.world_from_sensor)
         for scan, outcome in zip(scans, outcomes, strict=True)
-        if outcome.placement
+        if outcome.registration
     ]
     metres, radians = np.array(off).T
     return {

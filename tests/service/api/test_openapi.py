@@ -100,6 +100,7 @@ def test_uploads_describe_their_body(document: dict[str, Any]) -> None:
     }
 
 
+@pytest.mark.slow
 def test_importing_the_api_brings_neither_torch_nor_the_worker() -> None:
     import subprocess
     import sys

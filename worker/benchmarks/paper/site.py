@@ -17,8 +17,8 @@ from worker.cloud.voxels import Voxels, merged_in_order
 from worker.pipeline.flow import PipelineSettings
 from worker.pipeline.mapping.fusion import reference_map
 from worker.pipeline.mapping.map_registration import register_map_scans
-from worker.pipeline.registration.icp import Surface
 from worker.pipeline.registration.results import ScanFile
+from worker.pipeline.registration.surface import Surface
 from worker.progress import Progress
 from worker.simulation.scenes import corridor
 from worker.simulation.sensor import SimulatedScan
@@ -98,11 +98,11 @@ def _registered(
         ]
         for file, scan in zip(files, seen, strict=True):
             write_pcd(file.path, scan.points)
-        outcomes = register_map_scans(files, settings=pipeline.placing, progress=progress).outcomes
+        outcomes = register_map_scans(files, settings=pipeline.joint_registration, progress=progress).outcomes
     return [
-        (scan.points, outcome.placement.map_from_scan)
+        (scan.points, outcome.registration.map_from_scan)
         for scan, outcome in zip(seen, outcomes, strict=True)
-        if outcome.placement
+        if outcome.registration
     ]
 
 

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from worker.cloud.poses import inverse, transformed
+from worker.cloud.poses import fit_poses, inverse, transformed
 from worker.cloud.types import Bools, Floats, Matrix4
 
 ARM = 1.0  #: metres along each axis of a pose; with these tips even stops on one line leave no turn free
@@ -36,7 +36,7 @@ def align(estimated: Sequence[Matrix4], true: Sequence[Matrix4]) -> Matrix4:
             break
         inliers = now
         chosen = np.flatnonzero(now).tolist()
-        found = fitted([estimated[at] for at in chosen], [true[at] for at in chosen])
+        found = fit_poses([estimated[index] for index in chosen], [true[index] for index in chosen], arm=ARM)
     return found
 
 
@@ -45,18 +45,6 @@ def distances(true_from_estimated: Matrix4, estimated: Sequence[Matrix4], true: 
     there = transformed(np.stack([pose[:3, 3] for pose in estimated]), true_from_estimated)
     off: Floats = np.linalg.norm(there - np.stack([pose[:3, 3] for pose in true]), axis=1)
     return off
-
-
-def fitted(estimated: Sequence[Matrix4], true: Sequence[Matrix4]) -> Matrix4:
-    """(4, 4) true_from_estimated of least squares over all (Horn 1987, by singular values as Kabsch has it)."""
-    source, target = (np.concatenate([_tips(pose) for pose in poses]) for poses in (estimated, true))
-    middle_source, middle_target = source.mean(axis=0), target.mean(axis=0)
-    u, _, vt = np.linalg.svd((source - middle_source).T @ (target - middle_target))
-    mirrored = np.array([1.0, 1.0, np.sign(np.linalg.det(vt.T @ u.T))])
-    result = np.eye(4)
-    result[:3, :3] = vt.T @ np.diag(mirrored) @ u.T
-    result[:3, 3] = middle_target - result[:3, :3] @ middle_source
-    return result
 
 
 def _by_one_pose(estimated: Sequence[Matrix4], true: Sequence[Matrix4]) -> Matrix4:
@@ -68,9 +56,3 @@ def _by_one_pose(estimated: Sequence[Matrix4], true: Sequence[Matrix4]) -> Matri
 def _lower_median(off: Floats) -> float:
     """Of two in the middle the lower: half of the poses have to agree, no more."""
     return float(np.sort(off)[(len(off) - 1) // 2])
-
-
-def _tips(pose: Matrix4) -> Floats:
-    """(4, 3) the place of a pose, and a point on each of its axes."""
-    tips: Floats = pose[:3, 3] + np.vstack([np.zeros(3), ARM * pose[:3, :3].T])
-    return tips

@@ -88,7 +88,7 @@ def assess(
     """
     home = {at: pose for at, pose in enumerate(true) if pose is not None}
     out_of_place = [outcome for at, outcome in enumerate(outcomes) if at not in home]
-    placed = {at: found for at in home if (found := outcomes[at].placement) is not None}
+    placed = {at: found for at in home if (found := outcomes[at].registration) is not None}
     frame, held = None, _held_at(reference, outcomes, true)
     if placed:
         frame = align([found.map_from_scan for found in placed.values()], [home[at] for at in placed])
@@ -102,7 +102,7 @@ def assess(
         ),
         missing=tuple(outcomes[at].name for at in home if at not in placed),
         foreign=len(out_of_place),
-        foreign_accepted=tuple(outcome.name for outcome in out_of_place if outcome.placement),
+        foreign_accepted=tuple(outcome.name for outcome in out_of_place if outcome.registration),
         true_from_map=frame,
     )
 
@@ -113,7 +113,7 @@ def _held_at(
     """true_from_map by the reference scan alone; None where there is none, or it is of another building."""
     if reference is None:
         return None
-    placement, pose = outcomes[reference].placement, true[reference]
+    placement, pose = outcomes[reference].registration, true[reference]
     if placement is None or pose is None:
         return None
     true_from_map: Matrix4 = pose @ inverse(placement.map_from_scan)

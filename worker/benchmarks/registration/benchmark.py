@@ -78,7 +78,7 @@ class Run:
             "seconds": self.seconds,
             "processor_seconds": self.processor_seconds,
             "reasons": {
-                outcome.name: outcome.reason for outcome in self.built.outcomes if not outcome.placement
+                outcome.name: outcome.reason for outcome in self.built.outcomes if not outcome.registration
             },
         }
 
@@ -148,9 +148,9 @@ def _plainly(
     there = plain.build_plainly(run.scenario.files, chosen, progress)
     used = processor_seconds() - used
     poses = {
-        at: outcome.placement.map_from_scan
+        at: outcome.registration.map_from_scan
         for at, outcome in enumerate(run.built.outcomes)
-        if outcome.placement
+        if outcome.registration
     }
     true: list[Matrix4] = [pose for pose in run.scenario.true if pose is not None]  # of all: none is foreign
     compared = compare(there, poses, kept, true)

@@ -71,8 +71,8 @@ def _places(scenario: Scenario, built: BuiltMap, found: Assessment) -> dict[int,
     """(3,) by index: where the map has a scan; where it was in truth for one of the building that is missing."""
     places: dict[int, Floats] = {}
     for at, (outcome, true) in enumerate(zip(built.outcomes, scenario.true, strict=True)):
-        if outcome.placement:
-            places[at] = outcome.placement.map_from_scan[:3, 3]
+        if outcome.registration:
+            places[at] = outcome.registration.map_from_scan[:3, 3]
         elif true is not None and found.true_from_map is not None:
             places[at] = _moved(true, inverse(found.true_from_map))
     return places
@@ -84,7 +84,7 @@ def _moved(pose: Matrix4, target_from_source: Matrix4) -> Floats:
 
 
 def _draw_edges(axes: Axes, built: BuiltMap, places: dict[int, Floats]) -> None:
-    for pairs, color, order in ((built.kept, KEPT, 2), (built.contradicted, THROWN, 3)):
+    for pairs, color, order in ((built.kept, KEPT, 2), (built.rejected, THROWN, 3)):
         for pair in pairs:
             if pair.target in places and pair.source in places:
                 ends = np.stack([places[pair.target], places[pair.source]])
@@ -93,7 +93,7 @@ def _draw_edges(axes: Axes, built: BuiltMap, places: dict[int, Floats]) -> None:
 
 def _draw_stops(axes: Axes, scenario: Scenario, built: BuiltMap, places: dict[int, Floats]) -> None:
     for at, place in places.items():
-        missing, foreign = built.outcomes[at].placement is None, scenario.true[at] is None
+        missing, foreign = built.outcomes[at].registration is None, scenario.true[at] is None
         color = MISSING if missing else THROWN if foreign else INK
         axes.plot(place[0], place[1], "x" if missing or foreign else "o", color=color, markersize=5, zorder=4)
         axes.annotate(

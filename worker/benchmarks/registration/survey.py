@@ -43,17 +43,17 @@ def time_survey(
     path = folder / "survey.pcd"
     write_pcd(path, seen.points)
     map_from_true = inverse(true_from_map)
-    surface, start = reference.surface(), map_from_true @ seen.prior
+    surface, prior = reference.surface(), map_from_true @ seen.prior
     reading, registering, processor = [], [], []
     for _ in range(REPEATS + 1):
         begun, used = time.perf_counter(), time.process_time()
         scan = read_scan(path)
         read = time.perf_counter()
-        found = register(prepare(scan, settings), surface, start=start, settings=settings)
+        hypothesis = register(prepare(scan, settings), surface, prior=prior, settings=settings)
         reading.append(read - begun)
         registering.append(time.perf_counter() - read)
         processor.append(time.process_time() - used)
-    metres, radians = difference(map_from_true @ seen.world_from_sensor, found.found.target_from_source)
+    metres, radians = difference(map_from_true @ seen.world_from_sensor, hypothesis.target_from_source)
     return {
         "points": len(scan.points),
         "map_points": len(reference.points),

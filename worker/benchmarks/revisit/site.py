@@ -56,9 +56,9 @@ def walk_site(
     files = written(seen, folder, "map", robot_from_world)
     built = build_map(files, settings=settings.pipeline, progress=prefixed(progress, f"{plan.name}: "))
     accepted = [
-        (outcome.placement.map_from_scan, scan.world_from_sensor)
+        (outcome.registration.map_from_scan, scan.world_from_sensor)
         for outcome, scan in zip(built.outcomes, seen, strict=True)
-        if outcome.placement
+        if outcome.registration
     ]
     map_from_world = inverse(align([found for found, _ in accepted], [true for _, true in accepted]))
     scans = placed_scans(built.outcomes, seen, map_from_world)
@@ -91,11 +91,11 @@ def placed_scans(
     return tuple(
         PlacedScan(
             points=scan.points,
-            placement=outcome.placement,
+            placement=outcome.registration,
             true=map_from_world @ scan.world_from_sensor,
         )
         for outcome, scan in zip(outcomes, scans, strict=True)
-        if outcome.placement
+        if outcome.registration
     )
 
 
