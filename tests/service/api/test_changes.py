@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 from fastapi.testclient import TestClient
 
+from service.api.features import TileCollection
 from service.api.http.paging import encoded
 from service.catalog.catalog import Catalog
 from tests.support.samples import (
@@ -64,6 +65,7 @@ def asked_often(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Visited]:
 def found(client: TestClient, **asked: str) -> list[tuple[str, float]]:
     answer = client.get("/maps/lobby/changes", params=asked)
     assert answer.status_code == 200, answer.text
+    TileCollection.model_validate_json(answer.content)  # the answer is what the schema says
     body = answer.json()
     assert body["numberReturned"] == len(body["features"])
     return [(f["properties"]["tile_id"][5:12], f["properties"]["score"]) for f in body["features"]]
