@@ -1,0 +1,55 @@
+"""What the JSON documents of all benchmarks share: how values are spread, and how a file is written."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from worker.cloud.types import Floats
+
+Document = dict[str, Any]  #: JSON-ready
+
+STATISTICS: Mapping[str, Callable[[Floats], Any]] = {
+    "median": np.median,
+    "95%": lambda values: np.percentile(values, 95),
+    "least": np.min,
+    "most": np.max,
+    "worst": np.max,
+}
+
+
+def spread(values: ArrayLike, *names: str, digits: int | None = None) -> dict[str, float] | None:
+    """Return the named STATISTICS of the values that are not NaN; None where there are none."""
+    every = np.asarray(values, np.float64)
+    known = every[~np.isnan(every)]
+    if not len(known):
+        return None
+    statistics = {name: float(STATISTICS[name](known)) for name in names}
+    return (
+        statistics if digits is None else {name: round(value, digits) for name, value in statistics.items()}
+    )
+
+
+def pose_spread(errors: Sequence[tuple[float, float]], *names: str) -> Document:
+    """Return the named STATISTICS of pose errors (metres, radians), in `centimetres` and `degrees`."""
+    metres, radians = np.array(errors).reshape(-1, 2).T
+    return {"centimetres": spread(100 * metres, *names), "degrees": spread(np.degrees(radians), *names)}
+
+
+def write_json(path: Path, document: Document) -> None:
+    """Write a document aside and rename it. Raises ValueError for NaN, OSError for the folder."""
+    text = json.dumps(document, indent=2, allow_nan=False) + "\n"
+    write_bytes(path, text.encode())
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """Write a file aside and rename it, its folder made where there is none. Raises OSError."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    aside = path.with_name(path.name + ".tmp")
+    aside.write_bytes(content)
+    aside.replace(path)
