@@ -38,7 +38,7 @@ class CountingDetector:
     ) -> TileScores:
         known = self.describe(pairs.reference) if description is None else description
         assert len(known["counts"]) == len(pairs.current)
-        self.asked.append(len(pairs.current))
+        self.asked.append(int(pairs.observed.sum()))
         now = np.array([len(points) for points in pairs.current])
         share = np.abs(now - known["counts"]) / known["counts"]
         probabilities = np.stack([1 - share, share, 0 * share], axis=1).astype(np.float32)

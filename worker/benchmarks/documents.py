@@ -1,4 +1,4 @@
-"""What the JSON documents of all benchmarks share: how values are spread, and how a file is written."""
+"""What the documents and tables of all benchmarks share: how values are spread, shown and written."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
+from rich.table import Table
 
 from worker.cloud.types import Floats
 
@@ -53,3 +54,16 @@ def write_bytes(path: Path, content: bytes) -> None:
     aside = path.with_name(path.name + ".tmp")
     aside.write_bytes(content)
     aside.replace(path)
+
+
+def titled_table(title: str, *columns: str) -> Table:
+    """Make a table for a terminal, numbers to the right of the first column; no columns, no head."""
+    table = Table(title=title, title_justify="left", title_style="bold", show_header=bool(columns))
+    for number, column in enumerate(columns):
+        table.add_column(column, justify="right" if number else "left")
+    return table
+
+
+def shown(value: float | None, form: str, *, missing: str = "") -> str:
+    """Write a figure in a format, as in `.2f`; `missing` where there is none."""
+    return missing if value is None else format(value, form)

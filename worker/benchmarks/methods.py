@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 import pickle
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from worker.benchmarks.baselines import installed_baselines
 from worker.benchmarks.plots import Log, read_log
-from worker.benchmarks.tiles import selected
 from worker.cloud.tiling import TilePairs, Tiles
 from worker.cloud.types import Arrays
 from worker.detectors.detector import Detector, TileScores
@@ -142,17 +141,13 @@ class CachedDetector:
         """Return the probability of change (T,), NaN where not observed."""
         embedding = self.embedding(pairs.reference)
         keys = [_key(tile, points.tobytes()) for tile, points in enumerate(pairs.current)]
-        observed = np.flatnonzero(pairs.observed)
-        new = np.array([tile for tile in observed if keys[tile] not in self._scores], int)
-        if len(new) == len(observed) > 0:
-            scores = change_scores(self.detector, pairs, embedding)[new]
-            self._scores |= {keys[tile]: score for tile, score in zip(new, scores, strict=True)}
-        elif len(new):
-            rows = {name: values[new] for name, values in embedding.items()}
-            scores = change_scores(self.detector, selected(pairs, new), rows)
-            self._scores |= {keys[tile]: score for tile, score in zip(new, scores, strict=True)}
+        new = pairs.observed & [key not in self._scores for key in keys]
+        if new.any():
+            scores = change_scores(self.detector, replace(pairs, observed=new), embedding)
+            self._scores |= {keys[tile]: scores[tile] for tile in np.flatnonzero(new)}
         change = np.full(len(keys), np.nan, np.float32)
-        change[observed] = [self._scores[keys[tile]] for tile in observed]
+        for tile in np.flatnonzero(pairs.observed):
+            change[tile] = self._scores[keys[tile]]
         return change
 
 

@@ -14,9 +14,11 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 import torch
+from rich.console import Group
+from rich.table import Table
 
 from worker.benchmarks.baselines import CloudToCloud
-from worker.benchmarks.documents import Document, pose_spread, spread
+from worker.benchmarks.documents import Document, pose_spread, shown, spread, titled_table
 from worker.benchmarks.methods import TileScore, change_scores, encode_reference, open_model, tile_scores
 from worker.benchmarks.tiles import selected
 from worker.benchmarks.timing import StageClock, machine
@@ -190,3 +192,37 @@ def ways(pairs: TilePairs, detector: Detector) -> dict[str, Callable[[], TileSco
 def resized(pairs: TilePairs, count: int) -> TilePairs:
     """Return `count` observed pairs, the first ones or some twice."""
     return selected(pairs, np.resize(np.flatnonzero(pairs.observed), count))
+
+
+def tables(figures: Document) -> Group:
+    """Show the seconds of each stage and each way of scoring on a terminal."""
+    scene, poses = figures["scene"], figures["map_poses"]
+    title = f"{scene['scans']} scans of {scene['points_per_scan']:,} points, {scene['tiles']} tiles"
+    stages = titled_table(title, "stage", "map", "survey, drifted prior", "survey, no prior")
+    columns = [figures["map"], figures["survey_with_prior"], figures["survey_without_prior"]]
+    names = dict.fromkeys(
+        name for column in columns for name, value in column.items() if isinstance(value, float)
+    )
+    for name in [*(name for name in names if name != "total"), "total"]:
+        stages.add_row(name, *(shown(column.get(name), ".2f") for column in columns))
+    return Group(
+        stages,
+        _scoring_table(figures["network"]),
+        f"scans placed: {poses['accepted']} of {poses['of']}, off by {poses['centimetres']['median']:.1f} cm "
+        f"(most {poses['centimetres']['most']:.1f}) and {poses['degrees']['median']:.2f} degrees "
+        f"(most {poses['degrees']['most']:.2f})",
+        f"peak memory {figures['peak_memory_mb']} MB",
+    )
+
+
+def _scoring_table(scoring: Document) -> Table:
+    title = f"{scoring['tiles']} tiles, {scoring['distinct_points_per_tile']} distinct points each"
+    table = titled_table(title, "scoring", "seconds (median)", "least to most", "times C2C")
+    names = {"c2c": "C2C by k-d tree", "uncached": "detector", "cached": "detector, map encoded before"}
+    for name, seconds in scoring["seconds"].items():
+        least_to_most = f"{seconds['least']:.2f} to {seconds['most']:.2f}"
+        ratio = f"{scoring['times_c2c'][name]:.1f}"
+        table.add_row(names[name], f"{seconds['median']:.2f}", least_to_most, ratio)
+    difference = scoring["largest_score_difference"]
+    table.caption = f"largest difference between the detector's scores: {difference:.1e}"
+    return table

@@ -12,7 +12,7 @@ import numpy as np
 from rich.console import Group
 from rich.table import Table
 
-from worker.benchmarks.documents import Document, write_bytes, write_json
+from worker.benchmarks.documents import Document, shown, titled_table, write_bytes, write_json
 from worker.benchmarks.paper.benchmark import MethodResult, PaperResult
 from worker.benchmarks.paper.experiments import published
 from worker.benchmarks.paper.figures import pictures
@@ -139,12 +139,12 @@ def tables(figures: Document) -> Group:
     """Show Tables 5 and 6 on a terminal, with the paper's figures beside ours."""
     threshold = figures["thresholds"]["validation"]
     return Group(
-        _shown(
+        _table(
             f"Table 5: {figures['model']} above {threshold:.2f}, chosen on another corridor",
             _table_5(figures),
             total=True,
         ),
-        _shown(
+        _table(
             "Table 6: all experiments; in brackets at the threshold that is best on them, as the paper's",
             _table_6(figures),
         ),
@@ -188,18 +188,15 @@ def _summary(figures: Document) -> str:
     return f"F1 by kind: {kinds}; {figures['map']['tiles']} tiles, {figures['seconds']:.0f} s{left_out}"
 
 
-def _shown(title: str, rows: Rows, *, total: bool = False) -> Table:
-    table = Table(title=title, title_justify="left", title_style="bold")
-    for number, column in enumerate(rows[0]):
-        table.add_column(column, justify="right" if number else "left")
+def _table(title: str, rows: Rows, *, total: bool = False) -> Table:
+    table = titled_table(title, *rows[0])
     for number, row in enumerate(rows[1:], start=1):
         table.add_row(*row, style="bold" if total and number == len(rows) - 1 else "")
     return table
 
 
 def _ratio(value: float | None) -> str:
-    """Write two decimals, a dash where there is none."""
-    return "-" if value is None else f"{value:.2f}"
+    return shown(value, ".2f", missing="-")
 
 
 def write_report(result: PaperResult, figures: Document, folder: Path) -> Path:

@@ -12,7 +12,7 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 
 from worker.benchmarks import plots
-from worker.benchmarks.documents import Document
+from worker.benchmarks.documents import Document, shown, titled_table
 from worker.benchmarks.plots import FOUND, INK, MISSED, WRONG
 from worker.benchmarks.registration.assessment import Assessment
 from worker.benchmarks.registration.scenarios import Scenario
@@ -35,16 +35,9 @@ def tables(result: Document) -> Group:
     return Group(*parts)
 
 
-def _titled(title: str, *columns: str) -> Table:
-    table = Table(title=title, title_justify="left", title_style="bold", show_header=bool(columns))
-    for number, column in enumerate(columns):
-        table.add_column(column, justify="right" if number else "left")
-    return table
-
-
 def _scenario(row: Document, paper: Document) -> Table:
     report, seconds = row["report"], row["seconds"]
-    table = _titled(f"{row['scenario']}, seed {row['seed']}", "", "measured", "the paper")
+    table = titled_table(f"{row['scenario']}, seed {row['seed']}", "", "measured", "the paper")
     table.add_row(
         "scans placed", f"{row['accepted']} of {row['of']}", f"{paper['accepted']} of {paper['scans']}"
     )
@@ -101,7 +94,7 @@ def _calibration(row: Document) -> str:
 
 def _baseline(row: Document) -> Table:
     distances = ", ".join(f"{100 * distance:g}" for distance in row["gates"])
-    table = _titled(f"the Open3D baseline on the drifted scans, correspondences within {distances} cm")
+    table = titled_table(f"the Open3D baseline on the drifted scans, correspondences within {distances} cm")
     seconds, truth = row["seconds"], row["to_the_truth"]
     run = f"{row['pairs_run']} of {row['pairs_possible']} pairs run, {row['processor_seconds']:.0f} s of processors"
     extrapolated = "; the time of the others extrapolated" if row["pairs_run"] < row["pairs_possible"] else ""
@@ -127,7 +120,7 @@ def _apart(row: Document) -> str:
 
 
 def _survey(row: Document) -> Table:
-    table = _titled(f"one scan of {row['points']:,} points on a warm map of {row['map_points']:,}")
+    table = titled_table(f"one scan of {row['points']:,} points on a warm map of {row['map_points']:,}")
     times = f"{row['register_seconds']:.2f} ({row['register_least']:.2f} to {row['register_most']:.2f})"
     table.add_row("seconds to register, median (least to most)", times)
     table.add_row("seconds of processors, reading too", f"{row['processor_seconds']:.2f}")
@@ -137,7 +130,7 @@ def _survey(row: Document) -> Table:
 
 
 def _real(real: Document) -> Table:
-    table = _titled(
+    table = titled_table(
         "real scans, no priors", "scans", "joined", "to the given transform", "fitness", "RMSE", "seconds"
     )
     for row in real["pairs"]:
@@ -156,12 +149,9 @@ def _real(real: Document) -> Table:
 
 
 def _quality(row: Document) -> tuple[str, str, str]:
-    fitness, rmse = row.get("fitness"), row.get("rmse_centimetres")
-    return (
-        "" if fitness is None else f"{fitness:.2f}",
-        "" if rmse is None else f"{rmse:.1f} cm",
-        f"{row['seconds']:.1f}",
-    )
+    fitness = shown(row.get("fitness"), ".2f")
+    rmse = row.get("rmse_centimetres")
+    return fitness, "" if rmse is None else f"{rmse:.1f} cm", f"{row['seconds']:.1f}"
 
 
 def draw_run(folder: Path, scenario: Scenario, seed: int, built: BuiltMap, assessment: Assessment) -> None:

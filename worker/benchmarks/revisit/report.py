@@ -12,7 +12,7 @@ from rich.console import Group
 from rich.table import Table
 
 from worker.benchmarks import plots
-from worker.benchmarks.documents import Document
+from worker.benchmarks.documents import Document, shown, titled_table
 from worker.benchmarks.methods import TileScore
 from worker.benchmarks.plots import FOUND, MISSED, QUIET, WRONG, ScoredTiles, TileStyle
 from worker.benchmarks.revisit.measures import Measured, TileTable
@@ -48,13 +48,10 @@ def _methods(result: Document) -> Table:
         f"{there['visits']} visits, {there['without_change']} of them without a change: "
         f"{there['observed']} of {there['tiles']} tiles observed, {there['changed']['counted']} of them changed"
     )
-    table = Table(title=title, title_justify="left", title_style="bold")
-    table.add_column("method")
-    for column in (
-        "F1 (95%)", "precision", "recall", "false alarms", "quiet visits alarmed", "threshold",
+    table = titled_table(
+        title, "method", "F1 (95%)", "precision", "recall", "false alarms", "quiet visits alarmed", "threshold",
         "test-optimal: F1", "threshold", "ROC area", "AP", "seconds",
-    ):  # fmt: skip
-        table.add_column(column, justify="right")
+    )  # fmt: skip
     for row in result["methods"]:
         table.add_row(row["name"], *_row(row))
     chosen = result["validation"]
@@ -69,13 +66,13 @@ def _row(row: Document) -> tuple[str, ...]:
     chosen, best = row["chosen"], row["best"]
     low, high = chosen["f1_interval"]
     return (
-        f"{_share(chosen['f1'], 2)} ({low:.2f}-{high:.2f})",
-        _share(chosen["precision"], 2),
-        _share(chosen["recall"], 2),
-        _percent(chosen["false_positive_rate"]),
+        f"{shown(chosen['f1'], '.2f')} ({low:.2f}-{high:.2f})",
+        shown(chosen["precision"], ".2f"),
+        shown(chosen["recall"], ".2f"),
+        shown(chosen["false_positive_rate"], ".1%"),
         f"{row['unchanged_visits_with_false_alarm']} of {row['unchanged_visits']}",
         f"{chosen['threshold']:.3g}",
-        _share(best["f1"], 2),
+        shown(best["f1"], ".2f"),
         f"{best['threshold']:.3g}",
         f"{row['area_under_roc']:.3f}",
         f"{row['average_precision']:.3f}",
@@ -85,10 +82,7 @@ def _row(row: Document) -> tuple[str, ...]:
 
 def _groups(result: Document) -> Table:
     methods = result["methods"]
-    table = Table(title="changes found; false alarms", title_justify="left", title_style="bold")
-    table.add_column("tiles")
-    for row in methods:
-        table.add_column(row["name"], justify="right")
+    table = titled_table("changes found; false alarms", "tiles", *(row["name"] for row in methods))
     for by, title in TITLES.items():
         table.add_section()
         table.add_row(f"[bold]{title}")
@@ -104,7 +98,7 @@ def _cell(counts: Document) -> str:
     changed = counts["true_positives"] + counts["false_negatives"]
     words = [f"{counts['true_positives']} of {changed}"] if changed else []
     if counts["false_positive_rate"] is not None:
-        words.append(_percent(counts["false_positive_rate"]))
+        words.append(shown(counts["false_positive_rate"], ".1%"))
     return "; ".join(words)
 
 
@@ -124,14 +118,6 @@ def _notes(there: Document) -> list[str]:
             f"worst {off['worst']:.1f} cm"
         )
     return lines
-
-
-def _share(value: float | None, digits: int) -> str:
-    return "" if value is None else f"{value:.{digits}f}"
-
-
-def _percent(value: float | None) -> str:
-    return "" if value is None else f"{value:.1%}"
 
 
 def draw(folder: Path, methods: Sequence[Measured], table: TileTable, visits: Sequence[Revisit]) -> None:
