@@ -4,9 +4,9 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 
-.PHONY: help demo up test check format bench openapi clean
+.PHONY: help demo up test test-fast check format bench openapi clean
 help: ## this list
-	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
+	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
 
 demo: $(INSTALLED) ## simulate a building, run the whole service on it, show what changed
 	$(BIN)/spicd-worker demo
@@ -14,10 +14,13 @@ demo: $(INSTALLED) ## simulate a building, run the whole service on it, show wha
 up: $(INSTALLED) ## start the service to stay: API, workers, embedded Redis
 	$(BIN)/spicd up
 
-test: $(INSTALLED) ## every test
-	$(BIN)/pytest
+test: $(INSTALLED) ## every test, on all cores
+	$(BIN)/pytest -n auto --dist loadscope
 
-check: $(INSTALLED) ## ruff and mypy
+test-fast: $(INSTALLED) ## the tests that take no longer than a second or so: under a minute on two cores
+	$(BIN)/pytest -m fast -n auto --dist loadscope
+
+check: $(INSTALLED) ## ruff and mypy, tests and examples included
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -64,9 +66,39 @@ def test_every_file_of_ours_that_a_page_names_exists(page: Path) -> None:
     assert [name for name in named if not (ROOT / name).exists()] == []
 
 
-def test_the_readme_names_targets_that_make_has() -> None:
-    targets = set(re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
-    assert set(re.findall(r"(?:^|`)make ([a-z]+)", (ROOT / "README.md").read_text(), re.MULTILINE)) <= targets
+def test_every_page_is_reached_from_the_readme_by_links() -> None:
+    reached: set[Path] = set()
+    waiting = [ROOT / "README.md"]
+    while waiting:
+        page = waiting.pop()
+        if page not in reached:
+            reached.add(page)
+            waiting += linked_pages(page)
+    assert set(PAGES) - reached == set()
+
+
+def linked_pages(page: Path) -> Iterator[Path]:
+    """Yield the pages that a page links to; a link to a folder leads to all of its pages."""
+    for link in re.findall(r"\]\((?!https?://|#)([^)#\s]+)", page.read_text()):
+        target = (page.parent / link).resolve()
+        yield from target.glob("*.md") if target.is_dir() else [target] * (target.suffix == ".md")
+
+
+@pytest.mark.parametrize("page", ["README.md", "CONTRIBUTING.md"])
+def test_a_page_names_targets_that_make_has(page: str) -> None:
+    targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+    assert set(re.findall(r"(?:^|`)make ([a-z-]+)", (ROOT / page).read_text(), re.MULTILINE)) <= targets
+
+
+def test_the_real_scans_are_those_of_the_page(shared_data: Path) -> None:
+    page = (ROOT / "docs/test-data.md").read_text()
+    listed = dict(re.findall(r"^\| `([^`]+)` \| `([0-9a-f]{64})` \|$", page, re.MULTILINE))
+    present = {
+        path.relative_to(shared_data).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in shared_data.rglob("*")
+        if path.is_file() and path.parent != shared_data
+    }
+    assert present.items() <= listed.items()
 
 
 def codes(kind: type[Exception]) -> set[str]:

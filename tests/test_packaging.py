@@ -75,7 +75,41 @@ def test_the_worker_and_evaluate_extras_add_what_only_the_worker_imports() -> No
 def test_every_requirement_is_pinned_to_a_version_that_it_admits() -> None:
     pinned = pins()
     wanted = requirements("worker", "evaluate", "dev")
-    assert {name for name, each in wanted.items() if not each.specifier.contains(pinned[name])} == set()
+    assert {name for name, needed in wanted.items() if not needed.specifier.contains(pinned[name])} == set()
+
+
+def test_the_licence_is_named_as_pep_639_has_it_and_its_file_is_there() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert project["license"] == "MIT"
+    assert project["authors"] == [{"name": "SPICD contributors"}]
+    for name in project["license-files"]:
+        assert "SPICD contributors" in (ROOT / name).read_text()
+
+
+def test_the_hosted_ci_calls_the_commands_of_our_own_on_the_oldest_python() -> None:
+    job = yaml.safe_load((ROOT / ".github/workflows/ci.yml").read_text())["jobs"]["all"]
+    ours = [line for line in (ROOT / ".ci/run").read_text().splitlines() if line.startswith("make ")]
+    assert [step["run"] for step in job["steps"] if step.get("run", "").startswith("make ")] == ours
+    assert ours == ["make check", "make test"]
+    oldest = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["requires-python"]
+    (version,) = (step["with"]["python-version"] for step in job["steps"] if "python" in step.get("uses", ""))
+    assert oldest == f">={version}"
+
+
+def test_pre_commit_runs_what_make_check_runs() -> None:
+    (repo,) = yaml.safe_load((ROOT / ".pre-commit-config.yaml").read_text())["repos"]
+    assert repo["repo"] == "local"  # nothing is fetched
+    commands = [hook["entry"].replace(".venv/bin/", "$(BIN)/") for hook in repo["hooks"]]
+    assert commands == recipe("check")
+    assert {hook["language"] for hook in repo["hooks"]} == {"system"}
+    assert not any(hook["pass_filenames"] for hook in repo["hooks"])
+
+
+def recipe(target: str) -> list[str]:
+    """Return the commands of a target of the Makefile."""
+    rule = re.search(rf"^{target}:.*\n((?:\t.*\n)+)", (ROOT / "Makefile").read_text(), re.MULTILINE)
+    assert rule is not None
+    return [line.strip() for line in rule[1].splitlines()]
 
 
 def test_the_files_that_a_package_brings_beside_its_modules_are_there() -> None:

@@ -14,12 +14,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.acceptance.conftest import MODEL, Service, Visits
+from examples import client as example
+from service.client import Client
+from tests.support.running_service import Service
+from tests.support.two_visits import Visits
 from worker.cloud.formats.scan import read_scan
 from worker.cloud.poses import difference
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="looks for processes in /proc")
 
+MODEL = "spicd-net/1"
 STATES = ("unchanged", "changed", "inconsistent", "unobserved")
 
 
@@ -180,6 +184,20 @@ def test_the_map_has_a_cloud_and_the_survey_a_picture(service: Service, survey: 
     assert picture.content.startswith(b"\x89PNG\r\n\x1a\n")
     width, height = (int.from_bytes(picture.content[at : at + 4]) for at in (16, 20))
     assert min(width, height) > 300
+
+
+def test_the_example_of_the_client_prints_the_changed_tiles(
+    service: Service, visits: Visits, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (before, _), (after, _), *_ = visits.first
+    with Client(service.url) as client:
+        example.main(client, before, after)
+        (surveyed,) = (job for job in client.jobs()[:1])
+        changes = client.changes(surveyed["map_id"])["features"]
+    printed = capsys.readouterr().out.splitlines()
+    assert [line for line in printed if line.startswith("100 ")]
+    tiles = [feature["properties"]["tile_id"] for feature in changes]
+    assert [line.split()[0] for line in printed if line.startswith("tile_")] == tiles
 
 
 def test_a_survey_of_a_foreign_place_fails_with_its_numbers(

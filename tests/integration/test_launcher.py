@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +20,8 @@ from service.settings import Settings
 from service.up.children import WorkerPool
 from service.up.embedded_redis import LaunchFailed
 from service.up.launcher import environment_of, up
+from tests.support.processes import descendants, running, until
 
-LAUNCH = Path(__file__).parent / "launch.py"
 ROOT = Path(__file__).parents[2]
 
 # A worker that ends by itself, and one that does not listen to SIGTERM.
@@ -34,37 +34,19 @@ time.sleep(60)
 """
 
 
-def until(condition: Callable[[], object], seconds: float = 30) -> None:
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, "waited too long"
-        time.sleep(0.02)
-
-
-def stat(pid: int) -> list[str]:
-    """State, parent and the rest of /proc/PID/stat; a process that is gone is a zombie of nobody."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    except (FileNotFoundError, ProcessLookupError):
-        return ["Z", "0"]
-
-
-def alive(pid: int) -> bool:
-    return stat(pid)[0] != "Z"
-
-
-def descendants(pid: int) -> list[int]:
-    every = [int(path.name) for path in Path("/proc").iterdir() if path.name.isdigit()]
-    children = [other for other in every if stat(other)[1] == str(pid)]
-    return children + [deeper for child in children for deeper in descendants(child)]
-
-
 class Launched:
     """A running `spicd up`, everything it said, and every process it started."""
 
     def __init__(self, folder: Path, workers: int) -> None:
         ready = folder / "ready.json"
-        command = [sys.executable, str(LAUNCH), str(folder / "data"), str(ready), str(workers)]
+        command = [
+            sys.executable,
+            "-m",
+            "tests.support.launch",
+            str(folder / "data"),
+            str(ready),
+            str(workers),
+        ]
         environment = {key: value for key, value in os.environ.items() if not key.startswith("SPICD_")}
         self.process = subprocess.Popen(command, cwd=ROOT, env={**environment, "PYTHONPATH": str(ROOT)})
         until(lambda: ready.exists() or self.process.poll() is not None)
@@ -77,7 +59,7 @@ class Launched:
         client.close()
 
     def pids(self) -> list[int]:
-        return descendants(self.process.pid)
+        return list(descendants(self.process.pid))
 
 
 @pytest.fixture
@@ -113,7 +95,7 @@ def test_asked_to_end_it_leaves_no_process_behind(launched: Launched, how: signa
     assert len(pids) == 3
     launched.process.send_signal(how)
     assert launched.process.wait(20) == 0
-    assert not [pid for pid in pids if alive(pid)]
+    assert not [pid for pid in pids if running(pid)]
 
 
 @linux
@@ -122,7 +104,7 @@ def test_killed_it_leaves_no_process_behind(launched: Launched) -> None:
     pids = launched.pids()
     assert len(pids) == 3
     launched.process.kill()
-    until(lambda: not [pid for pid in pids if alive(pid)])
+    until(lambda: not [pid for pid in pids if running(pid)])
 
 
 def test_a_second_one_on_the_same_folder_is_refused_in_one_line(launched: Launched, tmp_path: Path) -> None:
@@ -172,7 +154,7 @@ def test_a_dead_redis_is_started_again_with_what_it_held(launched: Launched) -> 
     client = Redis.from_url(launched.ready["redis_url"])
     client.set("kept", "yes")
     os.kill(launched.ready["redis_pid"], signal.SIGTERM)
-    until(lambda: not alive(launched.ready["redis_pid"]))
+    until(lambda: not running(launched.ready["redis_pid"]))
 
     def kept() -> bool:
         try:

@@ -8,6 +8,7 @@ import signal
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from fastapi.testclient import TestClient
@@ -15,11 +16,13 @@ from sqlalchemy import select
 
 from service.api.app import create_app
 from service.catalog import tables
+from service.catalog.steps import Queue
 from service.up.embedded_redis import EmbeddedRedis
-from tests.support.bench import Bench, add_map, running, until
+from tests.support.bench import Bench, add_map
+from tests.support.processes import running, until
 from tests.support.samples import catalog_of, settings_in
 
-STEPS = (("hold", "geometry"), ("finish", "geometry"))
+STEPS: tuple[tuple[str, Queue], ...] = (("hold", "geometry"), ("finish", "geometry"))
 
 
 class Service:
@@ -32,7 +35,7 @@ class Service:
         self.bench = Bench(folder, self.redis.url, self.settings.resolved_database_url())
         self.open_api()
 
-    def open_api(self, steps: tuple[tuple[str, str], ...] = STEPS) -> None:
+    def open_api(self, steps: tuple[tuple[str, Queue], ...] = STEPS) -> None:
         self.queue = self.bench.queue(*steps)
         self.api = TestClient(create_app(self.settings, queue=self.queue))
         self.api.__enter__()
@@ -45,12 +48,13 @@ class Service:
         self.queue.submit(job_id, "map")
         return job_id
 
-    def job(self, job_id: str) -> dict[str, object]:
-        return self.api.get(f"/jobs/{job_id}").json()
+    def job(self, job_id: str) -> dict[str, Any]:
+        document: dict[str, Any] = self.api.get(f"/jobs/{job_id}").json()
+        return document
 
     def attempts(self, job_id: str) -> int:
         with catalog_of(self.api).database.read() as session:
-            return session.scalar(select(tables.Job.attempts).where(tables.Job.id == job_id))
+            return session.scalars(select(tables.Job.attempts).where(tables.Job.id == job_id)).one()
 
     def await_end(self, job_id: str, status: str = "successful") -> None:
         until(lambda: self.job(job_id)["status"] in ("successful", "failed"))

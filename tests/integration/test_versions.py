@@ -17,7 +17,7 @@ from worker.cloud.tiling import Tiles, inside_tiles, tile_id
 from worker.cloud.types import Indices, Points
 from worker.jobs import versions
 from worker.pipeline import archive
-from worker.pipeline.flow import NoScanAccepted
+from worker.pipeline.flow import NoScanAccepted, build_map
 from worker.pipeline.map_update import without
 from worker.pipeline.registration.results import RegisteredScan
 
@@ -76,8 +76,8 @@ def changed(house: House, survey_id: str) -> Indices:
 
 def test_the_first_version_tells_how_its_scans_were_registered(house: House) -> None:
     first = version(house, 1)
-    found = house.catalog.maps.get(MAP)
-    assert first.registration == found.registration is not None
+    assert first.registration is not None
+    assert first.registration == house.catalog.maps.get(MAP).registration
     assert (first.registration["scans"], first.registration["accepted"]) == (2, 2)
     ids = [scan.scan_id for scan in first.scans]
     assert first.registration["reference"] in ids
@@ -210,7 +210,7 @@ def test_a_build_that_is_killed_goes_on_from_its_pairs_and_leaves_none_behind(
     house: House, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     remembered: list[int] = []
-    real = versions.build_map
+    real = build_map
 
     def build(files: Any, *, pairs: Any, **more: Any) -> Any:
         remembered.append(len(list(pairs.load())))

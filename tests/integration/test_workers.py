@@ -6,16 +6,19 @@ import os
 import signal
 import subprocess
 import sys
+from typing import Any
 from unittest.mock import Mock
 
 import pytest
 from rq import Queue
 from rq.serializers import JSONSerializer
 
+from service.catalog import steps
 from service.catalog.catalog import open_catalog
 from service.settings import Settings
 from service.up.launcher import environment_of
-from tests.support.bench import ROOT, Bench, add_map, running, until
+from tests.support.bench import ROOT, STANDIN, Bench, add_map
+from tests.support.processes import running, until
 from worker.rq_workers import GeometryWorker
 
 
@@ -51,7 +54,7 @@ def test_a_dismissed_step_is_killed_and_the_worker_goes_on(bench: Bench) -> None
 
 
 @pytest.mark.parametrize("kind", ["geometry", "inference"])
-def test_a_function_that_is_not_ours_is_refused_and_never_called(bench: Bench, kind: str) -> None:
+def test_a_function_that_is_not_ours_is_refused_and_never_called(bench: Bench, kind: steps.Queue) -> None:
     trace = bench.folder / "trace"
     worker = bench.worker(kind)
     queue = Queue(kind, connection=bench.redis, serializer=JSONSerializer)
@@ -66,7 +69,8 @@ def test_a_function_that_is_not_ours_is_refused_and_never_called(bench: Bench, k
 
 def test_a_callback_that_a_job_names_is_not_called(bench: Bench) -> None:
     queue = bench.submit("m1", ("first", "geometry"))
-    callback = {"success_callback_name": "standin.leak", "failure_callback_name": "standin.leak"}
+    leak = f"{STANDIN}.leak"
+    callback: dict[Any, Any] = {"success_callback_name": leak, "failure_callback_name": leak}
     bench.redis.hset("rq:job:m1-first", mapping=callback)
     queue.submit("m2", "map")
     bench.worker("geometry")
@@ -86,7 +90,7 @@ def test_a_stop_that_comes_when_the_step_is_over_kills_nobody(
 
 
 @pytest.mark.parametrize("kind", ["geometry", "inference"])
-def test_a_step_that_takes_too_long_is_ended_and_says_so(bench: Bench, kind: str) -> None:
+def test_a_step_that_takes_too_long_is_ended_and_says_so(bench: Bench, kind: steps.Queue) -> None:
     worker = bench.worker(kind)
     bench.submit("m1", ("busy", kind), timeout_s=1)
     bench.wait_for("died m1 timed_out")
@@ -126,6 +130,5 @@ def test_a_working_inference_worker_keeps_its_claim_alive(bench: Bench) -> None:
     bench.worker("inference")
     bench.submit("m1", ("busy", "inference"))
     until(lambda: bench.redis.zcard("rq:wip:inference") == 1)
-    claim = bench.redis.zrange("rq:wip:inference", 0, -1)[0]
-    begin = bench.redis.zscore("rq:wip:inference", claim)
-    until(lambda: bench.redis.zscore("rq:wip:inference", claim) > begin)
+    ((claim, begin),) = bench.claims("inference").items()
+    until(lambda: bench.claims("inference")[claim] > begin)

@@ -231,6 +231,7 @@ def test_a_start_sweeps_what_a_killed_process_left_and_no_upload_of_today(settin
 
 def test_every_real_scan_is_taken_by_its_first_bytes_sound_or_not(client, shared_data):
     """Whether it can be read is for the job to say; only what names neither format is refused here."""
+    assert (shared_data / "formats/pypcd4/ascii_empty.pcd").read_bytes() == b""
     refused = []
     for path in sorted((shared_data / "formats").rglob("*.p[lc][yd]")):
         head = path.read_bytes()[:300]

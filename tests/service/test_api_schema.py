@@ -98,6 +98,7 @@ def test_uploads_describe_their_body(document):
     }
 
 
+@pytest.mark.slow
 def test_importing_the_api_brings_neither_torch_nor_the_worker():
     import subprocess
     import sys

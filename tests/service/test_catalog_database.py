@@ -32,6 +32,7 @@ def test_the_migrations_make_the_tables_that_the_code_expects(tmp_path):
         assert compare_metadata(MigrationContext.configure(connection), Base.metadata) == []
 
 
+@pytest.mark.slow
 def test_three_processes_may_upgrade_one_new_database_at_once(tmp_path):
     context = multiprocessing.get_context("spawn")
     processes = [context.Process(target=open_and_ping, args=(url(tmp_path),)) for _ in range(3)]

@@ -6,32 +6,18 @@ import hashlib
 import os
 import subprocess
 import sys
-import time
-from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from redis import Redis
 
 from service.catalog.catalog import Catalog
-from service.catalog.steps import Step
+from service.catalog.steps import Queue, Step
 from service.queue import JobQueue
+from tests.support.processes import until
 
-STANDIN = Path(__file__).parent / "standin.py"
+STANDIN = "tests.support.standin"  #: the module of the workers and their steps
 ROOT = Path(__file__).parents[2]
-
-
-def until(condition: Callable[[], object], seconds: float = 20) -> None:
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, "waited too long"
-        time.sleep(0.02)
-
-
-def running(pid: int) -> bool:
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
-    except FileNotFoundError:
-        return False
 
 
 class Bench:
@@ -43,18 +29,18 @@ class Bench:
         self.workers: list[subprocess.Popen[bytes]] = []
 
     def worker(self, queue: str, grace: float = 5) -> subprocess.Popen[bytes]:
-        command = [sys.executable, str(STANDIN), queue, self.redis_url, str(self.folder), str(grace)]
-        environment = {**os.environ, "PYTHONPATH": str(ROOT), "STANDIN_CATALOG": self.catalog_url}
+        command = [sys.executable, "-m", STANDIN, queue, self.redis_url, str(self.folder), str(grace)]
+        environment = {**os.environ, "STANDIN_CATALOG": self.catalog_url}
         self.workers.append(subprocess.Popen(command, env=environment, cwd=ROOT, start_new_session=True))
         return self.workers[-1]
 
-    def submit(self, job_id: str, *steps: tuple[str, str], timeout_s: int = 60) -> JobQueue:
+    def submit(self, job_id: str, *steps: tuple[str, Queue], timeout_s: int = 60) -> JobQueue:
         queue = self.queue(*steps, timeout_s=timeout_s)
         queue.submit(job_id, "map")
         return queue
 
-    def queue(self, *steps: tuple[str, str], timeout_s: int = 60) -> JobQueue:
-        table = tuple(Step(name=name, function=f"standin.{name}", queue=queue) for name, queue in steps)
+    def queue(self, *steps: tuple[str, Queue], timeout_s: int = 60) -> JobQueue:
+        table = tuple(Step(name=name, function=f"{STANDIN}.{name}", queue=queue) for name, queue in steps)
         return JobQueue(self.redis_url, timeout_s=timeout_s, steps={"map": table})
 
     def record(self) -> list[str]:
@@ -74,10 +60,15 @@ class Bench:
         return [line.split()[0] for line in self.record()]
 
     def end_claims(self, queue: str) -> None:
-        """As if the minute were over in which a dead worker's claim still stands."""
-        claims = self.redis.zrange(f"rq:wip:{queue}", 0, -1)
+        """Let the minute be over in which a dead worker's claim still stands."""
+        claims = self.claims(queue)
         assert claims
         self.redis.zadd(f"rq:wip:{queue}", dict.fromkeys(claims, 1))
+
+    def claims(self, queue: str) -> dict[str, float]:
+        """Return the steps that a worker has a claim on, and when (seconds) each claim ends."""
+        claims: Any = self.redis.zrange(f"rq:wip:{queue}", 0, -1, withscores=True)
+        return {claim.decode(): end for claim, end in claims}
 
 
 def add_map(catalog: Catalog, map_id: str = "lobby") -> str:

@@ -1,4 +1,7 @@
-"""`spicd up` with an API of one route, for tests of the launcher: `python launch.py DATA_DIR READY_FILE WORKERS`."""
+"""`spicd up` with an API of one route, for tests of the launcher.
+
+python -m tests.support.launch DATA_DIR READY_FILE WORKERS
+"""
 
 from __future__ import annotations
 

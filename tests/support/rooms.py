@@ -10,9 +10,8 @@ from worker.cloud.formats.scan import Scan
 from worker.cloud.types import Matrix4, Points
 from worker.cloud.voxels import Voxels
 from worker.detectors.detector import TileScores
-from worker.pipeline.registration.icp import Surface
-from worker.pipeline.registration.preprocessing import surface_of
 from worker.pipeline.registration.settings import RegistrationSettings
+from worker.pipeline.registration.surface import Surface, surface_of
 from worker.simulation.scenes import random_room
 from worker.simulation.sensor import SimulatedScan
 from worker.simulation.visits import visit
@@ -51,3 +50,9 @@ def simulated_room() -> Room:
 
 def scores_of(*rows: tuple[float, float, float]) -> TileScores:
     return TileScores(probabilities=np.array(rows, np.float32))
+
+
+def wall(x: float, *, y: tuple[float, float] = (-2.0, 2.0)) -> np.ndarray:
+    """4 m high, across the x axis, a point every 2 cm."""
+    across, up = np.meshgrid(np.arange(*y, 0.02), np.arange(-2, 2, 0.02))
+    return np.column_stack([np.full(across.size, x), across.ravel(), up.ravel()])

@@ -1,7 +1,9 @@
-"""A worker with steps of its own, for tests: `python standin.py geometry|inference REDIS_URL FOLDER [GRACE]`.
+"""A worker with steps of its own, for tests.
 
-What the steps did and how they ended stands in FOLDER/record, one line an event. Where STANDIN_CATALOG names a database,
-the steps begin and end their job there, and the worker tells it what it tells the catalog.
+    python -m tests.support.standin geometry|inference REDIS_URL FOLDER [GRACE]
+
+What the steps did and how they ended stands in FOLDER/record, one line an event. Where STANDIN_CATALOG names a
+database, the steps begin and end their job there, and the worker tells it what it tells the catalog.
 """
 
 from __future__ import annotations
@@ -115,7 +117,7 @@ def main() -> None:
     kind(
         queue,
         Redis.from_url(redis_url),
-        allowed=frozenset(f"standin.{name}" for name in FUNCTIONS),
+        allowed=frozenset(f"tests.support.standin.{name}" for name in FUNCTIONS),
         records=CatalogRecords(catalog) if (catalog := os.environ.get("STANDIN_CATALOG")) else Book(),
         grace_s=float(grace),
     ).work()

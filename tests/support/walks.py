@@ -11,8 +11,8 @@ from tests.support.rooms import as_scan
 from worker.cloud.formats.pcd import write_pcd
 from worker.cloud.poses import difference, inverse, transformed
 from worker.cloud.types import Matrix4, Points
-from worker.pipeline.mapping.settings import MapSettings, MultiScanSettings
-from worker.pipeline.mapping.tasks import Folder, thin
+from worker.pipeline.mapping.settings import JointRegistrationSettings, MapSettings
+from worker.pipeline.mapping.tasks import Folder, downsample
 from worker.pipeline.registration.preprocessing import prepare
 from worker.pipeline.registration.results import RegistrationResult, ScanFile, ScanResult
 from worker.pipeline.registration.settings import RegistrationSettings
@@ -21,13 +21,13 @@ from worker.simulation.sensor import SimulatedScan
 THIN = 3  #: every third point of a scan does here
 MANY = 1_000_000
 FREE = np.array([2.7, 1.45, 1.6])  #: metres, world frame: the emptiest place of the room
-#: without the slow part of the global search; plans are still asked
+#: without the slow part of the global search; BEV candidates are still asked
 QUICK = RegistrationSettings(max_iterations=12, search_resolutions=(0.3,), search_seeds=1)
 
 
-def placing(registration: RegistrationSettings = QUICK, **mapping: float) -> MultiScanSettings:
-    """Of these settings."""
-    return MultiScanSettings(
+def joint_settings(registration: RegistrationSettings = QUICK, **mapping: float) -> JointRegistrationSettings:
+    """Return these settings together, with some of the map's changed."""
+    return JointRegistrationSettings(
         registration=registration, mapping=MapSettings().model_copy(update=mapping), max_points=MANY
     )
 
@@ -91,15 +91,15 @@ def prepared_folder(root: Path, scans: Mapping[int, SimulatedScan]) -> tuple[Fol
     for number, scan in scans.items():
         ready = prepare(as_scan(scan.points[::THIN], name=f"{number}.pcd"), QUICK)
         ready.save(folder.path(number))
-        points[number] = thin(ready.surface.points)
+        points[number] = downsample(ready.surface.points)
     return folder, points
 
 
-def placement(outcome: ScanResult) -> RegistrationResult:
-    """Of a scan that must have been accepted."""
-    assert outcome.placement is not None, outcome.reason
+def registered(outcome: ScanResult) -> RegistrationResult:
+    """Return the registration of a scan that must have been accepted."""
+    assert outcome.registration is not None, outcome.reason
     assert outcome.reason is None
-    return outcome.placement
+    return outcome.registration
 
 
 def off(pose: Matrix4, truth: Matrix4) -> float:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from tests.acceptance.conftest import make_untrained
+from tests.support.models import make_untrained
 from worker.cloud.tiling import TileGrid
 from worker.demo.judgement import Verdict, grid_of, judge, placement_line, show_judgement
 from worker.demo.run import DemoSettings, run

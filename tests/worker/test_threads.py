@@ -29,6 +29,7 @@ def test_a_process_of_its_own_thread_gives_trees_and_libraries_one() -> None:
     assert told.stdout.split() == ["2", "1", "1", "1"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("module", ["worker.cli.main", "worker.__main__"])
 def test_neither_command_has_imported_torch_before_it_can_say_so(module: str) -> None:
     code = f"import sys, {module}; sys.exit(bool({{'torch', 'open3d'}} & set(sys.modules)))"

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.acceptance.conftest import make_untrained
+from tests.support.models import make_untrained
 from worker.benchmarks.plots import draw_curves
 from worker.cli import detect, main
 from worker.cloud.formats.pcd import write_pcd
@@ -66,6 +66,7 @@ def run(*words: str) -> int:
     return 0
 
 
+@pytest.mark.slow
 def test_detect_writes_features_a_cloud_and_a_picture_and_tells_where(
     files: tuple[str, str], store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -87,6 +88,7 @@ def test_detect_writes_features_a_cloud_and_a_picture_and_tells_where(
     assert Path(told["files"]["picture"]).read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.slow
 def test_detect_says_by_how_much_the_later_scan_was_off(
     files: tuple[str, str], store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -96,6 +98,7 @@ def test_detect_says_by_how_much_the_later_scan_was_off(
     np.testing.assert_allclose(undone, np.eye(4), atol=0.01)
 
 
+@pytest.mark.slow
 def test_every_seen_tile_is_changed_at_threshold_0_and_none_at_1(
     files: tuple[str, str], store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -110,6 +113,7 @@ def test_every_seen_tile_is_changed_at_threshold_0_and_none_at_1(
     assert changed["1"] == 0
 
 
+@pytest.mark.slow
 def test_more_reference_files_are_part_of_the_map(
     files: tuple[str, str], store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -187,6 +191,7 @@ def trainings(monkeypatch: pytest.MonkeyPatch) -> list[tuple[TrainSettings, Path
     return asked
 
 
+@pytest.mark.slow
 def test_train_simulates_the_set_that_is_not_there_and_trains_on_it(
     tmp_path: Path, trainings: list[tuple[TrainSettings, Path, Path]]
 ) -> None:

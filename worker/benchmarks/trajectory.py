@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from worker.cloud.poses import difference, inverse, transformed
+from worker.cloud.poses import difference, fit_poses, inverse, transformed
 from worker.cloud.types import Bools, Floats, Matrix4, Points
 from worker.pipeline.registration.results import RegistrationResult, ScanFile, ScanResult
 from worker.simulation.sensor import SimulatedScan
@@ -59,10 +59,10 @@ def placed_scans(
     """List the scans that were accepted, with their true poses in the map frame."""
     return tuple(
         PlacedScan(
-            points=scan.points, placement=outcome.placement, true=map_from_world @ scan.world_from_sensor
+            points=scan.points, placement=outcome.registration, true=map_from_world @ scan.world_from_sensor
         )
         for outcome, scan in zip(outcomes, scans, strict=True)
-        if outcome.placement
+        if outcome.registration
     )
 
 
@@ -88,7 +88,9 @@ def align(estimated: Sequence[Matrix4], true: Sequence[Matrix4]) -> Matrix4:
             break
         inliers = now
         chosen = np.flatnonzero(now).tolist()
-        true_from_estimated = fitted([estimated[scan] for scan in chosen], [true[scan] for scan in chosen])
+        true_from_estimated = fit_poses(
+            [estimated[scan] for scan in chosen], [true[scan] for scan in chosen], arm=ARM
+        )
     return true_from_estimated
 
 
@@ -97,18 +99,6 @@ def distances(true_from_estimated: Matrix4, estimated: Sequence[Matrix4], true: 
     moved = transformed(np.stack([pose[:3, 3] for pose in estimated]), true_from_estimated)
     off: Floats = np.linalg.norm(moved - np.stack([pose[:3, 3] for pose in true]), axis=1)
     return off
-
-
-def fitted(estimated: Sequence[Matrix4], true: Sequence[Matrix4]) -> Matrix4:
-    """Return true_from_estimated of least squares over all (Horn 1987, by singular values as Kabsch has it)."""
-    source, target = (np.concatenate([_tips(pose) for pose in poses]) for poses in (estimated, true))
-    middle_source, middle_target = source.mean(axis=0), target.mean(axis=0)
-    u, _, vt = np.linalg.svd((source - middle_source).T @ (target - middle_target))
-    mirrored = np.array([1.0, 1.0, np.sign(np.linalg.det(vt.T @ u.T))])
-    result = np.eye(4)
-    result[:3, :3] = vt.T @ np.diag(mirrored) @ u.T
-    result[:3, 3] = middle_target - result[:3, :3] @ middle_source
-    return result
 
 
 def _by_one_pose(estimated: Sequence[Matrix4], true: Sequence[Matrix4]) -> Matrix4:
@@ -120,9 +110,3 @@ def _by_one_pose(estimated: Sequence[Matrix4], true: Sequence[Matrix4]) -> Matri
 def _lower_median(off: Floats) -> float:
     """Return of two in the middle the lower: half of the poses have to agree, no more."""
     return float(np.sort(off)[(len(off) - 1) // 2])
-
-
-def _tips(pose: Matrix4) -> Floats:
-    """Return the place of a pose, and a point on each of its axes: (4, 3)"""
-    tips: Floats = pose[:3, 3] + np.vstack([np.zeros(3), ARM * pose[:3, :3].T])
-    return tips

@@ -91,15 +91,15 @@ def _titled(phase: str, progress: Progress) -> Progress:
 
 
 def _registration(outcome: ScanResult) -> dict[str, Any]:
-    placement = outcome.placement
-    sure = None if placement is None else placement.uncertainty
+    registration = outcome.registration
+    sigma = None if registration is None else registration.uncertainty
     return {
         "name": outcome.name,
-        "accepted": placement is not None,
+        "accepted": registration is not None,
         "fitness": outcome.fitness,
         "rmse": outcome.inlier_rmse,
-        "map_from_scan": None if placement is None else placement.map_from_scan.tolist(),
-        "translation_sigma": None if sure is None else sure.translation,
-        "rotation_sigma": None if sure is None else sure.rotation,
+        "map_from_scan": None if registration is None else registration.map_from_scan.tolist(),
+        "translation_sigma": None if sigma is None else sigma.translation,
+        "rotation_sigma": None if sigma is None else sigma.rotation,
         "reason": outcome.reason,
     }

@@ -34,13 +34,13 @@ def register_files(
 
     from worker.cloud.formats.scan import read_scan  # noqa: PLC0415
     from worker.cloud.poses import difference  # noqa: PLC0415
-    from worker.pipeline.mapping.settings import MapSettings, MultiScanSettings  # noqa: PLC0415
+    from worker.pipeline.mapping.settings import JointRegistrationSettings, MapSettings  # noqa: PLC0415
     from worker.pipeline.mapping.survey_registration import register_survey_scans  # noqa: PLC0415
-    from worker.pipeline.registration.preprocessing import ScanRejected, prepare  # noqa: PLC0415
-    from worker.pipeline.registration.results import ScanFile  # noqa: PLC0415
+    from worker.pipeline.registration.preprocessing import prepare  # noqa: PLC0415
+    from worker.pipeline.registration.results import ScanFile, ScanRejected  # noqa: PLC0415
     from worker.pipeline.registration.settings import RegistrationSettings  # noqa: PLC0415
 
-    settings = MultiScanSettings(
+    settings = JointRegistrationSettings(
         registration=RegistrationSettings(), mapping=MapSettings(), max_points=50_000_000
     )
     target = prepare(read_scan(reference), settings.registration).surface
@@ -48,23 +48,23 @@ def register_files(
     begun = time.perf_counter()
     (outcome,) = register_survey_scans([file], target, settings=settings)
     seconds = time.perf_counter() - begun
-    found = outcome.placement
-    if found is None:
+    registration = outcome.registration
+    if registration is None:
         raise ScanRejected(str(outcome.reason))
-    sure = found.uncertainty
+    sigma = registration.uncertainty
     result: dict[str, Any] = {
-        "reference_from_current": found.map_from_scan.tolist(),
-        "fitness": found.fitness,
-        "inlier_rmse": found.inlier_rmse,
-        "overlap": found.overlap,
-        "agreement": found.agreement,
-        "searched": found.searched,
-        "translation_sigma": None if sure is None else sure.translation,
-        "rotation_sigma": None if sure is None else sure.rotation,
+        "reference_from_current": registration.map_from_scan.tolist(),
+        "fitness": registration.fitness,
+        "inlier_rmse": registration.inlier_rmse,
+        "overlap": registration.overlap,
+        "agreement": registration.two_way_inlier_ratio,
+        "searched": registration.from_global_search,
+        "translation_sigma": None if sigma is None else sigma.translation,
+        "rotation_sigma": None if sigma is None else sigma.rotation,
         "seconds": seconds,
     }
     if truth is not None:
-        metres, radians = difference(np.loadtxt(truth), found.map_from_scan)
+        metres, radians = difference(np.loadtxt(truth), registration.map_from_scan)
         result["error"] = {"metres": metres, "degrees": float(np.degrees(radians))}
     if as_json:
         terminal.print_json(result)
@@ -76,7 +76,7 @@ def _table(result: dict[str, Any]) -> Table:
     table = Table(show_header=False)
     table.add_row("fitness", f"{result['fitness']:.3f}")
     table.add_row("inlier RMSE", f"{result['inlier_rmse'] * 100:.1f} cm")
-    table.add_row("agreement", f"{result['agreement']:.2f} over {result['overlap']:.0%} of the scan")
+    table.add_row("inlier ratio", f"{result['agreement']:.2f} over {result['overlap']:.0%} of the scan")
     table.add_row("start", "global search" if result["searched"] else "as given, or identity")
     if "error" in result:
         error = result["error"]

@@ -17,7 +17,7 @@ WIDER = 3.0  #: times the radius
 
 
 def estimate_normals(points: NDArray[Any], *, radius: float, max_neighbors: int) -> Normals:
-    """Unit normals (N, 3) of points (N, 3), from at most `max_neighbors` within `radius` metres.
+    """Estimate unit normals (N, 3) of points (N, 3), metres, from at most `max_neighbors` within `radius` metres.
 
     Where fewer than `SPARSE` lie so near, the radius is three times as wide: five metres away a standing
     scanner leaves 15 cm between its points, and three of them make no plane but noise, which drags ICP metres

@@ -49,7 +49,7 @@ class Voxels:
 
     @staticmethod
     def keys_of(points: NDArray[Any], *, size: float) -> NDArray[np.int64]:
-        """(N,) packed index of the cell that each point (N, 3) lies in; raises MapFailed as `of` does."""
+        """Return (N,) the packed index of the cell that each point (N, 3) lies in; raises MapFailed as `of` does."""
         cells = np.floor(points / size).astype(np.int64) + (1 << (_BITS - 1))
         if len(cells) and (cells.min() < 0 or cells.max() >> _BITS):
             farthest = float(np.abs(points).max()) / 1000
@@ -58,7 +58,7 @@ class Voxels:
         return keys
 
     def merged(self, other: Voxels) -> Voxels:
-        """Both together; colours are kept only where both have them."""
+        """Add both; colours are kept only where both have them."""
         width = min(self.sums.shape[1], other.sums.shape[1])
         return _summed(
             self.size,

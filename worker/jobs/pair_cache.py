@@ -19,7 +19,7 @@ log = logging.getLogger(__name__)
 
 
 class KeptPairs:
-    """A `worker.pipeline.mapping.pair_registration.PairMemory` among the files of a map, which go when it is saved.
+    """A `worker.pipeline.mapping.pair_registration.PairCache` among the files of a map, which go when it is saved.
 
     Each write is a blob of its own, under a name that nobody else takes: it is seen whole or not at all, and a worker that
     was thought dead and still writes does no harm.

@@ -11,7 +11,7 @@ import numpy as np
 from service.catalog.records import ScanOutcome
 from worker.jobs.step import Context, put
 from worker.pipeline import archive
-from worker.pipeline.registration.results import RegisteredScan, ScanFile, ScanResult, placed
+from worker.pipeline.registration.results import RegisteredScan, ScanFile, ScanResult, read_registered
 
 
 def scan_files(at: Context, scans: Sequence[ScanOutcome], stack: ExitStack) -> list[ScanFile]:
@@ -41,8 +41,8 @@ def save_scans(
     """Keep the points of every accepted scan; one file is read at a time."""
     for done, (each, file, outcome) in enumerate(zip(scans, files, outcomes, strict=True)):
         at.report("saving", done / len(scans))
-        if outcome.placement is not None:
-            scan = placed(file, outcome.placement, max_points=at.settings.max_scan_points)
+        if outcome.registration is not None:
+            scan = read_registered(file, outcome.registration, max_points=at.settings.max_scan_points)
             put(at, key_of(each.scan_id), functools.partial(archive.save_scan, scan=scan))
 
 
@@ -53,8 +53,8 @@ def kept_scan(at: Context, key: str) -> RegisteredScan:
 
 
 def _recorded(scan_id: str, outcome: ScanResult, ids: Sequence[str]) -> ScanOutcome:
-    found = outcome.placement
-    if found is None:
+    registration = outcome.registration
+    if registration is None:
         return ScanOutcome(
             scan_id=scan_id,
             accepted=False,
@@ -67,9 +67,9 @@ def _recorded(scan_id: str, outcome: ScanResult, ids: Sequence[str]) -> ScanOutc
         accepted=True,
         fitness=outcome.fitness,
         rmse=outcome.inlier_rmse,
-        map_from_scan=found.map_from_scan.tolist(),
-        translation_sigma=None if found.uncertainty is None else found.uncertainty.translation,
-        rotation_sigma=None if found.uncertainty is None else found.uncertainty.rotation,
-        path=tuple(ids[at] for at in found.path) or None,
+        map_from_scan=registration.map_from_scan.tolist(),
+        translation_sigma=None if registration.uncertainty is None else registration.uncertainty.translation,
+        rotation_sigma=None if registration.uncertainty is None else registration.uncertainty.rotation,
+        path=tuple(ids[index] for index in registration.path) or None,
         reason=outcome.reason,
     )

@@ -23,14 +23,13 @@ from worker.detectors.card import Preprocessing
 from worker.detectors.detector import Detector
 from worker.errors import MapFailed, RegistrationFailed
 from worker.pipeline.mapping.fusion import CurrentMap, ReferenceMap, current_map, fuse, reference_map
-from worker.pipeline.mapping.map_registration import register_map_scans
+from worker.pipeline.mapping.map_registration import MapReport, register_map_scans
 from worker.pipeline.mapping.pair_registration import PairCache
-from worker.pipeline.mapping.report import MapReport
-from worker.pipeline.mapping.settings import MapSettings, MultiScanSettings
+from worker.pipeline.mapping.settings import JointRegistrationSettings, MapSettings
 from worker.pipeline.mapping.survey_registration import register_survey_scans
-from worker.pipeline.registration.results import RegisteredScan, ScanFile, ScanResult, placed
+from worker.pipeline.registration.results import RegisteredScan, ScanFile, ScanResult, read_registered
 from worker.pipeline.registration.scan_to_scan import PairResult
-from worker.pipeline.registration.settings import RegistrationSettings
+from worker.pipeline.registration.settings import RegistrationSettings, with_values
 from worker.pipeline.results.changes import ChangeSet, decide
 from worker.progress import Progress, no_progress
 
@@ -49,17 +48,16 @@ class PipelineSettings(BaseModel):
         """The same settings with what is tied to a model's weights put in its place."""
         voxels = {"voxel_size": needs.voxel_size}
         tiles = {"tile_size": needs.tile_size, "min_points": needs.min_points}
-        return self.model_copy(
-            update={
-                "registration": self.registration.model_copy(update=voxels),
-                "tiling": self.tiling.model_copy(update=tiles),
-            }
+        return with_values(
+            self,
+            registration=with_values(self.registration, **voxels),
+            tiling=with_values(self.tiling, **tiles),
         )
 
     @property
-    def placing(self) -> MultiScanSettings:
-        """What placing scans needs of these."""
-        return MultiScanSettings(
+    def joint_registration(self) -> JointRegistrationSettings:
+        """What the registration of many scans needs of these."""
+        return JointRegistrationSettings(
             registration=self.registration, mapping=self.mapping, max_points=self.max_scan_points
         )
 
@@ -73,7 +71,7 @@ class BuiltMap:
     outcomes: tuple[ScanResult, ...]  #: of the files, in their order
     report: MapReport | None  #: None where nothing was registered anew
     kept: tuple[PairResult, ...] = ()  #: the registrations that the map rests on
-    contradicted: tuple[PairResult, ...] = ()  #: accepted ones that loops do not close over
+    rejected: tuple[PairResult, ...] = ()  #: accepted ones that loops do not close over
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -117,18 +115,18 @@ def build_map(
     `pairs` keeps registered pairs, so that a build that was killed goes on; `processes` is one a core if None.
     Raises ScanError where no file can be read, MapFailed where no scan holds a pose, and NothingToTile.
     """
-    placing = register_map_scans(
-        files, settings=settings.placing, memory=pairs, processes=processes, progress=progress
+    registered = register_map_scans(
+        files, settings=settings.joint_registration, pair_cache=pairs, processes=processes, progress=progress
     )
-    fused = fused_scans(accepted_scans(files, placing.outcomes, settings), len(files), settings, progress)
-    reference, tiles = tiled_map(fused, None, placing.outcomes, settings, progress)
+    fused = fused_scans(accepted_scans(files, registered.outcomes, settings), len(files), settings, progress)
+    reference, tiles = tiled_map(fused, None, registered.outcomes, settings, progress)
     return BuiltMap(
         reference=reference,
         tiles=tiles,
-        outcomes=placing.outcomes,
-        report=placing.report,
-        kept=placing.kept,
-        contradicted=placing.contradicted,
+        outcomes=registered.outcomes,
+        report=registered.report,
+        kept=registered.kept,
+        rejected=registered.rejected,
     )
 
 
@@ -144,8 +142,10 @@ def locate_survey(
 
     Raises ScanError where no file can be read, NoScanAccepted where none is left to compare.
     """
-    outcomes = register_survey_scans(files, reference.surface(), settings=settings.placing, progress=progress)
-    if not any(outcome.placement for outcome in outcomes):
+    outcomes = register_survey_scans(
+        files, reference.surface(), settings=settings.joint_registration, progress=progress
+    )
+    if not any(outcome.registration for outcome in outcomes):
         raise NoScanAccepted(outcomes)
     progress("tiling", 0.0)
     accepted = accepted_scans(files, outcomes, settings)
@@ -173,8 +173,8 @@ def accepted_scans(
 ) -> Iterator[RegisteredScan]:
     """The points of each accepted scan, read again: no two scans are held at once."""
     for file, outcome in zip(files, outcomes, strict=True):
-        if outcome.placement is not None:
-            yield placed(file, outcome.placement, max_points=settings.max_scan_points)
+        if outcome.registration is not None:
+            yield read_registered(file, outcome.registration, max_points=settings.max_scan_points)
 
 
 def fused_scans(

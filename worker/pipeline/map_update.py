@@ -17,7 +17,7 @@ from worker.pipeline.flow import (
     tiled_map,
 )
 from worker.pipeline.mapping.fusion import ReferenceMap
-from worker.pipeline.mapping.report import MapReport
+from worker.pipeline.mapping.map_registration import MapReport
 from worker.pipeline.mapping.survey_registration import register_survey_scans
 from worker.pipeline.registration.results import RegisteredScan, ScanFile
 from worker.progress import Progress, no_progress
@@ -41,16 +41,14 @@ def extend_map(
     finds a place, and NothingToTile.
     """
     outcomes = register_survey_scans(
-        files, base.reference.surface(), settings=settings.placing, growing=True, progress=progress
+        files, base.reference.surface(), settings=settings.joint_registration, growing=True, progress=progress
     )
-    if not any(outcome.placement for outcome in outcomes):
+    if not any(outcome.registration for outcome in outcomes):
         raise NoScanAccepted(outcomes)
     scans = itertools.chain((load() for load in base.scans), accepted_scans(files, outcomes, settings))
     fused = fused_scans(scans, len(base.scans) + len(files), settings, progress)
     reference, tiles = tiled_map(fused, base.grid, outcomes, settings, progress)
-    return BuiltMap(
-        reference=reference, tiles=tiles, outcomes=outcomes, report=MapReport.of_outcomes(outcomes)
-    )
+    return BuiltMap(reference=reference, tiles=tiles, outcomes=outcomes, report=MapReport.of(outcomes))
 
 
 def renew_map(

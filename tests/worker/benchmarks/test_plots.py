@@ -15,6 +15,7 @@ def write_log(folder: Path, text: str) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_the_picture_lies_beside_the_log_and_is_drawn_anew_after_each_epoch(tmp_path: Path) -> None:
     head = "epoch,train_loss,train_accuracy,validation_loss,accuracy\n"
     draw_curves(write_log(tmp_path, head + "1,0.2,0.4,0.21,0.45\n"))

@@ -42,8 +42,9 @@ def test_bench_times_every_stage_and_finds_the_same_scores_each_way(model_store:
     assert all(figures["map"][stage] > 0 for stage in ("fusing", "tiling", "describe", "total"))
     parts = [seconds for stage, seconds in figures["map"].items() if stage != "total"]
     assert sum(parts) == pytest.approx(figures["map"]["total"])
-    stages = ("load map", "score", "decide and export", "picture", "total")
-    assert all(figures["survey_with_prior"][stage] > 0 for stage in stages)
+    survey = figures["survey_with_prior"]  # with so few scans it may well be refused
+    stages = ("total",) if "rejected" in survey else ("score", "decide and export", "picture", "total")
+    assert all(survey[stage] > 0 for stage in ("load map", *stages))
     assert figures["map_poses"]["of"] == 4
     assert figures["peak_memory_mb"] > 0
     assert tables(figures).renderables

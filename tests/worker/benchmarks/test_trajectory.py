@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from worker.benchmarks.trajectory import align, distances, fitted
-from worker.cloud.poses import inverse
+from worker.benchmarks.trajectory import ARM, align, distances
+from worker.cloud.poses import fit_poses, inverse
 from worker.cloud.types import Matrix4
 from worker.simulation.scenes import rigid
 
@@ -32,7 +32,7 @@ def test_one_pose_20_metres_off_keeps_its_error_and_leaves_the_rest_at_none(walk
     off = distances(align(estimated, walk), estimated, walk)
     assert off[4] == pytest.approx(20.0)
     assert np.delete(off, 4).max() < 1e-9
-    assert distances(fitted(estimated, walk), estimated, walk)[0] > 0.3  # which is what one fit over all does
+    assert distances(fit_poses(estimated, walk, arm=ARM), estimated, walk)[0] > 0.3  # one fit over all
 
 
 def test_wrong_poses_short_of_half_are_told_from_the_right_ones(walk: list[Matrix4]) -> None:
@@ -47,7 +47,8 @@ def test_wrong_poses_short_of_half_are_told_from_the_right_ones(walk: list[Matri
 def test_noise_is_averaged_over_all_scans_that_agree(walk: list[Matrix4]) -> None:
     rng = np.random.default_rng(1)
     estimated = [MAP_FROM_WORLD @ pose @ rigid(*rng.normal(0.0, 0.01, 3).tolist()) for pose in walk]
-    best, robust = (distances(way(estimated, walk), estimated, walk) for way in (fitted, align))
+    fits = (fit_poses(estimated, walk, arm=ARM), align(estimated, walk))
+    best, robust = (distances(fit, estimated, walk) for fit in fits)
     np.testing.assert_allclose(robust, best, atol=1e-9)  # nobody is an outlier
     assert robust.mean() < 0.02
 

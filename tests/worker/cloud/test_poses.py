@@ -3,7 +3,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from worker.cloud.poses import difference, exponential, inverse, transformed
+from tests.support.graphs import ring, shifted
+from worker.cloud.poses import difference, exponential, fit_poses, inverse, rigid_fit, transformed
 
 
 def test_exponential_of_a_quarter_turn_about_z_takes_x_to_y() -> None:
@@ -22,3 +23,31 @@ def test_difference_is_metres_and_radians(angle: float) -> None:
     b = a @ exponential(np.array([0, angle, 0, 0, 0, 0.0]))
     b[:3, 3] += (0.03, 0.0, 0.04)
     assert difference(a, b) == pytest.approx((0.05, angle), abs=1e-12)
+
+
+MOTION = exponential(np.array([0.02, -0.01, 1.9, 4.0, -7.0, 0.3]))
+
+
+def test_fit_poses_undoes_a_known_motion() -> None:
+    poses = list(ring(5).values())
+    found = fit_poses(poses, [MOTION @ pose for pose in poses], arm=2.0)
+    assert found == pytest.approx(MOTION, abs=1e-9)
+
+
+def test_fit_poses_stays_a_rotation_where_the_scans_stand_on_one_line() -> None:
+    """Places alone leave the turn about the line free; headings hold it."""
+    poses = [shifted(2.0 * number) for number in range(4)]
+    found = fit_poses(poses, [MOTION @ pose for pose in poses], arm=2.0)
+    assert found == pytest.approx(MOTION, abs=1e-9)
+    assert np.linalg.det(found[:3, :3]) == pytest.approx(1.0)
+
+
+def test_rigid_fit_is_a_rotation_though_a_mirror_image_would_fit_better() -> None:
+    points = np.random.default_rng(0).uniform(-1, 1, (20, 3))
+    found = rigid_fit(points, points * (1, 1, -1))
+    assert np.linalg.det(found[:3, :3]) == pytest.approx(1.0)
+
+
+def test_rigid_fit_brings_points_onto_points() -> None:
+    points = np.random.default_rng(0).uniform(-1, 1, (20, 3))
+    assert rigid_fit(points, transformed(points, MOTION)) == pytest.approx(MOTION, abs=1e-9)

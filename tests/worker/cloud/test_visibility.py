@@ -1,26 +1,11 @@
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
-from tests.support.graphs import shifted
-from tests.support.rooms import Room, as_scan
-from worker.cloud.poses import inverse
+from tests.support.rooms import Room, wall
 from worker.cloud.visibility import ENOUGH, RangeImage, share_in_front
-from worker.pipeline.registration.icp import Surface
-from worker.pipeline.registration.preprocessing import ROBOT, PreparedScan, free_space_violation, prepare
-from worker.pipeline.registration.settings import RegistrationSettings
 from worker.simulation.visits import merged
-
-SETTINGS = RegistrationSettings()
-
-
-def wall(x: float, *, y: tuple[float, float] = (-2.0, 2.0)) -> np.ndarray:
-    """4 m high, across the x axis, a point every 2 cm."""
-    across, up = np.meshgrid(np.arange(*y, 0.02), np.arange(-2, 2, 0.02))
-    return np.column_stack([np.full(across.size, x), across.ravel(), up.ravel()])
 
 
 @pytest.fixture(scope="module")
@@ -58,54 +43,6 @@ def test_the_nearest_return_of_a_direction_is_what_counts() -> None:
     both = np.concatenate([wall(5.0), wall(2.0)])
     image = RangeImage.of(both, np.zeros(3))
     assert not image.free_space_violation(np.array([[2.5, 0.0, 0.0], [3.5, 0.2, 0.1]])).any()
-
-
-def posts(x: float) -> PreparedScan:
-    """A scan of 50 points that stand `x` metres before its sensor, and of nothing else."""
-    points = np.column_stack([np.full(50, x), np.linspace(-0.2, 0.2, 50), np.zeros(50)])
-    surface = Surface.of(points, np.tile([-1.0, 0, 0], (50, 1)), np.ones(50, bool))
-    image = RangeImage(origin=np.zeros(3), ranges=RangeImage.of(points, np.zeros(3)).ranges)
-    return PreparedScan(name="posts", surface=surface, image=image, sensor_pose=np.eye(4))
-
-
-def seeing(x: float) -> PreparedScan:
-    """A scan that saw a wall at `x` metres from the same place."""
-    other = posts(x)
-    return replace(other, image=RangeImage.of(wall(x), np.zeros(3)))
-
-
-def test_what_is_near_the_robot_is_not_asked() -> None:
-    assert free_space_violation(posts(ROBOT + 0.3), seeing(4.0), np.eye(4), every=1) == 1.0
-    assert free_space_violation(posts(ROBOT - 0.3), seeing(4.0), np.eye(4), every=1) == 0.0
-
-
-def test_the_worse_of_both_directions_counts() -> None:
-    a, b = posts(2.0), seeing(4.0)
-    assert (
-        free_space_violation(a, b, np.eye(4), every=1)
-        == free_space_violation(b, a, np.eye(4), every=1)
-        == 1.0
-    )
-
-
-def test_scans_whose_sensor_is_not_known_contradict_nothing() -> None:
-    unknown = replace(seeing(4.0), image=None)
-    assert free_space_violation(posts(2.0), unknown, np.eye(4)) == 0.0
-    assert free_space_violation(unknown, posts(2.0), np.eye(4)) == 0.0
-
-
-def test_a_scan_contradicts_neither_itself_nor_another_at_its_true_pose(room: Room) -> None:
-    a, b = (prepare(as_scan(scan.points), SETTINGS) for scan in room.before[:2])
-    true = inverse(room.before[1].world_from_sensor) @ room.before[0].world_from_sensor
-    assert free_space_violation(a, a, np.eye(4)) == 0.0
-    assert free_space_violation(a, b, true) < 0.001
-    assert free_space_violation(b, a, inverse(true)) < 0.001
-
-
-def test_a_scan_of_the_same_room_a_metre_and_a_half_off_is_contradicted(room: Room) -> None:
-    a, b = (prepare(as_scan(scan.points), SETTINGS) for scan in room.before[:2])
-    wrong = inverse(room.before[1].world_from_sensor) @ shifted(1.5) @ room.before[0].world_from_sensor
-    assert free_space_violation(a, b, wrong) > 5 * SETTINGS.max_free_space_violation
 
 
 def test_a_standing_scan_was_seen_from_its_sensor(room: Room) -> None:

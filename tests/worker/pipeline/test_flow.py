@@ -10,7 +10,7 @@ import pytest
 
 from tests.support.rooms import Room
 from tests.support.tilings import row_of
-from tests.support.walks import placement
+from tests.support.walks import registered
 from worker.cloud.formats.pcd import write_pcd
 from worker.cloud.poses import difference, inverse, transformed
 from worker.cloud.tiling import TilePairs, Tiles
@@ -157,7 +157,7 @@ def test_voxel_and_tile_sizes_come_from_the_card() -> None:
 
 def test_the_map_holds_every_scan_in_its_place(room: Room, told: Told) -> None:
     for outcome, scan in zip(told.built.outcomes, room.before[:2], strict=True):
-        assert difference(placement(outcome).map_from_scan, scan.world_from_sensor)[0] < 0.015
+        assert difference(registered(outcome).map_from_scan, scan.world_from_sensor)[0] < 0.015
 
 
 def test_the_map_is_cut_into_tiles_of_512_points_and_more(told: Told) -> None:
@@ -177,7 +177,7 @@ def test_the_same_scans_again_change_nothing(told: Told) -> None:
 
 def test_a_box_moves_no_scan(told: Told, boxed: tuple[LocatedSurvey, int]) -> None:
     for with_box, plain in zip(boxed[0].outcomes, told.survey.outcomes, strict=True):
-        metres, radians = difference(placement(with_box).map_from_scan, placement(plain).map_from_scan)
+        metres, radians = difference(registered(with_box).map_from_scan, registered(plain).map_from_scan)
         assert metres < 0.002
         assert radians < 0.001
 
@@ -221,7 +221,7 @@ def test_a_survey_of_another_place_is_refused_with_every_scans_numbers(told: Tol
     assert error.value.code == "registration_failed"
     assert [outcome.name for outcome in error.value.outcomes] == ["foreign-0.pcd", "foreign-1.pcd"]
     for outcome in error.value.outcomes:
-        assert outcome.placement is None
+        assert outcome.registration is None
         assert outcome.reason
         assert outcome.fitness is not None
 
@@ -235,7 +235,7 @@ def test_a_foreign_scan_leaves_the_survey_as_it_is_without_it(
     found = locate_survey(
         [files[0], foreign, files[1]], told.built.reference, told.built.tiles, settings=SETTINGS
     )
-    assert [outcome.placement is not None for outcome in found.outcomes] == [True, False, True]
+    assert [outcome.registration is not None for outcome in found.outcomes] == [True, False, True]
     assert found.current.points.tolist() == told.survey.current.points.tolist()
 
 
@@ -244,7 +244,7 @@ def test_a_survey_with_a_file_that_is_no_scan_goes_on_with_the_others_and_names_
 ) -> None:
     broken = _broken(tmp_path)
     found = locate_survey([broken, *files], told.built.reference, told.built.tiles, settings=SETTINGS)
-    assert [outcome.placement is not None for outcome in found.outcomes] == [False, True, True]
+    assert [outcome.registration is not None for outcome in found.outcomes] == [False, True, True]
     assert str(found.outcomes[0].reason).startswith("hall 3.ply: ")
     assert found.current.points.tolist() == told.survey.current.points.tolist()
 
@@ -253,7 +253,7 @@ def test_a_map_with_a_file_that_is_no_scan_goes_on_with_the_others_and_names_it(
     told: Told, files: list[ScanFile], tmp_path: Path
 ) -> None:
     built = build_map([files[0], _broken(tmp_path), files[1]], settings=SETTINGS, processes=1)
-    assert [outcome.placement is not None for outcome in built.outcomes] == [True, False, True]
+    assert [outcome.registration is not None for outcome in built.outcomes] == [True, False, True]
     assert str(built.outcomes[1].reason).startswith("hall 3.ply: ")
     assert (built.report.scans, built.report.accepted, built.report.discarded) == (3, 2, 1)
     assert built.reference.points == pytest.approx(told.built.reference.points, abs=1e-4)
@@ -278,7 +278,7 @@ def test_a_map_too_thin_for_a_tile_says_how_many_points_one_needs(files: list[Sc
     )
     with pytest.raises(NothingToTile, match="no tile holds 1000000 points") as error:
         build_map(files[:1], settings=dense, processes=1)
-    assert [outcome.placement is not None for outcome in error.value.outcomes] == [True]
+    assert [outcome.registration is not None for outcome in error.value.outcomes] == [True]
 
 
 def test_the_report_of_a_map_names_its_reference_and_its_registrations(told: Told) -> None:

@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 
 from tests.support.rooms import Room
-from tests.support.walks import MANY, QUICK, placement, written
+from tests.support.walks import MANY, QUICK, registered, written
 from worker.cloud.poses import difference
 from worker.cloud.tiling import TileGrid
 from worker.cloud.types import Floats
 from worker.pipeline.flow import BuiltMap, NoScanAccepted, PipelineSettings, build_map
 from worker.pipeline.map_update import KeptMap, extend_map, renew_map, without
 from worker.pipeline.mapping.fusion import fuse, reference_map
-from worker.pipeline.registration.results import RegisteredScan, ScanFile, ScanResult, placed
+from worker.pipeline.registration.results import RegisteredScan, ScanFile, ScanResult, read_registered
 from worker.simulation.scenes import random_room
 from worker.simulation.visits import visit
 
@@ -43,7 +43,7 @@ def test_a_map_that_is_extended_holds_both_and_its_tiles_keep_their_ids(
         _kept(built, [east]), [whole], settings=SETTINGS, progress=lambda stage, share: stages.append(stage)
     )
     assert [outcome.name for outcome in grown.outcomes] == ["whole.pcd"]
-    found = placement(grown.outcomes[0])
+    found = registered(grown.outcomes[0])
     assert difference(found.map_from_scan, room.before[1].world_from_sensor)[0] < 0.015
     before, after = built.tiles, grown.tiles
     assert after.grid.origin.tolist() == before.grid.origin.tolist()
@@ -69,7 +69,7 @@ def test_a_map_is_not_extended_by_scans_of_another_place(whole: ScanFile, tmp_pa
 
 def _kept(built: BuiltMap, files: Sequence[ScanFile]) -> KeptMap:
     def loader(file: ScanFile, outcome: ScanResult) -> Callable[[], RegisteredScan]:
-        return lambda: placed(file, placement(outcome), max_points=MANY)
+        return lambda: read_registered(file, registered(outcome), max_points=MANY)
 
     scans = [loader(*each) for each in zip(files, built.outcomes, strict=True)]
     return KeptMap(reference=built.reference, grid=built.tiles.grid, scans=scans)

@@ -26,6 +26,7 @@ def overlapping(scene: Scene) -> list[str]:
     return [o.name for o in scene.movable if not scene.is_free(o.mesh.bounds, ignoring=o.name)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", [small_office, corridor, corridor_with_loop, random_room])
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_pieces_stand_apart_inside_the_building(make, seed):
@@ -52,6 +53,7 @@ def test_the_office_measures_ten_by_eight_by_two_point_six_inside():
     assert scene["ceiling-1"].mesh.bounds[0, 2] == pytest.approx(2.6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", [small_office, corridor, corridor_with_loop, random_room])
 def test_no_ray_leaves_a_building(make):
     scene = make(2)
@@ -63,6 +65,7 @@ def test_no_ray_leaves_a_building(make):
     assert np.all(seen.world_points > low) and np.all(seen.world_points < high)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_a_robot_can_walk_the_route_of_the_corridor_with_a_loop(seed):
     scene = corridor_with_loop(seed)
@@ -73,6 +76,7 @@ def test_a_robot_can_walk_the_route_of_the_corridor_with_a_loop(seed):
         assert room.min() > 0.3
 
 
+@pytest.mark.slow
 def test_the_route_of_the_corridor_with_a_loop_leads_about_the_block_and_back():
     route = np.array(corridor_with_loop(1).route)
     legs = np.linalg.norm(np.diff(route, axis=0), axis=1)

@@ -13,6 +13,7 @@ from worker.simulation.sensor import PERFECT
 from worker.simulation.visits import CLEARANCE, drifted, drifted_within, edited, merged, stops, visit
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("make", "count"), [(small_office, 25), (corridor, 25), (corridor_with_loop, 42)])
 @pytest.mark.parametrize("seed", [0, 7])
 def test_stops_are_in_rooms_and_clear_of_everything(make, count, seed):
@@ -83,6 +84,7 @@ def test_merged_scans_without_noise_lie_on_the_scene():
     assert scene.caster.distances(points).max() < 1e-3
 
 
+@pytest.mark.slow
 def test_a_corridor_of_25_scans_holds_about_as_many_tiles_as_the_paper():
     points = merged(visit(corridor(1), 25, seed=5))
     voxels = np.unique(np.floor(points / 0.05).astype(np.int64), axis=0)

@@ -22,7 +22,8 @@ from worker.cloud.poses import inverse, transformed
 from worker.cloud.tiling import TilePairs, pair_tiles
 from worker.cloud.types import Bools, Points
 from worker.cloud.voxels import Voxels, merged_in_order
-from worker.pipeline.registration.preprocessing import ScanRejected, prepare
+from worker.pipeline.registration.preprocessing import prepare
+from worker.pipeline.registration.results import ScanRejected
 from worker.pipeline.registration.scan_to_map import register
 from worker.progress import Progress
 from worker.simulation.scenes import ChangeKind
@@ -188,7 +189,9 @@ def _voxels(site: Site, scan: int, points: Points) -> Voxels | None:
     read = Scan(name=f"scan {scan}", points=own, colors=None, sensor_pose=np.eye(4), n_dropped=0)
     settings = site.settings.registration
     try:
-        result = register(prepare(read, settings), site.surface, start=site.poses[scan], settings=settings)
+        hypothesis = register(
+            prepare(read, settings), site.surface, prior=site.poses[scan], settings=settings
+        )
     except ScanRejected:
         return None
-    return Voxels.of(transformed(own, result.found.target_from_source).astype(np.float32), size=size)
+    return Voxels.of(transformed(own, hypothesis.target_from_source).astype(np.float32), size=size)

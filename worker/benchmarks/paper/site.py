@@ -19,7 +19,7 @@ from worker.cloud.voxels import Voxels, merged_in_order
 from worker.pipeline.flow import PipelineSettings
 from worker.pipeline.mapping.fusion import reference_map
 from worker.pipeline.mapping.map_registration import register_map_scans
-from worker.pipeline.registration.icp import Surface
+from worker.pipeline.registration.surface import Surface
 from worker.progress import Progress
 from worker.simulation.scenes import corridor
 from worker.simulation.visits import DRIFT, drifted_within, stops, visit
@@ -82,11 +82,11 @@ def build_site(settings: SiteSettings, pipeline: PipelineSettings, progress: Pro
         if settings.true_poses:
             return _mapped(scene.name, [(s.points, s.world_from_sensor) for s in scans], settings, pipeline)
         files = scan_files(scans)
-        outcomes = register_map_scans(files, settings=pipeline.placing, progress=progress).outcomes
+        outcomes = register_map_scans(files, settings=pipeline.joint_registration, progress=progress).outcomes
     accepted = [
-        (scan.points, outcome.placement.map_from_scan)
+        (scan.points, outcome.registration.map_from_scan)
         for scan, outcome in zip(scans, outcomes, strict=True)
-        if outcome.placement
+        if outcome.registration
     ]
     return _mapped(scene.name, accepted, settings, pipeline)
 

@@ -74,7 +74,7 @@ def assess(
     """
     home = {scan: pose for scan, pose in enumerate(true) if pose is not None}
     out_of_place = [outcome for scan, outcome in enumerate(outcomes) if scan not in home]
-    accepted = {scan: placement for scan in home if (placement := outcomes[scan].placement) is not None}
+    accepted = {scan: placement for scan in home if (placement := outcomes[scan].registration) is not None}
     frame: Matrix4 | None = None
     errors: list[PoseError] = []
     if accepted:
@@ -90,7 +90,7 @@ def assess(
         errors=tuple(errors),
         missing=tuple(outcomes[scan].name for scan in home if scan not in accepted),
         foreign=len(out_of_place),
-        foreign_accepted=tuple(outcome.name for outcome in out_of_place if outcome.placement),
+        foreign_accepted=tuple(outcome.name for outcome in out_of_place if outcome.registration),
         true_from_map=frame,
     )
 
@@ -101,7 +101,7 @@ def _held_at(
     """Return true_from_map by the reference scan alone; None where there is none, or it is of another building."""
     if reference is None:
         return None
-    placement, pose = outcomes[reference].placement, true[reference]
+    placement, pose = outcomes[reference].registration, true[reference]
     if placement is None or pose is None:
         return None
     true_from_map: Matrix4 = pose @ inverse(placement.map_from_scan)

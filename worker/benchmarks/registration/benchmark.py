@@ -86,7 +86,7 @@ class Run:
             "seconds": self.seconds,
             "processor_seconds": self.processor_seconds,
             "reasons": {
-                outcome.name: outcome.reason for outcome in self.built.outcomes if not outcome.placement
+                outcome.name: outcome.reason for outcome in self.built.outcomes if not outcome.registration
             },
         }
 
@@ -161,9 +161,9 @@ def _baseline(
     theirs = baseline.build_baseline(run.scenario.files, chosen, progress)
     used = processor_seconds() - used
     ours = {
-        scan: outcome.placement.map_from_scan
+        scan: outcome.registration.map_from_scan
         for scan, outcome in enumerate(run.built.outcomes)
-        if outcome.placement
+        if outcome.registration
     }
     true: list[Matrix4] = [
         pose for pose in run.scenario.true if pose is not None
@@ -198,17 +198,17 @@ def time_survey(
     )
     path = folder / "survey.pcd"
     map_from_true = inverse(true_from_map)
-    surface, start = reference.surface(), map_from_true @ simulated.prior
+    surface, prior = reference.surface(), map_from_true @ simulated.prior
     reading, registering, processor = [], [], []
     for _ in range(REPEATS + 1):
         begun, used = time.perf_counter(), time.process_time()
         scan = read_scan(path)
         read = time.perf_counter()
-        result = register(prepare(scan, settings), surface, start=start, settings=settings)
+        hypothesis = register(prepare(scan, settings), surface, prior=prior, settings=settings)
         reading.append(read - begun)
         registering.append(time.perf_counter() - read)
         processor.append(time.process_time() - used)
-    metres, radians = difference(map_from_true @ simulated.world_from_sensor, result.found.target_from_source)
+    metres, radians = difference(map_from_true @ simulated.world_from_sensor, hypothesis.target_from_source)
     return {
         "points": len(scan.points),
         "map_points": len(reference.points),

@@ -90,7 +90,7 @@ def _pair(folder: Path, pair: RealPair, progress: Progress) -> Document:
 def _frames(folder: Path, progress: Progress) -> Document:
     """Build one map of five frames, and one of each pair of neighbours, to compare their relative poses."""
     built, seconds = _built(folder, FRAMES, progress)
-    accepted = sum(outcome.placement is not None for outcome in built.outcomes) if built else 0
+    accepted = sum(outcome.registration is not None for outcome in built.outcomes) if built else 0
     off = []
     for number, names in enumerate(pairwise(FRAMES)):
         alone, _ = _built(folder, names, progress)
@@ -129,7 +129,7 @@ def _built(folder: Path, names: Sequence[str], progress: Progress) -> tuple[Buil
 
 def _relative(built: BuiltMap, first: int, second: int) -> Matrix4 | None:
     """Return first_from_second, None where one of them was left out."""
-    one, other = built.outcomes[first].placement, built.outcomes[second].placement
+    one, other = built.outcomes[first].registration, built.outcomes[second].registration
     if one is None or other is None:
         return None
     relative: Matrix4 = inverse(one.map_from_scan) @ other.map_from_scan

@@ -184,15 +184,15 @@ def _places(scenario: Scenario, built: BuiltMap, assessment: Assessment) -> dict
     """Return (3,) by index: where the map has a scan; where it was in truth for one of the building that is missing."""
     places: dict[int, Floats] = {}
     for scan, (outcome, true) in enumerate(zip(built.outcomes, scenario.true, strict=True)):
-        if outcome.placement:
-            places[scan] = outcome.placement.map_from_scan[:3, 3]
+        if outcome.registration:
+            places[scan] = outcome.registration.map_from_scan[:3, 3]
         elif true is not None and assessment.true_from_map is not None:
             places[scan] = (inverse(assessment.true_from_map) @ true)[:3, 3]
     return places
 
 
 def _draw_edges(axes: Axes, built: BuiltMap, places: dict[int, Floats]) -> None:
-    for pairs, color, order in ((built.kept, FOUND, 2), (built.contradicted, WRONG, 3)):
+    for pairs, color, order in ((built.kept, FOUND, 2), (built.rejected, WRONG, 3)):
         for pair in pairs:
             if pair.target in places and pair.source in places:
                 ends = np.stack([places[pair.target], places[pair.source]])
@@ -201,7 +201,7 @@ def _draw_edges(axes: Axes, built: BuiltMap, places: dict[int, Floats]) -> None:
 
 def _draw_stops(axes: Axes, scenario: Scenario, built: BuiltMap, places: dict[int, Floats]) -> None:
     for scan, place in places.items():
-        missing, out_of_place = built.outcomes[scan].placement is None, scenario.true[scan] is None
+        missing, out_of_place = built.outcomes[scan].registration is None, scenario.true[scan] is None
         color = MISSED if missing else WRONG if out_of_place else INK
         marker = "x" if missing or out_of_place else "o"
         axes.plot(place[0], place[1], marker, color=color, markersize=5, zorder=4)

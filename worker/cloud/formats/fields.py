@@ -1,4 +1,4 @@
-"""Records: how one point lies in a file, and its positions and colours taken out of it.
+"""Fields and columns: how one point lies in a file, and its positions and colours taken out of it.
 
 PCD and PLY both describe a point as a row of named, typed fields. Both readers turn their header into
 `Field`s; from there on the two formats are the same.
@@ -10,18 +10,21 @@ import mmap
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from worker.cloud.types import Colors, Matrix4
-from worker.errors import ScanError
+from worker.errors import ScanError, ScanTooLarge
 
 FARTHEST = 10_000.0  #: metres from the origin; there a float32 steps by 1 mm
 
 HEADER_LIMIT = 64 * 1024  #: bytes; a longer header is refused unread
 STRIDE_LIMIT = 64 * 1024  #: bytes of one point; SHOT, the widest descriptor in PCL, takes 1.4 kB
+LINE_LIMIT = 1024 * 1024  #: bytes of one line
+_NUMBERS_AT_ONCE = 1_000_000  #: decoded together, which bounds the memory of the columns nobody wants
 
 _POSITION = ("x", "y", "z")
 _TRIPLES = (
@@ -57,12 +60,12 @@ class RawCloud:
 
 
 def stride(fields: Sequence[Field]) -> int:
-    """Bytes of one point."""
+    """Return the bytes of one point."""
     return sum(field.size for field in fields)
 
 
 def chosen_fields(fields: Sequence[Field]) -> dict[str, int]:
-    """The fields that are read, name to index; the others are skipped over.
+    """Choose the fields that are read, name to index; the others are skipped over.
 
     Raises ScanError when x, y or z is missing, doubled, or not one float or double, or a point is too wide.
     """
@@ -85,7 +88,7 @@ def chosen_fields(fields: Sequence[Field]) -> dict[str, int]:
 
 
 def _color_names(fields: Sequence[Field]) -> tuple[str, ...]:
-    """The fields that colour a point, or none; a colour in any other type is ignored as any other field is."""
+    """Choose the fields that colour a point, or none; a colour of another type is ignored like any other field."""
     single = {f.name: f for f in fields if f.count == 1 and [g.name for g in fields].count(f.name) == 1}
     for triple in _TRIPLES:
         if all(name in single for name in triple):
@@ -94,33 +97,25 @@ def _color_names(fields: Sequence[Field]) -> tuple[str, ...]:
     return next(((name,) for name in _PACKED if name in single and single[name].dtype.itemsize == 4), ())
 
 
-def colors_of(columns: Columns) -> Colors | None:
-    """Colours (N, 3) uint8 out of the columns, or None.
+def check_point_count(n: int, *, max_points: int) -> None:
+    """Raise ScanTooLarge when a header declares more points than the limit."""
+    if n > max_points:
+        raise ScanTooLarge(f"header declares {n} points, the limit is {max_points}; split or thin the scan")
 
-    A packed `rgb` is 0x00RRGGBB in four bytes, whatever type they are declared as (PCL, `PointXYZRGB`).
-    Floating colours are scaled from 0..1; others are not guessed at.
-    """
-    for name in _PACKED:
-        if name in columns:
-            packed = np.ascontiguousarray(columns[name]).astype(
-                columns[name].dtype.newbyteorder("="), copy=False
-            )
-            bits = packed.view(np.uint32)
-            return np.stack([(bits >> shift & 0xFF).astype(np.uint8) for shift in (16, 8, 0)], axis=1)
-    names = next((triple for triple in _TRIPLES if triple[0] in columns), None)
-    if names is None:
-        return None
-    colors: NDArray[Any] = np.stack([columns[name] for name in names], axis=1)
-    if colors.dtype == np.uint8:
-        return colors.astype(np.uint8, copy=False)
-    if not bool(np.all((colors >= 0) & (colors <= 1))):
-        return None
-    scaled: Colors = np.rint(colors * 255).astype(np.uint8)
-    return scaled
+
+def rows_size(fields: Sequence[Field], *, n: int, held: int) -> int:
+    """Return the bytes of `n` binary records; raise ScanError when the file has only `held` bytes left for them."""
+    needed = n * stride(fields)
+    if held < needed:
+        raise ScanError(
+            f"truncated: header declares {n} points ({needed} bytes), "
+            f"file holds {held // stride(fields)} ({held} bytes); upload it again"
+        )
+    return needed
 
 
 def from_rows(fields: Sequence[Field], buffer: mmap.mmap, *, offset: int, n: int) -> Columns:
-    """Columns of `n` records that lie one after another; the caller has checked that they are there."""
+    """Return the columns of `n` records that lie one after another; the caller has checked that they are there."""
     starts = np.cumsum([0, *(field.size for field in fields)])
     chosen = chosen_fields(fields)
     record = np.dtype(
@@ -136,7 +131,7 @@ def from_rows(fields: Sequence[Field], buffer: mmap.mmap, *, offset: int, n: int
 
 
 def from_blocks(fields: Sequence[Field], block: NDArray[np.uint8], *, n: int) -> Columns:
-    """Columns of `n` records stored field by field, as PCD's binary_compressed keeps them."""
+    """Return the columns of `n` records stored field by field, as PCD's binary_compressed keeps them."""
     starts = np.cumsum([0, *(field.size * n for field in fields)])
     return {
         name: np.frombuffer(block, fields[i].dtype, count=n, offset=int(starts[i]))
@@ -144,12 +139,17 @@ def from_blocks(fields: Sequence[Field], block: NDArray[np.uint8], *, n: int) ->
     }
 
 
-LINE_LIMIT = 1024 * 1024  #: bytes of one line
-_NUMBERS_AT_ONCE = 1_000_000  #: decoded together, which bounds the memory of the columns nobody wants
+def text_lines(buffer: mmap.mmap) -> Iterator[bytes]:
+    """Yield the lines of `buffer` from where it stands, without the blank ones."""
+    for line in iter(buffer.readline, b""):
+        if len(line) > LINE_LIMIT:
+            raise ScanError(f"a line of {len(line)} bytes, the limit is {LINE_LIMIT}; write one point a line")
+        if not line.isspace():
+            yield line
 
 
 def from_text(fields: Sequence[Field], lines: Iterator[bytes], *, n: int, size: int) -> Columns:
-    """Columns of `n` lines of numbers; `size` is how many bytes are left in the file.
+    """Return the columns of `n` lines of numbers; `size` is how many bytes are left in the file.
 
     Raises ScanError for a missing line, a wrong number of columns, a word, or a value outside its type.
     """
@@ -175,16 +175,8 @@ def from_text(fields: Sequence[Field], lines: Iterator[bytes], *, n: int, size: 
     return columns
 
 
-def text_lines(buffer: mmap.mmap) -> Iterator[bytes]:
-    """Lines of `buffer` from where it stands, without the blank ones."""
-    for line in iter(buffer.readline, b""):
-        if len(line) > LINE_LIMIT:
-            raise ScanError(f"a line of {len(line)} bytes, the limit is {LINE_LIMIT}; write one point a line")
-        if not line.isspace():
-            yield line
-
-
 def _decode(chunk: list[bytes], width: int, *, start: int, n: int) -> NDArray[np.float64]:
+    """Decode lines of `width` numbers, (lines, width); raise ScanError that names the point at fault."""
     if not chunk:
         return np.empty((0, width))
     try:
@@ -214,7 +206,7 @@ def _is_number(word: str) -> bool:
 
 
 def _cast(values: NDArray[np.float64], field: Field) -> NDArray[Any]:
-    """Numbers read as float64 in the type that the header declares for them."""
+    """Cast numbers read as float64 to the type that the header declares for them."""
     if field.dtype.kind == "f":
         # Positions stay as read until they are checked; only a declared float may overflow here, to inf.
         with np.errstate(over="ignore"):
@@ -225,3 +217,37 @@ def _cast(values: NDArray[np.float64], field: Field) -> NDArray[Any]:
         value = values[np.argmax(bad)]
         raise ScanError(f"field {field.name!r} holds {value:g}, which no {field.dtype.name} can be")
     return values.astype(field.dtype)
+
+
+def colors_of(columns: Columns) -> Colors | None:
+    """Return the colours (N, 3) uint8 out of the columns, or None.
+
+    A packed `rgb` is 0x00RRGGBB in four bytes, whatever type they are declared as (PCL, `PointXYZRGB`).
+    Floating colours are scaled from 0..1; others are not guessed at.
+    """
+    for name in _PACKED:
+        if name in columns:
+            packed = np.ascontiguousarray(columns[name]).astype(
+                columns[name].dtype.newbyteorder("="), copy=False
+            )
+            bits = packed.view(np.uint32)
+            return np.stack([(bits >> shift & 0xFF).astype(np.uint8) for shift in (16, 8, 0)], axis=1)
+    names = next((triple for triple in _TRIPLES if triple[0] in columns), None)
+    if names is None:
+        return None
+    colors: NDArray[Any] = np.stack([columns[name] for name in names], axis=1)
+    if colors.dtype == np.uint8:
+        return colors.astype(np.uint8, copy=False)
+    if not bool(np.all((colors >= 0) & (colors <= 1))):
+        return None
+    scaled: Colors = np.rint(colors * 255).astype(np.uint8)
+    return scaled
+
+
+def write_whole(path: Path, header: str, rows: NDArray[Any]) -> None:
+    """Write an ASCII header and the bytes of `rows`, so that the file appears whole or not at all."""
+    aside = path.with_name(path.name + ".tmp")
+    with aside.open("wb") as file:
+        file.write(header.encode("ascii"))
+        file.write(rows.tobytes())
+    aside.replace(path)

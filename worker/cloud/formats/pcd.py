@@ -1,4 +1,4 @@
-"""The header of PCD, versions .5 to .7: lines of text up to `DATA`.
+"""PCD files, versions .5 to .7: a header in lines of text up to `DATA`, then the points.
 
 Format: https://pointclouds.org/documentation/tutorials/pcd_file_format.html
 """
@@ -19,32 +19,26 @@ from worker.cloud.formats.fields import (
     Columns,
     Field,
     RawCloud,
+    check_point_count,
     chosen_fields,
     from_blocks,
     from_rows,
     from_text,
+    rows_size,
     stride,
     text_lines,
+    write_whole,
 )
 from worker.cloud.types import Colors, Matrix4, Points
-from worker.errors import ScanError, ScanTooLarge
+from worker.errors import ScanError
 
 _KEYWORDS = (
-    "VERSION",
-    "FIELDS",
-    "COLUMNS",
-    "SIZE",
-    "TYPE",
-    "COUNT",
-    "WIDTH",
-    "HEIGHT",
-    "VIEWPOINT",
-    "POINTS",
-    "DATA",
-)
+    "VERSION", "FIELDS", "COLUMNS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS", "DATA",
+)  # fmt: skip
 _VERSIONS = (".5", ".6", ".7", "0.5", "0.6", "0.7")
 _TYPES = {f"{kind}{size}" for kind in "IU" for size in (1, 2, 4, 8)} | {"F4", "F8"}
 _NO_POSE = ["0", "0", "0", "1", "0", "0", "0"]
+_LZF_GAIN = 88  #: the longest back reference of LZF makes 264 bytes out of 3
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -61,6 +55,15 @@ class PcdHeader:
 def looks_like_pcd(head: bytes) -> bool:
     """Whether a file that starts with `head` means to be PCD."""
     return re.match(rb"\s*(#[^\n]*\.PCD|(VERSION|FIELDS|COLUMNS)\s)", head) is not None
+
+
+def read_pcd(buffer: mmap.mmap, *, max_points: int) -> RawCloud:
+    """Decode a whole PCD file. Raises ScanError, ScanTooLarge."""
+    header = parse_pcd_header(buffer[:HEADER_LIMIT])
+    chosen_fields(header.fields)
+    check_point_count(header.n, max_points=max_points)
+    decode = {"ascii": _ascii, "binary": _binary, "binary_compressed": _compressed}[header.encoding]
+    return RawCloud(columns=decode(header, buffer), sensor_pose=header.sensor_pose)
 
 
 def parse_pcd_header(head: bytes) -> PcdHeader:
@@ -85,7 +88,7 @@ def parse_pcd_header(head: bytes) -> PcdHeader:
 
 
 def _entries(head: bytes) -> tuple[dict[str, list[str]], int]:
-    """The header's lines by keyword, and how many bytes they take."""
+    """Return the words of the header's lines by keyword, and how many bytes the header takes."""
     entries: dict[str, list[str]] = {}
     position = 0
     while "DATA" not in entries:
@@ -103,11 +106,12 @@ def _entries(head: bytes) -> tuple[dict[str, list[str]], int]:
 
 
 def _fields(names: list[str], entries: dict[str, list[str]]) -> tuple[Field, ...]:
+    """Pair the names with their entries of SIZE, TYPE and COUNT."""
     sizes, types = entries.get("SIZE", []), entries.get("TYPE", [])
     counts = entries.get("COUNT", ["1"] * len(names))
     if not len(names) == len(sizes) == len(types) == len(counts):
-        found = f"{len(names)} FIELDS, {len(sizes)} SIZE, {len(types)} TYPE, {len(counts)} COUNT"
-        raise ScanError(f"header lines disagree: {found}")
+        lengths = f"{len(names)} FIELDS, {len(sizes)} SIZE, {len(types)} TYPE, {len(counts)} COUNT"
+        raise ScanError(f"header lines disagree: {lengths}")
     fields = []
     for name, size, kind, count in zip(names, sizes, types, counts, strict=True):
         if kind + size not in _TYPES:
@@ -121,6 +125,7 @@ def _fields(names: list[str], entries: dict[str, list[str]]) -> tuple[Field, ...
 
 
 def _n_points(entries: dict[str, list[str]]) -> int:
+    """Return the number of points that WIDTH, HEIGHT and POINTS agree on."""
     declared = {
         key: _number(" ".join(entries[key]), key) for key in ("WIDTH", "HEIGHT", "POINTS") if key in entries
     }
@@ -142,7 +147,7 @@ def _number(word: str, key: str) -> int:
 
 
 def _viewpoint(words: list[str]) -> Matrix4:
-    """`tx ty tz qw qx qy qz` as scan_from_sensor."""
+    """Return scan_from_sensor (4, 4) of `tx ty tz qw qx qy qz`, metres and a unit quaternion."""
     try:
         numbers = np.array([float(word) for word in words])
     except ValueError:
@@ -167,26 +172,6 @@ def _viewpoint(words: list[str]) -> Matrix4:
     return pose
 
 
-_LZF_GAIN = 88  #: the longest back reference of LZF makes 264 bytes out of 3
-
-
-def read_pcd(buffer: mmap.mmap, *, max_points: int) -> RawCloud:
-    """Decode a whole PCD file. Raises ScanError, ScanTooLarge."""
-    header = parse_pcd_header(buffer[:HEADER_LIMIT])
-    chosen_fields(header.fields)
-    if header.n > max_points:
-        raise ScanTooLarge(
-            f"header declares {header.n} points, the limit is {max_points}; split or thin the scan"
-        )
-    if header.encoding == "ascii":
-        columns = _ascii(header, buffer)
-    elif header.encoding == "binary":
-        columns = _binary(header, buffer)
-    else:
-        columns = _compressed(header, buffer)
-    return RawCloud(columns=columns, sensor_pose=header.sensor_pose)
-
-
 def _ascii(header: PcdHeader, buffer: mmap.mmap) -> Columns:
     buffer.seek(header.size)
     lines = text_lines(buffer)
@@ -197,13 +182,7 @@ def _ascii(header: PcdHeader, buffer: mmap.mmap) -> Columns:
 
 
 def _binary(header: PcdHeader, buffer: mmap.mmap) -> Columns:
-    width, held = stride(header.fields), len(buffer) - header.size
-    needed = header.n * width
-    if held < needed:
-        raise ScanError(
-            f"truncated: header declares {header.n} points ({needed} bytes), "
-            f"file holds {held // width} ({held} bytes); upload it again"
-        )
+    needed = rows_size(header.fields, n=header.n, held=len(buffer) - header.size)
     _refuse_leftovers(buffer, header.size + needed)
     return from_rows(header.fields, buffer, offset=header.size, n=header.n)
 
@@ -229,6 +208,7 @@ def _compressed(header: PcdHeader, buffer: mmap.mmap) -> Columns:
 
 
 def _decompress(packed: bytes, size: int) -> NDArray[np.uint8]:
+    """Unpack an LZF block into exactly `size` bytes."""
     import imagecodecs  # noqa: PLC0415 - most scans are not compressed
 
     plain = np.empty(size, np.uint8)
@@ -244,7 +224,7 @@ def _decompress(packed: bytes, size: int) -> NDArray[np.uint8]:
 
 
 def _refuse_leftovers(buffer: mmap.mmap, end: int) -> None:
-    """Old PCL pads the file to a page with zeros; anything else after the points means a wrong header."""
+    """Raise ScanError for anything after the points but zeros, with which old PCL pads the file to a page."""
     left = len(buffer) - end
     if left and np.frombuffer(buffer, np.uint8, offset=end).any():
         raise ScanError(f"{left} bytes follow after the declared points; correct POINTS or the fields")
@@ -263,24 +243,21 @@ def write_pcd(
     if colors is not None:
         red, green, blue = np.asarray(colors, np.uint32).T
         rows["rgb"] = red << 16 | green << 8 | blue
+    viewpoint = _viewpoint_words(np.eye(4) if sensor_pose is None else sensor_pose)
     header = (
         "# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\n"
         f"FIELDS {' '.join(name for name, _ in fields)}\n"
         f"SIZE {' '.join(kind[2] for _, kind in fields)}\n"
         f"TYPE {' '.join(kind[1].upper() for _, kind in fields)}\n"
         f"COUNT {' '.join('1' for _ in fields)}\n"
-        f"WIDTH {len(rows)}\nHEIGHT 1\nVIEWPOINT {_viewpoint_words(np.eye(4) if sensor_pose is None else sensor_pose)}\n"
+        f"WIDTH {len(rows)}\nHEIGHT 1\nVIEWPOINT {viewpoint}\n"
         f"POINTS {len(rows)}\nDATA binary\n"
     )
-    aside = path.with_name(path.name + ".tmp")
-    with aside.open("wb") as file:
-        file.write(header.encode("ascii"))
-        file.write(rows.tobytes())
-    aside.replace(path)
+    write_whole(path, header, rows)
 
 
 def _viewpoint_words(pose: Matrix4) -> str:
-    """`tx ty tz qw qx qy qz` of a rigid pose."""
+    """Return `tx ty tz qw qx qy qz` of a rigid pose (4, 4)."""
     from scipy.spatial.transform import Rotation  # noqa: PLC0415 - reading does not need it
 
     x, y, z, w = Rotation.from_matrix(pose[:3, :3]).as_quat()

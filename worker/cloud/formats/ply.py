@@ -1,4 +1,4 @@
-"""The header of PLY, version 1.0: which tables follow, and how a row of each is laid out.
+"""PLY files, version 1.0: a header in lines of text up to `end_header`, then the rows of each element.
 
 Format: Greg Turk, "The PLY Polygon File Format", 1994.
 """
@@ -21,24 +21,28 @@ from worker.cloud.formats.fields import (
     Columns,
     Field,
     RawCloud,
+    check_point_count,
     chosen_fields,
     from_rows,
     from_text,
-    stride,
+    rows_size,
     text_lines,
+    write_whole,
 )
 from worker.cloud.types import Colors, Points
-from worker.errors import ScanError, ScanTooLarge
+from worker.errors import ScanError
 
-SHORT_NAMES = {
-    "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4", "double": "f8",
+_SHORT_NAMES = {
+    "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4",
+    "float": "f4", "double": "f8",
 }  # fmt: skip
 _LONG_NAMES = {
     "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4",
     "float32": "f4", "float64": "f8",
 }  # fmt: skip
-_TYPES = SHORT_NAMES | _LONG_NAMES
+_TYPES = _SHORT_NAMES | _LONG_NAMES
 _ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
+_LIST_ROWS_LIMIT = 5_000_000  #: rows with lists that are walked one by one in Python, about 0.5 us each
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -64,6 +68,7 @@ class Element:
 
     @property
     def has_lists(self) -> bool:
+        """Whether its rows differ in size."""
         return any(p.length is not None for p in self.properties)
 
 
@@ -84,6 +89,18 @@ class PlyHeader:
 def looks_like_ply(head: bytes) -> bool:
     """Whether a file that starts with `head` means to be PLY."""
     return re.match(rb"ply[ \t]*\r?\n", head) is not None
+
+
+def read_ply(buffer: mmap.mmap, *, max_points: int) -> RawCloud:
+    """Decode the vertices of a PLY file. Raises ScanError, ScanTooLarge."""
+    header = parse_ply_header(buffer[:HEADER_LIMIT])
+    vertex = header.elements[header.vertex]
+    if vertex.has_lists:
+        raise ScanError("element 'vertex' has a list property; write the points without lists")
+    chosen_fields([p.field for p in vertex.properties])
+    check_point_count(vertex.n, max_points=max_points)
+    decode = _ascii if header.encoding == "ascii" else _binary
+    return RawCloud(columns=decode(header, buffer), sensor_pose=np.eye(4))
 
 
 def parse_ply_header(head: bytes) -> PlyHeader:
@@ -112,7 +129,7 @@ def parse_ply_header(head: bytes) -> PlyHeader:
 
 
 def _lines(head: bytes) -> tuple[list[list[str]], int]:
-    """The words of each line between `ply` and `end_header`, comments left out, and the header's bytes."""
+    """Return the words of each line between `ply` and `end_header` but comments, and the header's bytes."""
     lines: list[list[str]] = []
     position = head.find(b"\n") + 1
     while True:
@@ -130,6 +147,7 @@ def _lines(head: bytes) -> tuple[list[list[str]], int]:
 
 
 def _format(words: list[str]) -> str:
+    """Return the encoding that the format line names."""
     match words:
         case ["format", encoding, "1.0"] if encoding in _ORDERS:
             return encoding
@@ -137,6 +155,7 @@ def _format(words: list[str]) -> str:
 
 
 def _property(words: list[str], order: str) -> Property:
+    """Read what follows the word `property`; `order` is the byte order as NumPy writes it."""
     match words:
         case ["list", length, kind, name] if _TYPES.get(length, "f")[0] != "f" and kind in _TYPES:
             field = Field(name=name, dtype=np.dtype(order + _TYPES[kind]))
@@ -146,32 +165,14 @@ def _property(words: list[str], order: str) -> Property:
     raise ScanError(f"property {' '.join(words)[:80]!r} has a type that PLY does not know")
 
 
-_LIST_ROWS_LIMIT = 5_000_000  #: rows with lists that are walked one by one in Python, about 0.5 us each
-
-
-def read_ply(buffer: mmap.mmap, *, max_points: int) -> RawCloud:
-    """Decode the vertices of a PLY file. Raises ScanError, ScanTooLarge."""
-    header = parse_ply_header(buffer[:HEADER_LIMIT])
-    vertex = header.elements[header.vertex]
-    if vertex.has_lists:
-        raise ScanError("element 'vertex' has a list property; write the points without lists")
-    chosen_fields([p.field for p in vertex.properties])
-    if vertex.n > max_points:
-        raise ScanTooLarge(
-            f"header declares {vertex.n} points, the limit is {max_points}; split or thin the scan"
-        )
-    read = _ascii if header.encoding == "ascii" else _binary
-    return RawCloud(columns=read(header, buffer), sensor_pose=np.eye(4))
-
-
 def _ascii(header: PlyHeader, buffer: mmap.mmap) -> Columns:
     buffer.seek(header.size)
     lines = text_lines(buffer)
     for element in header.elements[: header.vertex]:  # one line a row, whatever is in it
-        found = sum(1 for _ in zip(range(element.n), lines, strict=False))
-        if found < element.n:
+        held = sum(1 for _ in zip(range(element.n), lines, strict=False))
+        if held < element.n:
             raise ScanError(
-                f"truncated: element {element.name!r} declares {element.n} rows, file holds {found}"
+                f"truncated: element {element.name!r} declares {element.n} rows, file holds {held}"
             )
     vertex = header.elements[header.vertex]
     left = len(buffer) - buffer.tell()
@@ -187,24 +188,20 @@ def _binary(header: PlyHeader, buffer: mmap.mmap) -> Columns:
         start = _after(element, buffer, start)
     vertex, later = header.elements[header.vertex], header.elements[header.vertex + 1 :]
     fields = [p.field for p in vertex.properties]
-    needed, held = vertex.n * stride(fields), len(buffer) - start
-    if held < needed:
-        raise ScanError(
-            f"truncated: header declares {vertex.n} points ({needed} bytes), "
-            f"file holds {held // stride(fields)} ({held} bytes); upload it again"
-        )
-    rest = held - needed
-    if rest < sum(element.n * element.smallest_row for element in later):
+    held = len(buffer) - start
+    rest = held - rows_size(fields, n=vertex.n, held=held)
+    least = sum(element.n * element.smallest_row for element in later)
+    if rest < least:
         raise ScanError(f"truncated: {rest} bytes after the points cannot hold {[e.name for e in later]}")
     if not any(element.has_lists for element in later):
-        rest -= sum(element.n * element.smallest_row for element in later)
+        rest -= least
         if rest and np.frombuffer(buffer, np.uint8, offset=len(buffer) - rest).any():
             raise ScanError(f"{rest} bytes follow after the declared data; correct the count of points")
     return from_rows(fields, buffer, offset=start, n=vertex.n)
 
 
 def _after(element: Element, buffer: mmap.mmap, start: int) -> int:
-    """Offset of the first byte behind `element`, every list walked by its own length."""
+    """Return the offset of the first byte behind `element`; every list is walked by its own length."""
     if start + element.n * element.smallest_row > len(buffer):
         raise ScanError(
             f"truncated: element {element.name!r} declares {element.n} rows, the file ends before them"
@@ -234,7 +231,7 @@ def _after(element: Element, buffer: mmap.mmap, start: int) -> int:
 
 
 def _steps(element: Element) -> Iterator[tuple[int, struct.Struct | None, int]]:
-    """How to cross a row: bytes to skip, then the length of a list (or None) and the bytes of its values."""
+    """Yield how to cross a row: bytes to skip, then the length of a list (or None) and the bytes of its values."""
     skip = 0
     for p in element.properties:
         if p.length is None:
@@ -267,20 +264,17 @@ def write_ply(
         columns[name] = _scalar(name, np.asarray(values))
     if any(column.shape != (len(points),) for column in columns.values()):
         raise ValueError(f"columns of {[len(c) for c in columns.values()]} values for {len(points)} points")
-    words = {code: word for word, code in SHORT_NAMES.items()}
+    words = {code: word for word, code in _SHORT_NAMES.items()}
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}"]
     header += [f"property {words[column.dtype.str[1:]]} {name}" for name, column in columns.items()]
     rows = np.empty(len(points), np.dtype([(name, column.dtype) for name, column in columns.items()]))
     for name, column in columns.items():
         rows[name] = column
-    aside = path.with_name(path.name + ".tmp")
-    with aside.open("wb") as file:
-        file.write("\n".join([*header, "end_header", ""]).encode("ascii"))
-        file.write(rows.tobytes())
-    aside.replace(path)
+    write_whole(path, "\n".join([*header, "end_header", ""]), rows)
 
 
 def _scalar(name: str, values: NDArray[Any]) -> NDArray[Any]:
+    """Return the values as uchar, int or float; raise ValueError where none of them holds them."""
     if values.dtype.kind == "f":
         return values.astype("<f4")
     if values.dtype.kind == "b" or values.dtype == np.uint8:

@@ -1,4 +1,4 @@
-"""Scan: one upload as points, read strictly (docs/decisions, the note on reading formats).
+"""Scans: one upload as points, read strictly (docs/decisions/0003-reading-scans.md).
 
 The header is checked against the file's real size before anything is allocated, and what cannot be right
 is refused with the numbers that show it. A scan is never repaired, except that missing returns are dropped.
@@ -43,14 +43,15 @@ def read_scan(path: Path, *, name: str | None = None, max_points: int = 50_000_0
     """
     name = path.name if name is None else name
     try:
-        return _checked(_decoded(path, max_points), name)
+        return _checked_scan(_decode(path, max_points), name)
     except ScanError as error:
         raise type(error)(f"{name}: {error}") from None
     except MemoryError:
         raise ScanTooLarge(f"{name}: its points do not fit in memory; split or thin the scan") from None
 
 
-def _decoded(path: Path, max_points: int) -> RawCloud:
+def _decode(path: Path, max_points: int) -> RawCloud:
+    """Tell the format by the first bytes and decode the whole file."""
     with path.open("rb") as file:
         if path.stat().st_size == 0:
             raise ScanError("the file is empty (0 bytes); upload it again")
@@ -63,7 +64,8 @@ def _decoded(path: Path, max_points: int) -> RawCloud:
     raise ScanError(f"neither PLY nor PCD, it starts with {head[:16]!r}; upload one of the two")
 
 
-def _checked(raw: RawCloud, name: str) -> Scan:
+def _checked_scan(raw: RawCloud, name: str) -> Scan:
+    """Drop missing returns and refuse what cannot be a scan of a building in metres."""
     positions = np.stack([raw.columns[axis] for axis in "xyz"], axis=1)  # (N, 3), the file's type
     positions = positions.astype(positions.dtype.newbyteorder("="), copy=False)
     finite = np.isfinite(positions).all(axis=1)  # (N,)
@@ -75,7 +77,7 @@ def _checked(raw: RawCloud, name: str) -> Scan:
         positions = positions[finite]
         columns = {key: column[finite] for key, column in columns.items()}
     check_units(positions)
-    _refuse_far(positions)
+    _check_distance(positions)
     return Scan(
         name=name,
         points=np.ascontiguousarray(positions, np.float32),
@@ -95,14 +97,15 @@ def check_units(positions: NDArray[np.floating[Any]]) -> None:
     extent = 2 * float(np.max(high - low))
     if extent <= LONGEST_SITE:
         return
-    found = f"it spans {extent:.6g} along one axis, over {LONGEST_SITE:g} m"
+    span = f"it spans {extent:.6g} along one axis, over {LONGEST_SITE:g} m"
     for unit, factor in (("millimetres", 0.001), ("centimetres", 0.01)):  # the commoner one first
         if SHORTEST_ROOM <= extent * factor <= LONGEST_SITE:
-            raise ScanUnits(f"{found}: looks like {unit}; multiply by {factor} to get metres")
-    raise ScanUnits(f"{found}: not a scan of a building in metres; check its units")
+            raise ScanUnits(f"{span}: looks like {unit}; multiply by {factor} to get metres")
+    raise ScanUnits(f"{span}: not a scan of a building in metres; check its units")
 
 
-def _refuse_far(positions: NDArray[np.floating[Any]]) -> None:
+def _check_distance(positions: NDArray[np.floating[Any]]) -> None:
+    """Raise ScanError when a point (N, 3) lies too far away for float32 to keep its millimetres."""
     far = (np.abs(positions) > FARTHEST).any(axis=1)
     if far.any():
         first = int(np.argmax(far))

@@ -8,10 +8,9 @@ from dataclasses import dataclass
 from worker.cloud.types import Bools, Colors, Normals, Points
 from worker.cloud.voxels import Voxels
 from worker.errors import MapFailed
-from worker.pipeline.registration.icp import Surface
-from worker.pipeline.registration.preprocessing import surface_of
 from worker.pipeline.registration.results import RegisteredScan
 from worker.pipeline.registration.settings import RegistrationSettings
+from worker.pipeline.registration.surface import Surface, surface_of
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -25,7 +24,7 @@ class ReferenceMap:
     voxel_size: float  #: metres
 
     def surface(self) -> Surface:
-        """The map as a target of ICP; builds a tree (about 10 ms for 100,000 points)."""
+        """Return the map as a target of ICP; builds a tree (about 10 ms for 100,000 points)."""
         return Surface.of(self.points, self.normals, self.oriented)
 
 
@@ -58,7 +57,7 @@ def fuse(scans: Iterable[RegisteredScan], *, voxel_size: float) -> Voxels:
 
 
 def reference_map(fused: Voxels, *, settings: RegistrationSettings) -> ReferenceMap:
-    """The fused cloud with the normals that surveys will need, computed once."""
+    """Return the fused cloud with the normals that surveys will need, computed once."""
     surface = surface_of(fused, settings)
     return ReferenceMap(
         points=fused.points,
@@ -70,6 +69,6 @@ def reference_map(fused: Voxels, *, settings: RegistrationSettings) -> Reference
 
 
 def current_map(scans: Iterable[RegisteredScan], *, voxel_size: float) -> CurrentMap:
-    """The survey's scans fused like the map was (paper, Section 3.9.1)."""
+    """Fuse the survey's scans like the map was (paper, Section 3.9.1)."""
     fused = fuse(scans, voxel_size=voxel_size)
     return CurrentMap(points=fused.points, colors=fused.colors)

@@ -1,39 +1,100 @@
-"""What came of placing: an outcome for every file, and the totals."""
+"""Map registration: a pose for every scan among the others, and the totals of the paper's Table 2."""
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path
-from tempfile import TemporaryDirectory
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Self
 
 import numpy as np
 
 from worker.cloud.poses import transformed
 from worker.cloud.types import Matrix4
-from worker.errors import MapFailed
-from worker.pipeline.mapping.frame import map_from_reference
+from worker.errors import MapFailed, ScanError
 from worker.pipeline.mapping.multiview_refinement import Refined, refine_jointly
-from worker.pipeline.mapping.outlier_rejection import contradictions, most_accused
+from worker.pipeline.mapping.outlier_rejection import find_violations, most_voted
 from worker.pipeline.mapping.pair_registration import (
     NullPairCache,
+    Pair,
     PairCache,
-    PairWork,
-    ValidScan,
     plan_pairs,
     register_planned,
 )
-from worker.pipeline.mapping.pose_graph import Solution, components, solve_graph
+from worker.pipeline.mapping.pose_graph import Solution, components, map_from_reference, solve_graph
 from worker.pipeline.mapping.relocalization import Relocalized, relocalize
-from worker.pipeline.mapping.report import MapReport
-from worker.pipeline.mapping.settings import MapSettings, MultiScanSettings
-from worker.pipeline.mapping.tasks import Folder, PrepareTask, Read, forget_loaded, read_and_prepare
-from worker.pipeline.registration.results import RegistrationResult, ScanFile, ScanResult
+from worker.pipeline.mapping.settings import JointRegistrationSettings
+from worker.pipeline.mapping.tasks import PrepareTask, ValidScan, Workspace, open_workspace, read_and_prepare
+from worker.pipeline.registration.results import RegistrationResult, ScanFile, ScanRejected, ScanResult
 from worker.pipeline.registration.scan_to_scan import PairResult
-from worker.pipeline.registration.settings import RegistrationSettings
-from worker.processes import default_processes, open_processes
+from worker.processes import default_processes
 from worker.progress import Progress, monotonic_progress, no_progress
+
+_FEW = 4  # scans up to which processes cost more than they bring
+_FIRST_REFINEMENT, _REFINEMENTS = 0.6, 0.9  # of the stage's progress
+
+Scans = Mapping[int, ValidScan]  #: by index of the file
+Prepared = Mapping[int, ValidScan | ScanError | ScanRejected]  #: likewise; why a scan is not valid
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class MapReport:
+    """Totals; means and deviations are over the registrations that the map rests on, None where there is none."""
+
+    scans: int
+    accepted: int
+    discarded: int
+    pairs_possible: int  #: scans * (scans - 1) / 2; of a survey one a scan, to the map
+    pairs_tried: int  #: by ICP
+    calls_saved: float  #: share of the possible pairs that needed no ICP, 0..1
+    pairs_accepted: int  #: by their own numbers
+    pairs_contradicted: int  #: of those, rejected because loops do not close over them
+    mean_rmse: float | None  #: metres
+    std_rmse: float | None  #: metres
+    mean_fitness: float | None  #: 0..1
+    std_fitness: float | None
+    reference: int | None  #: index of the reference scan; None where the map was there before
+
+    @classmethod
+    def of(
+        cls,
+        results: Sequence[ScanResult],
+        *,
+        pairs: Sequence[PairResult] | None = None,
+        kept: Sequence[PairResult] = (),
+        reference: int | None = None,
+    ) -> Self:
+        """Count results; `pairs` are all that were tried, `kept` those that the map rests on.
+
+        Without pairs the scans were registered to a map that was there: each has one registration, to the map.
+        """
+        accepted = [result for result in results if result.registration is not None]
+        if pairs is None:
+            possible = tried = len(results)
+            agreed, edges = len(accepted), [(scan.fitness, scan.inlier_rmse) for scan in accepted]
+        else:
+            possible, tried = len(results) * (len(results) - 1) // 2, len(pairs)
+            agreed = sum(pair.accepted for pair in pairs)
+            edges = [(pair.fitness, pair.inlier_rmse) for pair in kept]
+        fitness, rmse = np.array(edges, np.float64).reshape(-1, 2).T
+        return cls(
+            scans=len(results),
+            accepted=len(accepted),
+            discarded=len(results) - len(accepted),
+            pairs_possible=possible,
+            pairs_tried=tried,
+            calls_saved=1 - tried / possible if possible else 0.0,
+            pairs_accepted=agreed,
+            pairs_contradicted=agreed - len(edges),
+            mean_rmse=float(rmse.mean()) if edges else None,
+            std_rmse=float(rmse.std()) if edges else None,
+            mean_fitness=float(fitness.mean()) if edges else None,
+            std_fitness=float(fitness.std()) if edges else None,
+            reference=reference,
+        )
+
+    def document(self) -> dict[str, Any]:
+        """Return it as JSON."""
+        return asdict(self)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -43,107 +104,14 @@ class MapRegistration:
     outcomes: tuple[ScanResult, ...]
     report: MapReport
     kept: tuple[PairResult, ...]  #: the registrations that the map rests on
-    contradicted: tuple[PairResult, ...]  #: accepted ones that were thrown out
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Result:
-    """What the stages left, by index of the file."""
-
-    read: Mapping[int, Read]
-    pairs: Sequence[PairResult]  #: all that were tried
-    solution: Solution
-    refined: Refined
-    relocalized: Mapping[int, Relocalized]
-    frame: Matrix4  #: (4, 4) map from the reference scan's frame
-
-    def placed(self, files: Sequence[ScanFile], folder: Folder) -> MapRegistration:
-        """Put together; the sensors' places come from the prepared scans in the folder."""
-        poses = self.refined.poses
-        kept = tuple(edge for edge in self.solution.kept if edge.target in poses and edge.source in poses)
-        by_scan = _by_scan(kept)
-        outcomes = tuple(
-            self._accepted(index, file.name, by_scan[index], folder)
-            if index in poses
-            else self._left_out(index, file.name)
-            for index, file in enumerate(files)
-        )
-        report = MapReport.of(
-            scans=len(files),
-            accepted=len(poses),
-            pairs=self.pairs,
-            kept=kept,
-            reference=self.solution.reference,
-        )
-        return MapRegistration(
-            outcomes=outcomes, report=report, kept=kept, contradicted=self.solution.contradicted
-        )
-
-    def _accepted(self, index: int, name: str, edges: Sequence[PairResult], folder: Folder) -> ScanResult:
-        pose = self.frame @ self.refined.poses[index]
-        origin = folder.load(index).origin
-        late = self.relocalized.get(index)
-        if late is not None and late.placement is not None:
-            found, path = late.placement, (*self.solution.paths.get(late.beside, ()), index)
-        else:
-            found, path = _of_edges(edges), self.solution.paths[index]
-        placement = replace(
-            found,
-            map_from_scan=pose,
-            sensor_origin=None if origin is None else transformed(origin[None], pose)[0],
-            uncertainty=self.refined.uncertainties[index] if len(self.refined.poses) > 1 else None,
-            path=path,
-        )
-        return ScanResult(
-            name=name, placement=placement, fitness=placement.fitness, inlier_rmse=placement.inlier_rmse
-        )
-
-    def _left_out(self, index: int, name: str) -> ScanResult:
-        """Why: the file, the scan by itself, the search for it, or what its neighbours saw."""
-        read, late = self.read[index], self.relocalized.get(index)
-        reason = read.error or read.reason or (None if late is None else late.reason)
-        if reason is None:
-            reason = f"scan {name}: it contradicts what its neighbours saw as free space; scan there again"
-        return ScanResult(
-            name=name,
-            placement=None,
-            reason=str(reason),
-            fitness=None if late is None else late.fitness,
-            inlier_rmse=None if late is None else late.inlier_rmse,
-        )
-
-
-def _of_edges(edges: Sequence[PairResult]) -> RegistrationResult:
-    """The numbers of a scan: means over its registrations, and the best cover."""
-    best = max(edges, key=lambda edge: edge.score, default=None)
-    return RegistrationResult(
-        map_from_scan=np.eye(4),
-        sensor_origin=None,
-        fitness=float(np.mean([edge.fitness for edge in edges])) if edges else None,
-        inlier_rmse=float(np.mean([edge.inlier_rmse for edge in edges])) if edges else None,
-        overlap=1.0 if best is None else best.overlap,
-        agreement=1.0 if best is None else best.agreement,
-        searched=best is not None and not best.consistent_with_prior,
-        uncertainty=None,
-    )
-
-
-def _by_scan(edges: Sequence[PairResult]) -> defaultdict[int, list[PairResult]]:
-    by_scan: defaultdict[int, list[PairResult]] = defaultdict(list)
-    for edge in edges:
-        by_scan[edge.target].append(edge)
-        by_scan[edge.source].append(edge)
-    return by_scan
-
-
-_FEW = 4  # scans up to which processes cost more than they bring
+    rejected: tuple[PairResult, ...]  #: accepted ones that loops or free space contradict
 
 
 def register_map_scans(
     files: Sequence[ScanFile],
     *,
-    settings: MultiScanSettings,
-    memory: PairCache | None = None,
+    settings: JointRegistrationSettings,
+    pair_cache: PairCache | None = None,
     processes: int | None = None,
     progress: Progress = no_progress,
 ) -> MapRegistration:
@@ -153,175 +121,204 @@ def register_map_scans(
     be read.
     """
     count = default_processes() if processes is None else processes
-    with TemporaryDirectory(prefix="spicd-scans-") as root, open_processes(_worth(count, files)) as pool:
-        try:
-            build = _Build(
-                files=files,
-                registration=settings.registration,
-                mapping=settings.mapping,
-                max_points=settings.max_points,
-                work=PairWork(
-                    folder=Folder(root=Path(root)),
-                    processes=pool,
-                    registration=settings.registration,
-                    mapping=settings.mapping,
-                    memory=NullPairCache() if memory is None else memory,
-                ),
-                progress=monotonic_progress(progress),
-            )
-            return build.run()
-        finally:
-            forget_loaded()
-
-
-def _worth(count: int, files: Sequence[ScanFile]) -> int:
-    return 1 if len(files) <= _FEW else count
+    with open_workspace(settings, processes=1 if len(files) <= _FEW else count) as workspace:
+        build = _Build(
+            files=files,
+            workspace=workspace,
+            pair_cache=NullPairCache() if pair_cache is None else pair_cache,
+            progress=monotonic_progress(progress),
+        )
+        return build.run()
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class _Build:
-    """One build: its inputs, and each stage as a method."""
+    """One build: its inputs, and each step as a method."""
 
     files: Sequence[ScanFile]
-    registration: RegistrationSettings
-    mapping: MapSettings
-    max_points: int
-    work: PairWork
+    workspace: Workspace
+    pair_cache: PairCache
     progress: Progress
 
     def run(self) -> MapRegistration:
-        """The whole of it, in order."""
-        read = self._read()
-        sound = self._sound(read)
-        pairs, solution = self._connected(sound)
-        self.progress("registering", 1.0)
-        self.progress("refining", 0.0)
-        tied = [(edge.target, edge.source) for edge in solution.kept]
-        refined = self._refined(solution, solution.poses, sound, also=tied, first=True)
-        relocalized: dict[int, Relocalized] = {}
-        while missing := sorted(set(sound) - set(refined.poses)):
-            tried = relocalize(missing, refined.poses, solution.reference, sound, self.work)
-            found = {number: each.pose for number, each in tried.items() if each.pose is not None}
-            relocalized |= tried
-            if not found:
-                break
-            before = len(refined.poses)
-            tied += [(relocalized[number].beside, number) for number in found]
-            refined = self._refined(solution, refined.poses | found, sound, also=tied, first=False)
-            if len(refined.poses) <= before:  # who was found is contradicted by the others
-                break
-        self.progress("refining", 1.0)
-        priors = {number: scan.prior for number, scan in sound.items() if scan.prior is not None}
-        result = Result(
-            read=read,
-            pairs=pairs,
-            solution=solution,
-            refined=refined,
-            relocalized=relocalized,
-            frame=map_from_reference(refined.poses, priors, solution.reference),
-        )
-        return result.placed(self.files, self.work.folder)
+        """Run the steps in order."""
+        prepared = self._prepare()
+        scans = self._valid(prepared)
+        pairs, graph = self._connect(scans)
+        refined, relocalized = self._refine_and_relocalize(scans, graph)
+        kept = tuple(edge for edge in graph.kept if refined.poses.keys() >= set(edge.pair))
+        results = self._results(prepared, replace(graph, kept=kept), refined, relocalized)
+        report = MapReport.of(results, pairs=pairs, kept=kept, reference=graph.reference)
+        return MapRegistration(outcomes=results, report=report, kept=kept, rejected=graph.rejected)
 
-    def _read(self) -> dict[int, Read]:
+    def _prepare(self) -> Prepared:
+        """Read every file; return the scans that can hold a pose, and for the others why they cannot."""
+        settings, folder = self.workspace.settings, self.workspace.folder
         tasks = [
-            PrepareTask(
-                folder=self.work.folder,
-                index=index,
-                file=file,
-                settings=self.registration,
-                max_points=self.max_points,
-            )
+            PrepareTask(folder=folder, index=index, file=file, settings=settings)
             for index, file in enumerate(self.files)
         ]
-        read = {}
-        for done, each in enumerate(self.work.processes.each(read_and_prepare, tasks)):
-            read[each.index] = each
-            self.progress("reading", done / len(tasks))
+        prepared = {}
+        for count, (index, scan) in enumerate(self.workspace.processes.each(read_and_prepare, tasks)):
+            prepared[index] = scan
+            self.progress("reading", count / len(tasks))
         self.progress("reading", 1.0)
-        return read
+        return dict(sorted(prepared.items()))
 
-    def _sound(self, read: Mapping[int, Read]) -> dict[int, ValidScan]:
-        """The scans that can hold a pose; raises where there is none."""
-        sound = {}
-        for index, each in sorted(read.items()):
-            if each.points is not None and each.sensor_pose is not None:
-                sound[index] = ValidScan(points=each.points, prior=self.files[index].start(each.sensor_pose))
-        if sound:
-            return sound
-        errors = [read[index].error for index in sorted(read) if read[index].error]
-        if len(errors) == len(read) and errors[0] is not None:
+    def _valid(self, prepared: Prepared) -> Scans:
+        """Return the scans that can hold a pose; raise where there is none."""
+        scans = {index: scan for index, scan in prepared.items() if isinstance(scan, ValidScan)}
+        if scans:
+            return scans
+        errors = [error for error in prepared.values() if isinstance(error, ScanError)]
+        if errors and len(errors) == len(prepared):
             raise errors[0]
-        raise MapFailed("; ".join(str(each.error or each.reason) for _, each in sorted(read.items())))
+        raise MapFailed("; ".join(map(str, prepared.values())))
 
-    def _connected(self, sound: Mapping[int, ValidScan]) -> tuple[list[PairResult], Solution]:
-        """Register the likeliest pairs; as long as that leaves several parts, the likeliest between them as well."""
-        searching = any(scan.prior is None for scan in sound.values())
-        half = 0.5 if searching else 0.0
-        span = (1 - half) / self.mapping.pairing_rounds
-        plan = plan_pairs(sound, self.work, progress=self._part(0.0, half))
-        wanted, pairs = plan.first(self.mapping), []
-        for round_ in range(self.mapping.pairing_rounds):
-            begin = half + span * round_
-            pairs += register_planned(wanted, plan, sound, self.work, progress=self._part(begin, span))
-            solution = self._solved(plan.numbers, pairs, sound)
-            parts = components(plan.numbers, [*solution.kept, *solution.elsewhere])
-            wanted = plan.across(parts, {(pair.target, pair.source) for pair in pairs}, self.mapping)
+    def _connect(self, scans: Scans) -> tuple[list[PairResult], Solution]:
+        """Register the likeliest pairs; as long as that leaves several components, the likeliest between them too."""
+        settings = self.workspace.settings.mapping
+        planning = 0.5 if any(scan.prior is None for scan in scans.values()) else 0.0
+        span = (1 - planning) / settings.pairing_rounds
+        plan = plan_pairs(scans, self.workspace, progress=self._registering(0.0, planning))
+        wanted, pairs = plan.first(settings), []
+        for number in range(settings.pairing_rounds):
+            progress = self._registering(planning + span * number, span)
+            pairs += register_planned(wanted, plan, scans, self.workspace, self.pair_cache, progress=progress)
+            graph = self._solve(pairs, scans)
+            joined = components(plan.indices, [*graph.kept, *graph.elsewhere])
+            wanted = plan.across(joined, {pair.pair for pair in pairs}, settings)
             if not wanted:
                 break
-        return pairs, solution
+        self.progress("registering", 1.0)
+        return pairs, graph
 
-    def _solved(
-        self, numbers: Sequence[int], pairs: Sequence[PairResult], sound: Mapping[int, ValidScan]
-    ) -> Solution:
-        """The graph solved without the edges that free space accuses, one after the other."""
-        points = {number: sound[number].points for number in numbers}
-        accused: list[PairResult] = []
-        while True:
-            heard = [pair for pair in pairs if not any(pair is each for each in accused)]
-            solution = solve_graph(numbers, heard, self.mapping)
-            found = contradictions(
-                solution.poses,
-                points,
-                self.work.folder,
-                self.work.processes,
-                limit=self.mapping.max_contradiction,
-                settings=self.mapping,
-            )
-            worst = most_accused(list(solution.poses), solution.kept, found, self.mapping)
-            if worst is None:
-                return replace(solution, contradicted=(*solution.contradicted, *accused))
-            accused.append(worst)
-
-    def _part(self, begin: float, span: float) -> Callable[[float], None]:
-        """Progress of a part of the registration."""
+    def _registering(self, begin: float, span: float) -> Callable[[float], None]:
         return lambda share: self.progress("registering", begin + span * share)
 
-    def _refined(
+    def _solve(self, pairs: Sequence[PairResult], scans: Scans) -> Solution:
+        """Solve the graph without the edges that free space votes out, one after the other."""
+        settings = self.workspace.settings.mapping
+        points = {index: scan.points for index, scan in scans.items()}
+        outliers: list[PairResult] = []
+        while True:
+            inliers = [pair for pair in pairs if not any(pair is outlier for outlier in outliers)]
+            graph = solve_graph(list(scans), inliers, settings)
+            violations = find_violations(graph.poses, points, self.workspace)
+            worst = most_voted(list(graph.poses), graph.kept, violations, settings)
+            if worst is None:
+                return replace(graph, rejected=(*graph.rejected, *outliers))
+            outliers.append(worst)
+
+    def _refine_and_relocalize(self, scans: Scans, graph: Solution) -> tuple[Refined, dict[int, Relocalized]]:
+        """Refine what the graph holds; look for the missing scans in it, and refine again, as long as one is found."""
+        self.progress("refining", 0.0)
+        ties = [edge.pair for edge in graph.kept]
+        refined = self._refine(graph.poses, scans, graph.reference, ties, span=_FIRST_REFINEMENT)
+        relocalized: dict[int, Relocalized] = {}
+        while missing := sorted(set(scans) - set(refined.poses)):
+            attempts = relocalize(missing, refined.poses, graph.reference, scans, self.workspace)
+            relocalized |= attempts
+            poses = {index: item.pose for index, item in attempts.items() if item.pose is not None}
+            if not poses:
+                break
+            before = len(refined.poses)
+            ties += [(attempts[index].nearest, index) for index in poses]
+            together = refined.poses | poses
+            refined = self._refine(together, scans, graph.reference, ties, span=_REFINEMENTS)
+            if len(refined.poses) <= before:  # what was found is contradicted by the others
+                break
+        self.progress("refining", 1.0)
+        return refined, relocalized
+
+    def _refine(
         self,
-        solution: Solution,
         poses: Mapping[int, Matrix4],
-        sound: Mapping[int, ValidScan],
+        scans: Scans,
+        reference: int,
+        ties: Sequence[Pair],
         *,
-        also: Sequence[tuple[int, int]],
-        first: bool,
+        span: float,
     ) -> Refined:
-        """Refine jointly; leave out, worst first, whom the free space of the others contradicts, and refine again."""
-        current = dict(poses)
+        """Refine jointly; leave out, worst first, what the free space of the others contradicts, and refine again."""
+        limit = self.workspace.settings.registration.max_free_space_violation
         while True:
             refined = refine_jointly(
-                current,
-                {number: sound[number].points for number in current},
-                fixed=solution.reference,
-                also=also,
-                folder=self.work.folder,
-                processes=self.work.processes,
-                settings=self.mapping,
-                progress=lambda share: self.progress("refining", (0.6 if first else 0.9) * share),
+                poses,
+                {index: scans[index].points for index in poses},
+                self.workspace,
+                fixed=reference,
+                ties=ties,
+                progress=lambda share: self.progress("refining", span * share),
             )
-            worst = max(refined.free_space_violation, key=lambda number: refined.free_space_violation[number])
-            if (
-                refined.free_space_violation[worst] <= self.registration.max_free_space_violation
-                or worst == solution.reference
-            ):
+            violations = refined.free_space_violation
+            worst = max(violations, key=lambda index: violations[index])
+            if violations[worst] <= limit or worst == reference:
                 return refined
-            current = {number: pose for number, pose in refined.poses.items() if number != worst}
+            poses = {index: pose for index, pose in refined.poses.items() if index != worst}
+
+    def _results(
+        self,
+        prepared: Prepared,
+        graph: Solution,
+        refined: Refined,
+        relocalized: Mapping[int, Relocalized],
+    ) -> tuple[ScanResult, ...]:
+        """Return what became of each file: registered in the map's frame, or left out with a reason."""
+        priors = {
+            index: scan.prior
+            for index, scan in prepared.items()
+            if isinstance(scan, ValidScan) and scan.prior is not None
+        }
+        frame = map_from_reference(refined.poses, priors, graph.reference)
+        results = []
+        for index, scan in prepared.items():
+            name, late = self.files[index].name, relocalized.get(index)
+            if index in refined.poses:
+                registration = self._registration(index, graph, refined, late, frame)
+                results.append(ScanResult.accepted(name, registration))
+            elif isinstance(scan, Exception):
+                results.append(ScanResult.rejected(name, scan))
+            elif late is not None and late.pose is None:
+                results.append(late.result)
+            else:
+                reason = (
+                    f"scan {name}: it contradicts what its neighbours saw as free space; scan there again"
+                )
+                results.append(ScanResult.rejected(name, ScanRejected(reason)))
+        return tuple(results)
+
+    def _registration(
+        self, index: int, graph: Solution, refined: Refined, late: Relocalized | None, frame: Matrix4
+    ) -> RegistrationResult:
+        """Return the numbers of its own registrations, or of its relocalization, at the refined pose."""
+        pose = frame @ refined.poses[index]
+        origin = self.workspace.folder.load(index).origin
+        if late is not None and late.result.registration is not None:
+            registration = late.result.registration
+            path = (*graph.paths.get(late.nearest, ()), index)
+        else:
+            registration = _mean_of_edges([edge for edge in graph.kept if index in edge.pair])
+            path = graph.paths[index]
+        return replace(
+            registration,
+            map_from_scan=pose,
+            sensor_origin=None if origin is None else transformed(origin[None], pose)[0],
+            uncertainty=refined.uncertainties[index] if len(refined.poses) > 1 else None,
+            path=path,
+        )
+
+
+def _mean_of_edges(edges: Sequence[PairResult]) -> RegistrationResult:
+    """Return the numbers of a scan: means over its registrations, and the best cover."""
+    best = max(edges, key=lambda edge: edge.score, default=None)
+    return RegistrationResult(
+        map_from_scan=np.eye(4),
+        sensor_origin=None,
+        fitness=float(np.mean([edge.fitness for edge in edges])) if edges else None,
+        inlier_rmse=float(np.mean([edge.inlier_rmse for edge in edges])) if edges else None,
+        overlap=1.0 if best is None else best.overlap,
+        two_way_inlier_ratio=1.0 if best is None else best.two_way_inlier_ratio,
+        from_global_search=best is not None and not best.consistent_with_prior,
+        uncertainty=None,
+    )

@@ -30,25 +30,27 @@ class Extent:
 
     @classmethod
     def of(cls, points: NDArray[Any], frame_from_scan: Matrix4) -> Self:
-        """Of points (N, 3), metres, scan frame."""
-        moved = transformed(points, frame_from_scan)
-        low, high = np.percentile(moved, _SHARE, axis=0)
-        return cls(low=low, high=high, centroid=moved.mean(axis=0))
+        """Measure points (N, 3), metres, scan frame."""
+        there = transformed(points, frame_from_scan)
+        low, high = np.percentile(there, _SHARE, axis=0)
+        return cls(low=low, high=high, centroid=there.mean(axis=0))
 
 
-def likely_pairs(extents: Mapping[int, Extent], settings: MapSettings) -> list[tuple[int, int]]:
-    """Pairs (lower index, higher index), sorted; at most `partners` a scan proposes."""
-    return best_pairs(sorted(extents), overlap_rank(extents, settings), settings.partners)
+def likely_pairs(
+    extents: Mapping[int, Extent], settings: MapSettings, *, partners: int | None = None
+) -> list[tuple[int, int]]:
+    """Return pairs (lower index, higher index), sorted; each scan proposes `partners` at most, else the settings'."""
+    rank = overlap_rank(extents, settings)
+    return best_pairs(sorted(extents), rank, settings.partners if partners is None else partners)
 
 
 def overlap_rank(extents: Mapping[int, Extent], settings: MapSettings) -> Floats:
-    """(S, S) how likely two scans see the same, 0..1, in the order of their indices; 0 where they are culled."""
-    numbers = sorted(extents)
-    if not numbers:
+    """Rank (S, S) how likely two scans see the same, 0..1, in the order of their indices; 0 where they are culled."""
+    if not extents:
         return np.zeros((0, 0))
+    ordered = [extents[index] for index in sorted(extents)]
     low, high, centroid = (
-        np.stack([getattr(extents[number], name) for number in numbers])
-        for name in ("low", "high", "centroid")
+        np.stack([getattr(extent, name) for extent in ordered]) for name in ("low", "high", "centroid")
     )
     shared = np.minimum(high[:, None], high) - np.maximum(low[:, None], low)  # (S, S, 3)
     volume = np.prod(np.maximum(high - low, 1e-3), axis=1)
@@ -66,11 +68,11 @@ def overlap_rank(extents: Mapping[int, Extent], settings: MapSettings) -> Floats
     return rank
 
 
-def best_pairs(numbers: list[int], rank: Floats, partners: int) -> list[tuple[int, int]]:
-    """Each scan's `partners` of highest `rank` (S, S); a rank of 0 is no pair."""
+def best_pairs(indices: list[int], rank: Floats, partners: int) -> list[tuple[int, int]]:
+    """Return each scan's `partners` of highest `rank` (S, S); a rank of 0 is no pair."""
     pairs = set()
-    for row, number in enumerate(numbers):
-        for other in np.argsort(-rank[row], kind="stable")[:partners]:
-            if rank[row, other] > 0:
-                pairs.add((min(number, numbers[other]), max(number, numbers[other])))
+    for row, index in enumerate(indices):
+        for column in np.argsort(-rank[row], kind="stable")[:partners]:
+            if rank[row, column] > 0:
+                pairs.add((min(index, indices[column]), max(index, indices[column])))
     return sorted(pairs)

@@ -1,8 +1,8 @@
 """Least squares over the poses of many scans, with the wrong registrations outvoted, not averaged in.
 
-Everything is linearised in one frame, that of the map: a scan's pose T becomes exp(d) T, and a term between two scans
-costs u'Hu + 2g'u with u = d_source - d_target. Registrations of a pose graph and point pairs of a joint refinement are
-both such terms. Robust weights by graduated non-convexity with the Geman-McClure loss (Yang et al., RA-L 2020).
+Everything is linearised in one frame, that of the map: a scan's pose T becomes exp(d) T, and a factor between two scans
+costs u'Hu + 2g'u with u = d_source - d_target. Registrations of a pose graph and point pairs of a multi-view refinement
+are both such factors. Robust weights by graduated non-convexity with the Geman-McClure loss (Yang et al., RA-L 2020).
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import scipy.sparse.linalg
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 
-from worker.cloud.poses import difference, exponential, inverse
+from worker.cloud.poses import adjoint, difference, exponential, inverse
 from worker.cloud.types import Floats, Matrix4
 from worker.pipeline.mapping.settings import MapSettings
 from worker.pipeline.registration.scan_to_scan import PairResult
@@ -37,44 +37,44 @@ class Factor:
     gradient: Floats  #: (6,) g
 
 
-def moved(poses: Poses, steps: Mapping[int, Floats]) -> dict[int, Matrix4]:
-    """Each pose after its step (6,)."""
+def retract(poses: Poses, steps: Mapping[int, Floats]) -> dict[int, Matrix4]:
+    """Return each pose after its step (6,)."""
     return {scan: exponential(steps[scan]) @ pose if scan in steps else pose for scan, pose in poses.items()}
 
 
-def solve(scans: Sequence[int], terms: Sequence[Factor], *, fixed: int) -> dict[int, Floats]:
-    """The step (6,) of every scan but the fixed one that makes the sum of all terms least."""
-    matrix, right = _system(scans, terms, fixed)
+def solve(scans: Sequence[int], factors: Sequence[Factor], *, fixed: int) -> dict[int, Floats]:
+    """Return the step (6,) of every scan but the fixed one that makes the sum of all factors least."""
+    matrix, right = _system(scans, factors, fixed)
     solution = scipy.sparse.linalg.spsolve(matrix.tocsc(), right)
     free = [scan for scan in scans if scan != fixed]
     return dict(zip(free, np.asarray(solution).reshape(-1, 6), strict=True))
 
 
 def covariances(
-    scans: Sequence[int], terms: Sequence[Factor], *, fixed: int, variance: float
+    scans: Sequence[int], factors: Sequence[Factor], *, fixed: int, variance: float
 ) -> dict[int, Floats]:
-    """(6, 6) of each free scan's step, every other scan's being unknown too; `variance` is that of one pair, m^2."""
-    matrix, _ = _system(scans, terms, fixed)
+    """Return the (6, 6) of each free scan's step, every other being unknown too; `variance` is of one pair, m^2."""
+    matrix, _ = _system(scans, factors, fixed)
     inverted = np.linalg.inv(matrix.toarray()) * variance
     free = [scan for scan in scans if scan != fixed]
-    return {scan: inverted[6 * at : 6 * at + 6, 6 * at : 6 * at + 6] for at, scan in enumerate(free)}
+    return {scan: inverted[6 * row : 6 * row + 6, 6 * row : 6 * row + 6] for row, scan in enumerate(free)}
 
 
-def pose_graph_terms(poses: Poses, edges: Sequence[PairResult], weights: Floats) -> list[Factor]:
-    """Each registration as a term at these poses."""
-    return [_edge_term(poses, edge, weight) for edge, weight in zip(edges, weights, strict=True)]
+def pose_graph_factors(poses: Poses, edges: Sequence[PairResult], weights: Floats) -> list[Factor]:
+    """Return each registration as a factor at these poses."""
+    return [_factor(poses, edge, weight) for edge, weight in zip(edges, weights, strict=True)]
 
 
 def residual(poses: Poses, edge: PairResult, settings: MapSettings) -> float:
-    """How far a registration is from the poses: 1 where it is off by as much as a loop may be."""
+    """Measure how far a registration is from the poses: 1 where it is off by as much as a loop may be."""
     metres, radians = difference(edge.target_from_source, inverse(poses[edge.target]) @ poses[edge.source])
     return float(np.hypot(metres / settings.loop_distance, radians / settings.loop_angle))
 
 
-def optimised(
+def optimize(
     poses: Poses, edges: Sequence[PairResult], *, fixed: int, settings: MapSettings
 ) -> tuple[dict[int, Matrix4], Floats]:
-    """Poses on which as many registrations as possible agree, and the weight (E,) of each, 0..1.
+    """Find poses on which as many registrations as possible agree, and the weight (E,) of each, 0..1.
 
     Begins with nearly every registration heard and ends with those outvoted that are far from all others.
     """
@@ -87,8 +87,8 @@ def optimised(
     left = _STEPS_AT_END
     while left:
         weights = trust * (softness / (squares + softness)) ** 2
-        steps = solve(scans, pose_graph_terms(current, edges, weights), fixed=fixed)
-        current = moved(current, steps)
+        factors = pose_graph_factors(current, edges, weights)
+        current = retract(current, solve(scans, factors, fixed=fixed))
         squares = _squares(current, edges, settings)
         left -= softness == 1.0
         softness = max(softness / _ANNEALING, 1.0)
@@ -99,56 +99,46 @@ def _squares(poses: Poses, edges: Sequence[PairResult], settings: MapSettings) -
     return np.array([residual(poses, edge, settings) ** 2 for edge in edges])
 
 
-def _edge_term(poses: Poses, edge: PairResult, weight: float) -> Factor:
+def _factor(poses: Poses, edge: PairResult, weight: float) -> Factor:
     target = poses[edge.target]
     wanted = target @ edge.target_from_source @ inverse(poses[edge.source])
     twist = np.r_[Rotation.from_matrix(wanted[:3, :3]).as_rotvec(), wanted[:3, 3]]
-    # a direction that the pair leaves free is held a little, so that every graph has a solution
-    held = edge.information + 1e-6 * np.trace(edge.information) / 6 * np.eye(6)
+    # damping: a direction that the pair leaves free is held a little, so that every graph has a solution
+    damped = edge.information + 1e-6 * np.trace(edge.information) / 6 * np.eye(6)
     back = adjoint(inverse(target))
-    information = weight * (back.T @ held @ back)
+    information = weight * (back.T @ damped @ back)
     return Factor(
         target=edge.target, source=edge.source, information=information, gradient=-information @ twist
     )
 
 
-def adjoint(pose: Matrix4) -> Floats:
-    """(6, 6): a twist (rotation, translation) in one frame as the same motion in another."""
-    x, y, z = pose[:3, 3]
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    result = np.zeros((6, 6))
-    result[:3, :3] = result[3:, 3:] = pose[:3, :3]
-    result[3:, :3] = cross @ pose[:3, :3]
-    return result
-
-
-def _loose(scans: Sequence[int], terms: Sequence[Factor], fixed: int) -> list[int]:
-    """Scans that no chain of terms ties to the fixed one: they are held where they are, and are unsure."""
+def _loose(scans: Sequence[int], factors: Sequence[Factor], fixed: int) -> list[int]:
+    """Return the scans that no chain of factors ties to the fixed one: they are held where they are, and are unsure."""
     row_of = {scan: row for row, scan in enumerate(scans)}
-    ends = ([row_of[term.target] for term in terms], [row_of[term.source] for term in terms])
-    graph = scipy.sparse.csr_array((np.ones(len(terms)), ends), shape=(len(scans), len(scans)))
+    ends = ([row_of[factor.target] for factor in factors], [row_of[factor.source] for factor in factors])
+    graph = scipy.sparse.csr_array((np.ones(len(factors)), ends), shape=(len(scans), len(scans)))
     _, labels = connected_components(graph, directed=False)
     return [scan for scan in scans if labels[row_of[scan]] != labels[row_of[fixed]]]
 
 
 def _system(
-    scans: Sequence[int], terms: Sequence[Factor], fixed: int
+    scans: Sequence[int], factors: Sequence[Factor], fixed: int
 ) -> tuple[scipy.sparse.coo_array, Floats]:
     row_of = {scan: row for row, scan in enumerate(scan for scan in scans if scan != fixed)}
     right = np.zeros(6 * len(row_of))
     rows, columns, blocks = [], [], []
-    for term in terms:
-        ends = [(row_of.get(term.source), 1.0), (row_of.get(term.target), -1.0)]
+    for factor in factors:
+        ends = [(row_of.get(factor.source), 1.0), (row_of.get(factor.target), -1.0)]
         for a, sign in ends:
             if a is None:
                 continue
-            right[6 * a : 6 * a + 6] -= sign * term.gradient
+            right[6 * a : 6 * a + 6] -= sign * factor.gradient
             for b, other in ends:
                 if b is not None:
                     rows.append(a)
                     columns.append(b)
-                    blocks.append(sign * other * term.information)
-    for scan in _loose(scans, terms, fixed):
+                    blocks.append(sign * other * factor.information)
+    for scan in _loose(scans, factors, fixed):
         rows.append(row_of[scan])
         columns.append(row_of[scan])
         blocks.append(np.eye(6))

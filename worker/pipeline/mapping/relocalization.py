@@ -1,4 +1,4 @@
-"""A second chance: scans that no single scan wanted are looked for in the map of all that were placed."""
+"""Relocalization: scans that no pair led to are looked for in the map of all that were registered."""
 
 from __future__ import annotations
 
@@ -9,38 +9,43 @@ import numpy as np
 
 from worker.cloud.poses import inverse
 from worker.cloud.types import Matrix4
-from worker.pipeline.mapping.frame import map_from_reference
-from worker.pipeline.mapping.pair_registration import PairWork, ValidScan
-from worker.pipeline.mapping.tasks import Folder, assembled
-from worker.pipeline.registration.preprocessing import PreparedScan, ScanRejected, free_space_violation
-from worker.pipeline.registration.results import RegistrationResult
-from worker.pipeline.registration.scan_to_map import placement_of, register
-from worker.pipeline.registration.settings import RegistrationSettings
+from worker.pipeline.mapping.pose_graph import map_from_reference
+from worker.pipeline.mapping.tasks import Folder, ValidScan, Workspace, lay_together
+from worker.pipeline.registration.hypothesis import Hypothesis
+from worker.pipeline.registration.preprocessing import PreparedScan
+from worker.pipeline.registration.results import ScanRejected, ScanResult
+from worker.pipeline.registration.scan_to_map import register, registration_result
+from worker.pipeline.registration.settings import RegistrationSettings, with_values
+from worker.pipeline.registration.verification import free_space_violation, rejected
 
-_FEW = 4  # placed scans up to which the whole search is worth its time
+_FEW = 4  # registered scans up to which the whole search is worth its time
 _NEAR = 6.0  # metres between sensors, within which one scan can speak of another
+_NEIGHBOURS = 8  # that are asked at most
+
+IndexedPose = tuple[int, Matrix4]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Relocalized:
     """What became of one scan that was left over."""
 
-    number: int
-    pose: Matrix4 | None = None  #: in the frame of the poses that were given; None where it has no place
-    beside: int = -1  #: the placed scan nearest to it
-    placement: RegistrationResult | None = None  #: its numbers
-    reason: str | None = None
-    fitness: float | None = None
-    inlier_rmse: float | None = None
+    index: int  #: of the file
+    result: ScanResult  #: accepted, in the frame of the poses that were given, or rejected
+    nearest: int = -1  #: the registered scan nearest to it; -1 where it has no place
+
+    @property
+    def pose(self) -> Matrix4 | None:
+        """In the frame of the poses that were given; None where it has no place."""
+        return None if self.result.registration is None else self.result.registration.map_from_scan
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class _Looking:
+class _RelocalizeTask:
     folder: Folder
-    map_number: int  #: of what the scan is looked for in
-    number: int
-    start: Matrix4 | None
-    poses: tuple[tuple[int, Matrix4], ...]
+    map_index: int  #: of what the scan is looked for in
+    index: int
+    prior: Matrix4 | None  #: map_from_scan
+    poses: tuple[IndexedPose, ...]  #: of the registered scans
     settings: RegistrationSettings
 
 
@@ -49,83 +54,71 @@ def relocalize(
     poses: Mapping[int, Matrix4],
     reference: int,
     scans: Mapping[int, ValidScan],
-    work: PairWork,
+    workspace: Workspace,
 ) -> dict[int, Relocalized]:
-    """Register each missing scan to the placed ones as a survey is registered to a map; all in one frame."""
+    """Register each missing scan to the registered ones as a survey is registered to a map; all in one frame."""
     if not missing:
         return {}
-    surface = assembled(work.folder, list(poses.items()), voxel_size=work.registration.voxel_size)
+    settings = workspace.settings.registration
+    surface = lay_together(workspace.folder, list(poses.items()), voxel_size=settings.voxel_size)
     # Below every scan's, and a new one whenever the map has grown: processes keep what they loaded.
-    map_number = -len(poses)
-    PreparedScan(name="map", surface=surface, image=None, sensor_pose=np.eye(4)).save(
-        work.folder.path(map_number)
-    )
-    priors = {number: scan.prior for number, scan in scans.items() if scan.prior is not None}
-    frame = inverse(map_from_reference(poses, priors, reference))
+    map_index = -len(poses)
+    workspace.folder.save_map(map_index, surface)
+    if len(poses) > _FEW:
+        # one draw of features: these scans have been looked for in every registered scan already
+        first = settings.search_resolutions[:1]
+        settings = with_values(settings, search_resolutions=first, search_seeds=1)
+    priors = {index: scan.prior for index, scan in scans.items() if scan.prior is not None}
+    reference_from_map = inverse(map_from_reference(poses, priors, reference))
     tasks = [
-        _Looking(
-            folder=work.folder,
-            map_number=map_number,
-            number=number,
-            start=frame @ priors[number] if number in priors else None,
+        _RelocalizeTask(
+            folder=workspace.folder,
+            map_index=map_index,
+            index=index,
+            prior=reference_from_map @ priors[index] if index in priors else None,
             poses=tuple(poses.items()),
-            settings=_hurried(work.registration) if len(poses) > _FEW else work.registration,
+            settings=settings,
         )
-        for number in missing
+        for index in missing
     ]
-    return {each.number: each for each in work.processes.each(_look, tasks)}
+    return {attempt.index: attempt for attempt in workspace.processes.each(_relocalize_one, tasks)}
 
 
-def _hurried(settings: RegistrationSettings) -> RegistrationSettings:
-    """One draw of features: these scans have been looked for in every placed scan already."""
-    return settings.model_copy(
-        update={"search_resolutions": settings.search_resolutions[:1], "search_seeds": 1}
-    )
-
-
-def _look(task: _Looking) -> Relocalized:
-    scan, target = task.folder.load(task.number), task.folder.load(task.map_number).surface
+def _relocalize_one(task: _RelocalizeTask) -> Relocalized:
+    scan, target = task.folder.load(task.index), task.folder.load(task.map_index).surface
     try:
-        best = register(scan, target, start=task.start, settings=task.settings)
+        hypothesis = register(scan, target, prior=task.prior, settings=task.settings)
+        pose = hypothesis.target_from_source
+        near = sorted(task.poses, key=lambda other: _apart(other[1], pose))
+        _require_free_space(scan, hypothesis, near, task)
     except ScanRejected as error:
-        return Relocalized(
-            number=task.number, reason=str(error), fitness=error.fitness, inlier_rmse=error.inlier_rmse
-        )
-    pose = best.found.target_from_source
-    near = _by_distance(pose, task.poses)
-    through = _contradicted(scan, pose, near, task.folder)
-    limit = (
-        task.settings.max_free_space_violation_near_prior
-        if best.consistent_with_prior
-        else task.settings.max_free_space_violation
-    )
-    if through > limit:
-        reason = (
-            f"scan {scan.name}: {through:.1%} of its points stand where its neighbours saw free space (at most "
-            f"{limit:.1%} is accepted); {'check its pose prior' if best.consistent_with_prior else 'give an initial pose'}, "
-            "or scan there again"
-        )
-        return Relocalized(
-            number=task.number,
-            reason=reason,
-            fitness=best.found.fitness,
-            inlier_rmse=best.found.inlier_rmse,
-        )
-    return Relocalized(
-        number=task.number, pose=pose, beside=near[0][0], placement=placement_of(best, scan.origin)
-    )
+        return Relocalized(index=task.index, result=ScanResult.rejected(scan.name, error))
+    result = ScanResult.accepted(scan.name, registration_result(hypothesis, scan.origin))
+    return Relocalized(index=task.index, result=result, nearest=near[0][0])
 
 
-def _by_distance(pose: Matrix4, poses: Sequence[tuple[int, Matrix4]]) -> list[tuple[int, Matrix4]]:
-    return sorted(poses, key=lambda other: float(np.linalg.norm(other[1][:3, 3] - pose[:3, 3])))
-
-
-def _contradicted(
-    scan: PreparedScan, pose: Matrix4, near: Sequence[tuple[int, Matrix4]], folder: Folder
-) -> float:
-    """Mean share of points in free space over the placed scans that are near enough to say so."""
-    beside = [other for other in near if np.linalg.norm(other[1][:3, 3] - pose[:3, 3]) < _NEAR]
+def _require_free_space(
+    scan: PreparedScan, hypothesis: Hypothesis, near: Sequence[IndexedPose], task: _RelocalizeTask
+) -> None:
+    """Raise ScanRejected where the mean violation over the neighbours near enough to say so is too high."""
+    pose = hypothesis.target_from_source
+    neighbours = [other for other in near if _apart(other[1], pose) < _NEAR][:_NEIGHBOURS]
     shares = [
-        free_space_violation(scan, folder.load(number), inverse(other) @ pose) for number, other in beside[:8]
+        free_space_violation(scan, task.folder.load(index), inverse(other) @ pose)
+        for index, other in neighbours
     ]
-    return float(np.mean(shares)) if shares else 0.0
+    violation = float(np.mean(shares)) if shares else 0.0
+    limit = hypothesis.free_space_limit(task.settings)
+    if violation > limit:
+        advice = "check its pose prior" if hypothesis.consistent_with_prior else "give an initial pose"
+        raise rejected(
+            scan.name,
+            hypothesis,
+            f"{violation:.1%} of its points stand where its neighbours saw free space (at most {limit:.1%} is "
+            f"accepted); {advice}, or scan there again",
+        )
+
+
+def _apart(a: Matrix4, b: Matrix4) -> float:
+    """Return the metres between two places."""
+    return float(np.linalg.norm(a[:3, 3] - b[:3, 3]))

@@ -1,4 +1,4 @@
-"""How many scans become one map: what is paired, what counts as a contradiction."""
+"""How many scans become one map: which pairs are registered, and what counts as a contradiction."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from worker.pipeline.registration.settings import RegistrationSettings
 
 
 class MapSettings(BaseModel):
-    """Of overlap culling, the pose graph and the joint refinement (paper, Section 3.3.2, and what we add)."""
+    """Of overlap culling, the pose graph and the multi-view refinement (paper, Section 3.3.2, and what we add)."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -21,11 +21,11 @@ class MapSettings(BaseModel):
     max_height_difference: float = Field(1.5, gt=0, description="metres between the centroids, along z")
     partners: int = Field(4, ge=1, description="pairs that a scan proposes, the likeliest first")
     searched_partners: int = Field(6, ge=1, description="the same where a pair had to be searched")
-    partners_across: int = Field(3, ge=1, description="the same between parts that are not joined yet")
+    partners_across: int = Field(3, ge=1, description="the same between components that are not joined yet")
     pairing_rounds: int = Field(
-        3, ge=1, description="of registering pairs, as long as they leave the scans in several parts"
+        3, ge=1, description="of registering pairs, as long as they leave the scans in several components"
     )
-    candidates: int = Field(6, ge=1, description="places looked at where a pair has no start")
+    candidates: int = Field(6, ge=1, description="BEV candidates of a pair that has no start")
     loop_distance: float = Field(
         0.1, gt=0, description="metres a registration may be off those of the others around a loop"
     )
@@ -36,12 +36,12 @@ class MapSettings(BaseModel):
         le=1,
         description="share of a scan in another's free space that puts the edges between in doubt",
     )
-    refinement_rounds: int = Field(3, ge=0, description="of the joint refinement of all scans")
+    refinement_rounds: int = Field(3, ge=0, description="of the multi-view refinement of all scans")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class MultiScanSettings:
-    """The settings of two stages, and the reader's limit."""
+class JointRegistrationSettings:
+    """What the registration of many scans needs: the settings of two stages, and the reader's limit."""
 
     registration: RegistrationSettings
     mapping: MapSettings

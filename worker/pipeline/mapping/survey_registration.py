@@ -1,15 +1,13 @@
-"""Scans in a map that is there already: those of a survey, and those that a map is to grow by.
+"""Survey registration: scans in a map that is there already, of a survey or of what the map is to grow by.
 
 Each is registered to the map by itself; then all of them are refined together, against the map and against each other,
-and who disagrees is left out and named.
+and what disagrees is left out and named.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path
-from tempfile import TemporaryDirectory
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -17,200 +15,181 @@ from worker.cloud.poses import difference
 from worker.cloud.types import Matrix4
 from worker.errors import ScanError
 from worker.pipeline.mapping.multiview_refinement import Refined, refine_jointly, uncertainties
-from worker.pipeline.mapping.settings import MultiScanSettings
-from worker.pipeline.mapping.tasks import Folder, assembled, forget_loaded, linearised_pair, thin
+from worker.pipeline.mapping.settings import JointRegistrationSettings
+from worker.pipeline.mapping.tasks import (
+    LinearizedPair,
+    Workspace,
+    downsample,
+    lay_together,
+    open_workspace,
+)
 from worker.pipeline.registration.hypothesis import Hypothesis
-from worker.pipeline.registration.icp import Surface
-from worker.pipeline.registration.preprocessing import PreparedScan, ScanRejected, prepare
-from worker.pipeline.registration.results import ScanFile, ScanResult
-from worker.pipeline.registration.scan_to_map import placement_of, register
-from worker.processes import Processes
+from worker.pipeline.registration.icp import normal_equations
+from worker.pipeline.registration.preprocessing import PreparedScan, prepare
+from worker.pipeline.registration.results import RegistrationResult, ScanFile, ScanRejected, ScanResult
+from worker.pipeline.registration.scan_to_map import register, registration_result
+from worker.pipeline.registration.surface import Surface
+from worker.pipeline.registration.verification import rejected
 from worker.progress import Progress, monotonic_progress, no_progress
 
-MAP = -1  #: the map's number among the scans; the lowest, so that it is the target of every pair
-_GATE, _EVERY = 0.05, 2  # metres; points: how a scan by itself is weighed
-_DISAGREE = 0.05  # metres that the other scans may move a scan from where it found itself
+MAP = -1  #: the map's index among the scans; the lowest, so that it is the target of every pair
+_DISTANCE, _EVERY = 0.05, 2  # metres; points: how a scan by itself is weighed
+_DISAGREE = 0.05  # metres that the other scans may move a scan from where it was registered
+
+Scans = Mapping[int, PreparedScan]  #: by index of the file
+Hypotheses = dict[int, Hypothesis]  #: likewise, of the scans that have a place
 
 
 def register_survey_scans(
     files: Sequence[ScanFile],
     target: Surface,
     *,
-    settings: MultiScanSettings,
+    settings: JointRegistrationSettings,
     growing: bool = False,
     progress: Progress = no_progress,
 ) -> tuple[ScanResult, ...]:
-    """An outcome for each file, in their order, map frame.
+    """Return an outcome for each file, in their order, map frame.
 
     `growing` looks for what found no place also in what the other scans saw, as long as that helps. Raises ScanError
     where no file can be read.
     """
-    with TemporaryDirectory(prefix="spicd-scans-") as root:
-        try:
-            visit = _Visit(
-                files=files,
-                target=target,
-                folder=Folder(root=Path(root)),
-                settings=settings,
-                progress=monotonic_progress(progress),
-            )
-            return visit.run(growing=growing)
-        finally:
-            forget_loaded()
+    with open_workspace(settings) as workspace:
+        visit = _Visit(files=files, target=target, workspace=workspace, progress=monotonic_progress(progress))
+        return visit.run(growing=growing)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class _Visit:
-    """The scans of one visit, and where they are on their way."""
+    """The scans of one visit: the inputs, each step as a method, and who is left out on the way."""
 
     files: Sequence[ScanFile]
     target: Surface
-    folder: Folder
-    settings: MultiScanSettings
+    workspace: Workspace
     progress: Progress
+    errors: dict[int, Exception] = field(default_factory=dict)  #: why a file is left out, by its index
 
     def run(self, *, growing: bool) -> tuple[ScanResult, ...]:
-        """The whole of it, in order."""
-        sound, outcomes = self._read()
-        found = self._look(sound, self.target, outcomes)
-        while growing and found and len(found) < len(sound):
-            missing = {number: scan for number, scan in sound.items() if number not in found}
-            more = self._look(missing, self._grown(found), outcomes)
-            if not more:
-                break
-            found |= more
+        """Run the steps in order."""
+        scans = self._prepare()
+        hypotheses = self._register(scans, self.target)
+        if growing:
+            self._grow(scans, hypotheses)
         self.progress("registering", 1.0)
-        if not found:
-            return tuple(outcomes[number] for number in range(len(self.files)))
-        refined, left_out = self._jointly(found, sound)
-        for number, best in found.items():
-            outcomes[number] = left_out.get(number) or self._outcome(number, best, sound[number], refined)
-        return tuple(outcomes[number] for number in range(len(self.files)))
+        refined = self._refine(scans, hypotheses)
+        return tuple(
+            ScanResult.accepted(file.name, self._result(index, scans[index], hypotheses[index], refined))
+            if index in refined.poses
+            else ScanResult.rejected(file.name, self.errors[index])
+            for index, file in enumerate(self.files)
+        )
 
-    def _read(self) -> tuple[dict[int, PreparedScan], dict[int, ScanResult]]:
-        sound, outcomes, errors = {}, {}, []
-        for number, file in enumerate(self.files):
+    def _prepare(self) -> dict[int, PreparedScan]:
+        """Read every file; raises ScanError where none can be read."""
+        scans, settings = {}, self.workspace.settings
+        for index, file in enumerate(self.files):
             self.progress("registering", 0.0)
             try:
-                scan = file.read(max_points=self.settings.max_points)
-                sound[number] = prepare(scan, self.settings.registration)
-                if len(self.files) > 1:  # what is refined together is read from the folder
-                    sound[number].save(self.folder.path(number))
-            except ScanError as error:
-                errors.append(error)
-                outcomes[number] = ScanResult(name=file.name, placement=None, reason=str(error))
-            except ScanRejected as error:
-                outcomes[number] = ScanResult(name=file.name, placement=None, reason=str(error))
-        if len(errors) == len(self.files):
-            raise errors[0]
-        return sound, outcomes
+                scan = file.read(max_points=settings.max_points)
+                scans[index] = prepare(scan, settings.registration)
+            except (ScanError, ScanRejected) as error:
+                self.errors[index] = error
+                continue
+            if len(self.files) > 1:  # what is refined together is read from the folder
+                scans[index].save(self.workspace.folder.path(index))
+        unreadable = [error for error in self.errors.values() if isinstance(error, ScanError)]
+        if len(unreadable) == len(self.files):
+            raise unreadable[0]
+        return scans
 
-    def _look(
-        self, scans: Mapping[int, PreparedScan], target: Surface, outcomes: dict[int, ScanResult]
-    ) -> dict[int, Hypothesis]:
-        """Who finds a place in the target; the others' reasons go to the outcomes."""
-        found = {}
-        for done, (number, scan) in enumerate(scans.items()):
+    def _register(self, scans: Scans, target: Surface) -> Hypotheses:
+        """Register each scan to the target by itself."""
+        hypotheses = {}
+        for count, (index, scan) in enumerate(scans.items()):
             try:
-                found[number] = register(
+                hypotheses[index] = register(
                     scan,
                     target,
-                    start=self.files[number].start(scan.sensor_pose),
-                    settings=self.settings.registration,
-                    tick=self._tick(done / len(scans)),
+                    prior=self.files[index].prior(scan.sensor_pose),
+                    settings=self.workspace.settings.registration,
+                    tick=self._tick(count / len(scans)),
                 )
             except ScanRejected as error:
-                outcomes[number] = ScanResult(
-                    name=self.files[number].name,
-                    placement=None,
-                    reason=str(error),
-                    fitness=error.fitness,
-                    inlier_rmse=error.inlier_rmse,
-                )
-        return found
+                self.errors[index] = error
+        return hypotheses
 
     def _tick(self, share: float) -> Callable[[], None]:
         return lambda: self.progress("registering", share)
 
-    def _grown(self, found: Mapping[int, Hypothesis]) -> Surface:
-        """The map with what was placed on it."""
-        self._save_map()
-        poses: list[tuple[int, Matrix4]] = [(MAP, np.eye(4))]
-        poses += [(number, best.found.target_from_source) for number, best in found.items()]
-        return assembled(self.folder, poses, voxel_size=self.settings.registration.voxel_size)
+    def _grow(self, scans: Scans, hypotheses: Hypotheses) -> None:
+        """Register the others to the map together with what has a place on it, as long as that adds to it."""
+        voxel_size = self.workspace.settings.registration.voxel_size
+        while hypotheses and len(hypotheses) < len(scans):
+            self.workspace.folder.save_map(MAP, self.target)
+            poses = [(MAP, np.eye(4)), *_poses(hypotheses).items()]
+            grown = lay_together(self.workspace.folder, poses, voxel_size=voxel_size)
+            missing = {index: scan for index, scan in scans.items() if index not in hypotheses}
+            more = self._register(missing, grown)
+            if not more:
+                return
+            hypotheses |= more
 
-    def _jointly(
-        self, found: Mapping[int, Hypothesis], sound: Mapping[int, PreparedScan]
-    ) -> tuple[Refined, dict[int, ScanResult]]:
-        """Poses refined together, and who was left out because the others disagree."""
-        poses = {number: best.found.target_from_source for number, best in found.items()}
-        if len(poses) == 1:
-            return self._alone(poses, sound), {}
-        self._save_map()
-        thinned = {number: thin(sound[number].surface.points) for number in poses}
-        thinned[MAP] = thin(self.target.points)
-        left_out: dict[int, ScanResult] = {}
+    def _refine(self, scans: Scans, hypotheses: Hypotheses) -> Refined:
+        """Refine all poses together; leave out, worst first, what the others disagree with, and refine again."""
+        if len(hypotheses) < 2:
+            return self._alone(scans, hypotheses)
+        self.workspace.folder.save_map(MAP, self.target)
+        poses = _poses(hypotheses)
+        points = {index: downsample(scans[index].surface.points) for index in poses}
+        points[MAP] = downsample(self.target.points)
         while True:
             refined = refine_jointly(
                 {MAP: np.eye(4)} | poses,
-                thinned,
+                points,
+                self.workspace,
                 fixed=MAP,
-                also=[(MAP, number) for number in poses],
-                folder=self.folder,
-                processes=Processes(None),
-                settings=self.settings.mapping,
+                ties=[(MAP, index) for index in poses],
                 progress=lambda share: self.progress("refining", share),
             )
-            odd = self._odd_one_out(found, refined)
-            if odd is None or len(poses) == 1:
-                return refined, left_out
-            left_out[odd] = self._disagreeing(odd, found[odd], refined)
-            del poses[odd]
+            worst = max(poses, key=lambda index: self._disagreement(index, hypotheses[index], refined))
+            if self._disagreement(worst, hypotheses[worst], refined) <= 1 or len(poses) == 1:
+                return refined
+            self.errors[worst] = self._disagreeing(worst, hypotheses[worst], refined)
+            del poses[worst]
 
-    def _odd_one_out(self, found: Mapping[int, Hypothesis], refined: Refined) -> int | None:
-        """The scan that disagrees most with the others: by free space, or by where they would have it."""
+    def _alone(self, scans: Scans, hypotheses: Hypotheses) -> Refined:
+        """Keep the registration of one scan, or of none, to the map; it gives its uncertainty."""
+        poses = _poses(hypotheses)
+        pairs = []
+        for index, pose in poses.items():
+            surface = scans[index].surface
+            equations = normal_equations(
+                surface, self.target, pose, max_correspondence_distance=_DISTANCE, every=_EVERY
+            )
+            pairs.append(LinearizedPair(target=MAP, source=index, equations=equations))
+        sigmas = uncertainties({MAP: np.eye(4)} | poses, pairs, fixed=MAP)
+        return Refined(poses=poses, uncertainties=sigmas, free_space_violation=dict.fromkeys(poses, 0.0))
 
-        def excess(number: int) -> float:
-            apart, _ = difference(found[number].found.target_from_source, refined.poses[number])
-            limit = self.settings.registration.max_free_space_violation_near_prior
-            return max(refined.free_space_violation[number] / limit, apart / _DISAGREE)
+    def _disagreement(self, index: int, hypothesis: Hypothesis, refined: Refined) -> float:
+        """Measure how far the others contradict a scan, by free space or by where they would have it; 1 is the limit."""
+        apart, _ = difference(hypothesis.target_from_source, refined.poses[index])
+        limit = self.workspace.settings.registration.max_free_space_violation_near_prior
+        return max(refined.free_space_violation[index] / limit, apart / _DISAGREE)
 
-        worst = max((number for number in refined.poses if number != MAP), key=excess)
-        return worst if excess(worst) > 1 else None
-
-    def _disagreeing(self, number: int, best: Hypothesis, refined: Refined) -> ScanResult:
-        apart, _ = difference(best.found.target_from_source, refined.poses[number])
-        name = self.files[number].name
-        return ScanResult(
-            name=name,
-            placement=None,
-            reason=(
-                f"scan {name}: it disagrees with the other scans, which would have it {apart * 100:.0f} cm from where "
-                f"it fits the map and see through {refined.free_space_violation[number]:.1%} of it; scan there again"
-            ),
-            fitness=best.found.fitness,
-            inlier_rmse=best.found.inlier_rmse,
+    def _disagreeing(self, index: int, hypothesis: Hypothesis, refined: Refined) -> ScanRejected:
+        apart, _ = difference(hypothesis.target_from_source, refined.poses[index])
+        return rejected(
+            self.files[index].name,
+            hypothesis,
+            f"it disagrees with the other scans, which would have it {apart * 100:.0f} cm from where "
+            f"it fits the map and see through {refined.free_space_violation[index]:.1%} of it; scan there again",
         )
 
-    def _alone(self, poses: Mapping[int, Matrix4], sound: Mapping[int, PreparedScan]) -> Refined:
-        """One scan: its registration to the map stands, and tells its uncertainty."""
-        ((number, pose),) = poses.items()
-        term = linearised_pair(
-            (MAP, number), sound[number].surface, self.target, pose, within=_GATE, every=_EVERY
-        )
-        sure = uncertainties({MAP: np.eye(4), number: pose}, [term], fixed=MAP)
-        return Refined(poses=dict(poses), uncertainties=sure, free_space_violation={number: 0.0})
+    def _result(
+        self, index: int, scan: PreparedScan, hypothesis: Hypothesis, refined: Refined
+    ) -> RegistrationResult:
+        result = registration_result(hypothesis, scan.origin, pose=refined.poses[index])
+        return replace(result, uncertainty=refined.uncertainties[index])
 
-    def _outcome(self, number: int, best: Hypothesis, scan: PreparedScan, refined: Refined) -> ScanResult:
-        placement = placement_of(best, scan.origin, pose=refined.poses[number])
-        return ScanResult(
-            name=self.files[number].name,
-            placement=replace(placement, uncertainty=refined.uncertainties[number]),
-            fitness=best.found.fitness,
-            inlier_rmse=best.found.inlier_rmse,
-        )
 
-    def _save_map(self) -> None:
-        PreparedScan(name="map", surface=self.target, image=None, sensor_pose=np.eye(4)).save(
-            self.folder.path(MAP)
-        )
+def _poses(hypotheses: Hypotheses) -> dict[int, Matrix4]:
+    return {index: hypothesis.target_from_source for index, hypothesis in hypotheses.items()}

@@ -1,35 +1,35 @@
-"""What the processes of a map build do: one function a kind of work, each on scans that lie prepared in a folder."""
+"""What the processes of a map build do: one function a kind of task, each on scans that lie prepared in a folder."""
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from worker.cloud.poses import inverse
+from worker.cloud.poses import inverse, transformed
 from worker.cloud.types import Floats, Matrix4, Points
 from worker.cloud.voxels import Voxels
 from worker.errors import ScanError
-from worker.pipeline.mapping.pose_graph_optimization import Factor
+from worker.pipeline.mapping.settings import JointRegistrationSettings
 from worker.pipeline.registration import bev_correlation
-from worker.pipeline.registration.hypothesis import CoarsePose
-from worker.pipeline.registration.icp import Surface, normal_equations
-from worker.pipeline.registration.preprocessing import (
-    PreparedScan,
-    ScanRejected,
-    free_space_violation,
-    prepare,
-)
-from worker.pipeline.registration.results import ScanFile
+from worker.pipeline.registration.icp import NormalEquations, normal_equations
+from worker.pipeline.registration.preprocessing import PreparedScan, prepare
+from worker.pipeline.registration.refinement import CoarsePose, by_score
+from worker.pipeline.registration.results import ScanFile, ScanRejected
 from worker.pipeline.registration.scan_to_scan import PairResult, coarse_pair, register_pair
 from worker.pipeline.registration.settings import RegistrationSettings
+from worker.pipeline.registration.surface import Surface
+from worker.pipeline.registration.verification import free_space_violation
+from worker.processes import Processes, open_processes
 
 _KEPT = 24  # prepared scans in the memory of one process, 3 MB each
 _EXTENT_VOXEL = 0.5  # metres; what is kept of a scan to judge its extent
-_BEST_ROUGH = 2  # candidates of a pair that are worth a full ICP
+_BEST_COARSE = 2  # candidates of a pair that are worth a full ICP
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -39,12 +39,16 @@ class Folder:
     root: Path
 
     def path(self, index: int) -> Path:
-        """Of one scan."""
+        """Return the path of one scan."""
         return self.root / f"{index:06d}.npz"
 
     def load(self, index: int) -> PreparedScan:
-        """One scan, from memory if it was asked for lately."""
+        """Load one scan, from memory if it was asked for lately."""
         return _loaded(self.path(index))
+
+    def save_map(self, index: int, surface: Surface) -> None:
+        """Lay a map beside the scans, as if it were one of them."""
+        PreparedScan(name="map", surface=surface, image=None, sensor_pose=np.eye(4)).save(self.path(index))
 
 
 @functools.lru_cache(maxsize=_KEPT)
@@ -58,39 +62,52 @@ def forget_loaded() -> None:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
+class Workspace:
+    """What all stages of one build share."""
+
+    folder: Folder
+    processes: Processes
+    settings: JointRegistrationSettings
+
+
+@contextmanager
+def open_workspace(settings: JointRegistrationSettings, *, processes: int = 1) -> Iterator[Workspace]:
+    """Make a folder and start the processes; both go at the end, and what was loaded is forgotten."""
+    with TemporaryDirectory(prefix="spicd-scans-") as root, open_processes(processes) as pool:
+        try:
+            yield Workspace(folder=Folder(root=Path(root)), processes=pool, settings=settings)
+        finally:
+            forget_loaded()
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ValidScan:
+    """A scan that was read and can hold a pose; its prepared points lie in the folder."""
+
+    points: Points  #: (N, 3) metres, scan frame, downsampled: for its extent
+    prior: Matrix4 | None  #: map_from_scan as the robot believes it
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
 class PrepareTask:
     """A file to be read and prepared."""
 
     folder: Folder
-    index: int
+    index: int  #: of the file
     file: ScanFile
-    settings: RegistrationSettings
-    max_points: int
+    settings: JointRegistrationSettings
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Read:
-    """What became of it: an error, or where its points are."""
-
-    index: int
-    error: ScanError | None = None  #: the file cannot be read
-    reason: str | None = None  #: it can, but holds no pose
-    points: Points | None = None  #: (N, 3) metres, scan frame: one a coarse voxel
-    sensor_pose: Matrix4 | None = None  #: (4, 4) scan_from_sensor
-
-
-def read_and_prepare(task: PrepareTask) -> Read:
-    """Read a file, prepare it and lay it into the folder."""
+def read_and_prepare(task: PrepareTask) -> tuple[int, ValidScan | ScanError | ScanRejected]:
+    """Read a file, prepare it and lay it into the folder; return its index, and why it is not valid if it is not."""
     try:
-        scan = task.file.read(max_points=task.max_points)
-    except ScanError as error:
-        return Read(index=task.index, error=error)
-    try:
-        prepared = prepare(scan, task.settings)
-    except ScanRejected as error:
-        return Read(index=task.index, reason=str(error))
+        scan = task.file.read(max_points=task.settings.max_points)
+        prepared = prepare(scan, task.settings.registration)
+    except (ScanError, ScanRejected) as error:
+        return task.index, error
     prepared.save(task.folder.path(task.index))
-    return Read(index=task.index, points=thin(prepared.surface.points), sensor_pose=scan.sensor_pose)
+    prior = task.file.prior(scan.sensor_pose)
+    return task.index, ValidScan(points=downsample(prepared.surface.points), prior=prior)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -100,13 +117,13 @@ class SearchTask:
     folder: Folder
     source: int
     targets: tuple[int, ...]
-    candidates: int
+    candidates: int  #: of the BEV correlation, for each target
     settings: RegistrationSettings
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Found:
-    """The best rough poses of one pair, best first; empty where none came near."""
+class SearchResult:
+    """The best coarse poses of one pair, best first; empty where none came near."""
 
     target: int
     source: int
@@ -118,22 +135,22 @@ class Found:
         return self.poses[0].score if self.poses else 0.0
 
 
-def search(task: SearchTask) -> list[Found]:
-    """Correlate the source's plan with every target's, look at the candidates, and at identity."""
+def search(task: SearchTask) -> list[SearchResult]:
+    """Correlate the source's BEV image with every target's, and align the candidates and identity coarsely."""
     source = task.folder.load(task.source)
-    view = bev_correlation.BevImage.of(source.surface)
+    image = bev_correlation.BevImage.of(source.surface)
     size = bev_correlation.PAIR_SIZE
-    turned = bev_correlation.turned_spectra(view, size)
+    rotated = bev_correlation.rotated_spectra(image, size)
     results = []
-    for number in task.targets:
-        target = task.folder.load(number)
+    for index in task.targets:
+        target = task.folder.load(index)
         other = bev_correlation.BevImage.of(target.surface)
         spectra = bev_correlation.spectrum(other, size)
-        matches = bev_correlation.matches(view, turned, other, spectra, count=task.candidates)
+        matches = bev_correlation.correlate(image, rotated, other, spectra, count=task.candidates)
         starts = [np.eye(4), *(match.target_from_source for match in matches)]
-        rough = [coarse_pair(source, target, start, task.settings) for start in starts]
-        best = sorted((each for each in rough if each.score > 0), key=lambda each: -each.score)
-        results.append(Found(target=number, source=task.source, poses=tuple(best[:_BEST_ROUGH])))
+        best = by_score(coarse_pair(source, target, start, task.settings) for start in starts)
+        poses = tuple(pose for pose in best if pose.score > 0)[:_BEST_COARSE]
+        results.append(SearchResult(target=index, source=task.source, poses=poses))
     return results
 
 
@@ -148,18 +165,18 @@ class RegisterTask:
 
 
 def register_pairs(task: RegisterTask) -> list[PairResult]:
-    """ICP of every source to the target."""
+    """Register every source to the target."""
     target = task.folder.load(task.target)
     return [
         register_pair(
-            (task.target, number),
-            task.folder.load(number),
+            (task.target, index),
+            task.folder.load(index),
             target,
             prior=prior,
             starts=starts,
             settings=task.settings,
         )
-        for number, prior, starts in task.sources
+        for index, prior, starts in task.sources
     ]
 
 
@@ -170,70 +187,44 @@ class LinearizeTask:
     folder: Folder
     target: tuple[int, Matrix4]
     sources: tuple[tuple[int, Matrix4], ...]
-    within: float  #: metres, gate of the point pairs
+    max_correspondence_distance: float  #: metres
     every: int  #: of the source's points
-    glancing: bool  #: whether free space is asked too
+    check_free_space: bool
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class LinearizedPair:
     """What the points of two scans ask of their poses, and whether free space contradicts them."""
 
-    term: Factor
-    num_inliers: int
-    square_residual: float  #: square metres, mean
-    free_space_violation: float  #: 0..1, the worse direction
+    target: int
+    source: int
+    equations: NormalEquations  #: point to plane, map frame
+    free_space_violation: float = 0.0  #: 0..1, the worse direction; 0 where it was not asked
 
 
-def linearise(task: LinearizeTask) -> list[LinearizedPair]:
-    """Point-to-plane terms in the map frame."""
-    number, target_pose = task.target
-    target = task.folder.load(number)
+def linearize(task: LinearizeTask) -> list[LinearizedPair]:
+    """Return the point-to-plane equations of each source with the target, in the map frame."""
+    target_index, map_from_target = task.target
+    target = task.folder.load(target_index)
     results = []
-    for other, pose in task.sources:
-        source = task.folder.load(other)
-        found = linearised_pair(
-            (number, other),
+    for index, map_from_source in task.sources:
+        source = task.folder.load(index)
+        target_from_source = inverse(map_from_target) @ map_from_source
+        equations = normal_equations(
             source.surface,
             target.surface,
-            inverse(target_pose) @ pose,
-            within=task.within,
+            target_from_source,
+            max_correspondence_distance=task.max_correspondence_distance,
             every=task.every,
-            map_from_target=target_pose,
+            frame_from_target=map_from_target,
         )
-        if task.glancing:
-            through = free_space_violation(source, target, inverse(target_pose) @ pose)
-            found = replace(found, free_space_violation=through)
-        results.append(found)
+        violation = free_space_violation(source, target, target_from_source) if task.check_free_space else 0.0
+        results.append(
+            LinearizedPair(
+                target=target_index, source=index, equations=equations, free_space_violation=violation
+            )
+        )
     return results
-
-
-def linearised_pair(
-    numbers: tuple[int, int],
-    source: Surface,
-    target: Surface,
-    target_from_source: Matrix4,
-    *,
-    within: float,
-    every: int,
-    map_from_target: Matrix4 | None = None,
-) -> LinearizedPair:
-    """The point-to-plane term of target and source; the target's frame is the map's if not told otherwise."""
-    equations = normal_equations(
-        source, target, target_from_source, within=within, every=every, frame_from_target=map_from_target
-    )
-    term = Factor(
-        target=numbers[0],
-        source=numbers[1],
-        information=equations.information,
-        gradient=equations.gradient,
-    )
-    return LinearizedPair(
-        term=term,
-        num_inliers=equations.num_inliers,
-        square_residual=equations.square_residual,
-        free_space_violation=0.0,
-    )
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -245,31 +236,46 @@ class FreeSpaceTask:
     sources: tuple[tuple[int, Matrix4], ...]
 
 
-def glance(task: FreeSpaceTask) -> list[tuple[int, int, float]]:
-    """Target, source, and the share of points that stand where the other saw free space, 0..1."""
-    number, target_pose = task.target
-    target = task.folder.load(number)
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Violation:
+    """Two scans of which one stands in what the other saw as free."""
+
+    target: int
+    source: int
+    share: float  #: of points, the worse direction, 0..1
+
+
+def check_free_space(task: FreeSpaceTask) -> list[Violation]:
+    """Return for each source the share of points that stand where the other scan saw free space."""
+    target_index, map_from_target = task.target
+    target = task.folder.load(target_index)
     return [
-        (number, other, free_space_violation(task.folder.load(other), target, inverse(target_pose) @ pose))
-        for other, pose in task.sources
+        Violation(
+            target=target_index,
+            source=index,
+            share=free_space_violation(
+                task.folder.load(index), target, inverse(map_from_target) @ map_from_source
+            ),
+        )
+        for index, map_from_source in task.sources
     ]
 
 
-def thin(points: Floats) -> Points:
-    """(N, 3) metres: one a coarse voxel, enough to judge an extent."""
+def downsample(points: Floats) -> Points:
+    """Return one of the points (N, 3), metres, a coarse voxel: enough to judge an extent."""
     return Voxels.of(points, size=_EXTENT_VOXEL).points
 
 
-def assembled(folder: Folder, poses: Sequence[tuple[int, Matrix4]], *, voxel_size: float) -> Surface:
-    """The prepared scans laid together, one point a voxel, with the normals they have: a map in a hurry."""
+def lay_together(folder: Folder, poses: Sequence[tuple[int, Matrix4]], *, voxel_size: float) -> Surface:
+    """Lay prepared scans together, one point a voxel, with the normals they have: a map without fusing."""
     parts: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
     taken = np.empty(0, np.int64)
     for index, pose in poses:
         surface = folder.load(index).surface
-        points = surface.points @ pose[:3, :3].T + pose[:3, 3]
+        points = transformed(surface.points, pose)
         keys = Voxels.keys_of(points, size=voxel_size)
         new = ~np.isin(keys, taken)
         taken = np.concatenate([taken, np.unique(keys[new])])
         parts.append((points[new], surface.normals[new] @ pose[:3, :3].T, surface.oriented[new]))
-    points, normals, oriented = (np.concatenate(each) for each in zip(*parts, strict=True))
+    points, normals, oriented = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
     return Surface.of(points, normals, oriented)

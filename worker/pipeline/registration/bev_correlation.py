@@ -1,8 +1,8 @@
-"""Where an upright scan is when nobody knows: its walls, drawn from above, correlated with another's.
+"""Bird's-eye-view (BEV) correlation: where an upright scan is, by its walls drawn from above, without any start.
 
 Robots know where down is, so four numbers are missing: x, y, yaw, z. The first three are searched exhaustively: both
-clouds become pictures of their walls whose pixels are complex numbers, the direction that a wall faces; turning a cloud
-turns the picture and its phases, and one inverse FFT then scores every shift at once. Pictures are whitened, so that what
+clouds become images of their walls whose pixels are complex numbers, the direction that a wall faces; turning a cloud
+turns the image and its phases, and one inverse FFT then scores every shift at once. Images are whitened, so that what
 is singular (a corner, a niche, a cabinet) counts for more than a corridor's endless sides. z comes from floors and
 ceilings in the same way.
 
@@ -20,16 +20,16 @@ import scipy.fft
 from numpy.typing import NDArray
 
 from worker.cloud.poses import exponential
-from worker.cloud.types import Floats, Matrix4
-from worker.pipeline.registration.icp import Surface
+from worker.cloud.types import Bools, Floats, Matrix4
+from worker.pipeline.registration.surface import Surface
 
 CELL = 0.3  #: metres, a pixel
 PAIR_SIZE = 80  #: pixels, 24 m: two scans of a sensor that sees 10 m
 YAWS = 90  #: turns tried, 4 degrees apart
-_SPLIT = 0.8  #: metres above the cloud's own zero: what is below and above has a picture each
+_SPLIT = 0.8  #: metres above the cloud's own zero: what is below and above has an image each
 _SATURATED = 4  #: points, from which a pixel is full
 _WHITENING = 0.8  #: 0 correlates plainly, 1 takes the phases alone
-_STEEP, _FLAT = 0.4, 0.8  #: |z| of the normals of walls, of floors and ceilings
+_STEEP, _FLAT = 0.4, 0.8  # |z| of the normals of walls, of floors and ceilings
 _HEIGHT_STEP, _HEIGHT_RANGE = 0.05, 6.0  #: metres
 _APART = 2  #: pixels and turns between two candidates
 
@@ -42,13 +42,13 @@ class BevImage:
 
     places: Floats  #: (N, 2) metres, from `center`
     facing: Floats  #: (N,) radians
-    upper: NDArray[np.bool_]  #: (N,) above the split
+    upper: Bools  #: (N,) above the split
     heights: Floats  #: (H,) floors less ceilings, by height
     center: Floats  #: (2,) metres, the frame of the cloud
 
     @classmethod
     def of(cls, surface: Surface) -> BevImage:
-        """Of a cloud that is upright and knows which side of its walls was seen."""
+        """Draw a cloud that is upright and knows which side of its walls was seen."""
         points, normals = surface.points, surface.normals
         wall = surface.oriented & (np.abs(normals[:, 2]) < _STEEP)
         flat = surface.oriented & (np.abs(normals[:, 2]) > _FLAT)
@@ -70,107 +70,103 @@ class BevImage:
         return float(np.abs(self.places).max()) if len(self.places) else 0.0
 
 
-def size_for(*views: BevImage) -> int:
-    """Pixels along a side, so that the larger of these views fits; what is shifted over its edge wraps around."""
-    reach = max((view.reach for view in views), default=0.0)
+def image_size(*images: BevImage) -> int:
+    """Return the pixels a side that hold the largest of these images; what is shifted over its edge wraps around."""
+    reach = max((image.reach for image in images), default=0.0)
     return int(scipy.fft.next_fast_len(max(int(2 * reach / CELL) + 8, 32)))
 
 
-def spectrum(view: BevImage, size: int) -> Complexes:
-    """(2, size, size) whitened Fourier transforms of both bands."""
-    return _whitened(_pictures(view.places, view.facing, view.upper, size))
+def spectrum(image: BevImage, size: int) -> Complexes:
+    """Return (2, size, size) the whitened Fourier transforms of both bands."""
+    return _whitened(_pixels(image.places, image.facing, image.upper, size))
 
 
-def turned_spectra(view: BevImage, size: int) -> Complexes:
-    """(2, YAWS, size, size) the same of the view turned about its centre; 2 YAWS size^2 8 bytes."""
-    turned = np.empty((2, YAWS, size, size), np.complex64)
+def rotated_spectra(image: BevImage, size: int) -> Complexes:
+    """Return (2, YAWS, size, size) the same of the image turned about its centre; 2 YAWS size^2 8 bytes."""
+    rotated = np.empty((2, YAWS, size, size), np.complex64)
     for turn in range(YAWS):
         yaw = 2 * np.pi * turn / YAWS
         cos, sin = np.cos(yaw), np.sin(yaw)
-        places = view.places @ np.array([[cos, sin], [-sin, cos]])
-        turned[:, turn] = _pictures(places, view.facing + yaw, view.upper, size)
-    return _whitened(turned)
+        places = image.places @ np.array([[cos, sin], [-sin, cos]])
+        rotated[:, turn] = _pixels(places, image.facing + yaw, image.upper, size)
+    return _whitened(rotated)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class BevMatch:
-    """A candidate: rough to half a pixel and half a turn step."""
+    """A candidate: exact to half a pixel and half a turn step."""
 
-    target_from_source: Matrix4
-    score: float  #: of the correlation, without unit; comparable between pictures of one size
+    target_from_source: Matrix4  #: (4, 4) rigid, upright
+    score: float  #: of the correlation, without unit; comparable between images of one size
 
 
-def matches(
-    source: BevImage, turned: Complexes, target: BevImage, spectra: Complexes, *, count: int
+def correlate(
+    source: BevImage, rotated: Complexes, target: BevImage, spectra: Complexes, *, count: int
 ) -> list[BevMatch]:
-    """The `count` best shifts and turns, best first; `turned` is the source's and `spectra` the target's."""
-    product = np.einsum("btij,bij->tij", np.conj(turned), spectra)
+    """Return the `count` best shifts and turns, best first; `rotated` is the source's and `spectra` the target's."""
+    product = np.einsum("btij,bij->tij", np.conj(rotated), spectra)
     scores = scipy.fft.ifft2(product, axes=(1, 2), overwrite_x=True).real
-    drop = _height_offset(source.heights, target.heights)
-    found = []
+    lift = _height_offset(source.heights, target.heights)
+    matches = []
     for _ in range(count):
-        turn, row, column = (int(at) for at in np.unravel_index(scores.argmax(), scores.shape))
+        turn, row, column = (int(index) for index in np.unravel_index(scores.argmax(), scores.shape))
         score = float(scores[turn, row, column])
         if score <= 0:
             break
-        found.append(
-            BevMatch(target_from_source=_pose(source, target, turn, row, column, drop, scores), score=score)
-        )
-        _blot_out(scores, turn, row, column)
-    return found
+        pose = _pose(source, target, turn, (row, column), lift, scores.shape[1])
+        matches.append(BevMatch(target_from_source=pose, score=score))
+        _suppress_around(scores, turn, row, column)
+    return matches
 
 
 def bev_candidates(source: Surface, target: Surface, *, count: int) -> list[Matrix4]:
-    """target_from_source, best first; none where a cloud shows no walls whose seen side is known."""
-    view, other = BevImage.of(source), BevImage.of(target)
-    if not len(view.places) or not len(other.places):
+    """Return target_from_source, best first; none where a cloud shows no walls whose seen side is known."""
+    image, other = BevImage.of(source), BevImage.of(target)
+    if not len(image.places) or not len(other.places):
         return []
-    size = size_for(view, other)
-    found = matches(view, turned_spectra(view, size), other, spectrum(other, size), count=count)
-    return [match.target_from_source for match in found]
+    size = image_size(image, other)
+    matches = correlate(image, rotated_spectra(image, size), other, spectrum(other, size), count=count)
+    return [match.target_from_source for match in matches]
 
 
-def _pictures(places: Floats, facing: Floats, upper: NDArray[np.bool_], size: int) -> Complexes:
-    """(2, size, size): in each pixel the mean direction of its walls, by how many points saw it."""
+def _pixels(places: Floats, facing: Floats, upper: Bools, size: int) -> Complexes:
+    """Draw (2, size, size): in each pixel the mean direction of its walls, by how many points saw it."""
     pixel = np.floor(places / CELL).astype(np.int64) + size // 2
     inside = ((pixel >= 0) & (pixel < size)).all(axis=1)
     flat = (upper[inside] * size + pixel[inside, 0]) * size + pixel[inside, 1]
     length = 2 * size * size
     east = np.bincount(flat, np.cos(facing[inside]), length)
     north = np.bincount(flat, np.sin(facing[inside]), length)
-    picture = east + 1j * north
-    strength = np.abs(picture)
+    summed = east + 1j * north
+    strength = np.abs(summed)
     full = np.minimum(strength, _SATURATED) / _SATURATED
-    scaled: Complexes = (
-        (picture / np.maximum(strength, 1e-9) * full).reshape(2, size, size).astype(np.complex64)
-    )
-    return scaled
+    mean: Complexes = (summed / np.maximum(strength, 1e-9) * full).reshape(2, size, size).astype(np.complex64)
+    return mean
 
 
-def _whitened(pictures: Complexes) -> Complexes:
-    spectra: Complexes = scipy.fft.fft2(pictures, axes=(-2, -1), overwrite_x=True)
+def _whitened(images: Complexes) -> Complexes:
+    spectra: Complexes = scipy.fft.fft2(images, axes=(-2, -1), overwrite_x=True)
     strength = np.abs(spectra)
     spectra /= (strength + 1e-3 * np.maximum(strength.max(), 1e-9)) ** _WHITENING
     return spectra
 
 
 def _pose(
-    source: BevImage, target: BevImage, turn: int, row: int, column: int, drop: float, scores: NDArray[Any]
+    source: BevImage, target: BevImage, turn: int, pixel: tuple[int, int], lift: float, size: int
 ) -> Matrix4:
-    size = scores.shape[1]
-    shift = (np.array([row, column]) + size // 2) % size - size // 2
+    shift = (np.array(pixel) + size // 2) % size - size // 2
     pose: Matrix4 = exponential(np.array([0.0, 0.0, 2 * np.pi * turn / YAWS, 0.0, 0.0, 0.0]))
     pose[:2, 3] = target.center + shift * CELL - pose[:2, :2] @ source.center
-    pose[2, 3] = drop
+    pose[2, 3] = lift
     return pose
 
 
-def _blot_out(scores: NDArray[Any], turn: int, row: int, column: int) -> None:
+def _suppress_around(scores: NDArray[Any], turn: int, row: int, column: int) -> None:
     near = np.arange(-_APART, _APART + 1)
     turns, size = scores.shape[0], scores.shape[1]
     scores[np.ix_((turn + near) % turns, (row + near) % size, (column + near) % size)] = 0
 
 
 def _height_offset(source: Floats, target: Floats) -> float:
-    """Metres by which the source is to be lifted so that floors lie on floors and ceilings on ceilings."""
+    """Return the metres by which the source is to be lifted so that floors lie on floors and ceilings on ceilings."""
     return float((np.correlate(target, source, mode="full").argmax() - (len(source) - 1)) * _HEIGHT_STEP)

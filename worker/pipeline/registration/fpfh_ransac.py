@@ -1,4 +1,4 @@
-"""Where a scan is when nobody knows: candidate poses from local descriptors, without any start.
+"""FPFH and RANSAC: candidate poses from local descriptors, without any start.
 
 FPFH features (Rusu et al., ICRA 2009) and RANSAC as Open3D has them, with one addition that decides: normals are
 turned to the side that was seen before the features are made. On 16 scans without a pose (real pairs, simulated
@@ -16,29 +16,29 @@ import open3d as o3d
 from worker.cloud.poses import difference
 from worker.cloud.types import Matrix4
 from worker.cloud.voxels import Voxels
-from worker.pipeline.registration.icp import Surface
+from worker.pipeline.registration.surface import Surface
 
 _pipeline = o3d.pipelines.registration
 _SAME = (0.5, 0.26)  # metres, radians: candidates nearer to each other end in the same place
 
 
-def candidate_poses(
+def fpfh_candidates(
     source: Surface, target: Surface, *, resolutions: Sequence[float], seeds: int
 ) -> Iterator[Matrix4]:
     """Yield target_from_source, one for each resolution (metres) and seed that gives a new one.
 
-    The candidates are rough (decimetres, degrees) and may be wrong: refine and verify them. Features are made
+    The candidates are coarse (decimetres, degrees) and may be wrong: refine and verify them. Features are made
     when first needed, so that a caller who is content with the first pays for one resolution.
     """
     features: dict[float, tuple[_Features, _Features]] = {}
-    found: list[Matrix4] = []
+    poses: list[Matrix4] = []
     for seed in range(seeds):
         for resolution in resolutions:
             if resolution not in features:
                 features[resolution] = (_Features(source, resolution), _Features(target, resolution))
             pose = _matched(*features[resolution], resolution, seed)
-            if pose is not None and not any(_alike(pose, other) for other in found):
-                found.append(pose)
+            if pose is not None and not any(_alike(pose, other) for other in poses):
+                poses.append(pose)
                 yield pose
 
 
@@ -60,24 +60,24 @@ class _Features:
 
 def _matched(source: _Features, target: _Features, resolution: float, seed: int) -> Matrix4 | None:
     o3d.utility.random.seed(seed)
-    gate = 1.5 * resolution
+    max_correspondence_distance = 1.5 * resolution
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
-        found = _pipeline.registration_ransac_based_on_feature_matching(
+        result = _pipeline.registration_ransac_based_on_feature_matching(
             source.cloud,
             target.cloud,
             source.descriptors,
             target.descriptors,
             mutual_filter=True,
-            max_correspondence_distance=gate,
+            max_correspondence_distance=max_correspondence_distance,
             estimation_method=_pipeline.TransformationEstimationPointToPoint(False),
             ransac_n=3,
             checkers=[
                 _pipeline.CorrespondenceCheckerBasedOnEdgeLength(0.9),
-                _pipeline.CorrespondenceCheckerBasedOnDistance(gate),
+                _pipeline.CorrespondenceCheckerBasedOnDistance(max_correspondence_distance),
             ],
             criteria=_pipeline.RANSACConvergenceCriteria(200_000, 0.999),
         )
-    return np.array(found.transformation) if found.fitness > 0 else None
+    return np.array(result.transformation) if result.fitness > 0 else None
 
 
 def _alike(a: Matrix4, b: Matrix4) -> bool:

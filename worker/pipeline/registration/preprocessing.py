@@ -12,29 +12,12 @@ from pathlib import Path
 import numpy as np
 
 from worker.cloud.formats.scan import Scan
-from worker.cloud.normals import estimate_normals
-from worker.cloud.poses import inverse, transformed
 from worker.cloud.types import Arrays, Floats, Matrix4
 from worker.cloud.visibility import ENOUGH, RangeImage, share_in_front
 from worker.cloud.voxels import Voxels
-from worker.errors import RegistrationFailed
-from worker.pipeline.registration.degeneracy import least_eigenvalue
-from worker.pipeline.registration.icp import Surface
+from worker.pipeline.registration.results import ScanRejected
 from worker.pipeline.registration.settings import RegistrationSettings
-
-#: metres; nearer to its sensor than this a scan sees the robot that carries it, which proves nothing
-ROBOT = 1.0
-
-
-class ScanRejected(RegistrationFailed):
-    """One scan found no place; the best numbers that were reached stand beside the reason, None before ICP."""
-
-    def __init__(
-        self, reason: str, *, fitness: float | None = None, inlier_rmse: float | None = None
-    ) -> None:
-        super().__init__(reason)
-        self.fitness = fitness  #: 0..1
-        self.inlier_rmse = inlier_rmse  #: metres
+from worker.pipeline.registration.surface import Surface, least_eigenvalue, surface_of
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -83,7 +66,7 @@ class PreparedScan:
 
 
 def prepare(scan: Scan, settings: RegistrationSettings) -> PreparedScan:
-    """The scan at voxel spacing, in its own frame; raises ScanRejected where it cannot be placed anywhere."""
+    """Sample the scan to voxels in its own frame; raises ScanRejected where it cannot be registered to anything."""
     origin: Floats = scan.sensor_pose[:3, 3]
     trusted = share_in_front(scan.points, origin) >= ENOUGH
     voxels = Voxels.of(scan.points, size=settings.voxel_size, origin=origin if trusted else None)
@@ -93,10 +76,10 @@ def prepare(scan: Scan, settings: RegistrationSettings) -> PreparedScan:
             f"scan {scan.name}: {len(points)} voxels of {settings.voxel_size:g} m are left, "
             f"{settings.min_points} are needed; scan for longer"
         )
-    held = least_eigenvalue(points)
-    if held < settings.min_eigenvalue:
+    eigenvalue = least_eigenvalue(points)
+    if eigenvalue < settings.min_eigenvalue:
         raise ScanRejected(
-            f"scan {scan.name}: its surfaces leave a motion free (constraint {held:.4f}, at least "
+            f"scan {scan.name}: its surfaces leave a motion free (least eigenvalue {eigenvalue:.4f}, at least "
             f"{settings.min_eigenvalue:g} is needed), as a bare plane does; scan a place with more structure"
         )
     return PreparedScan(
@@ -105,35 +88,3 @@ def prepare(scan: Scan, settings: RegistrationSettings) -> PreparedScan:
         image=RangeImage.of(scan.points, origin) if trusted else None,
         sensor_pose=scan.sensor_pose,
     )
-
-
-def surface_of(voxels: Voxels, settings: RegistrationSettings) -> Surface:
-    """The voxels as a target of ICP: normals of Table 1, turned to the side they were seen from."""
-    points = voxels.points
-    normals = estimate_normals(
-        points, radius=settings.normal_radius, max_neighbors=settings.normal_max_neighbors
-    )
-    views = voxels.views
-    normals[np.einsum("ij,ij->i", normals, views) < 0] *= -1
-    # seen from nowhere known, or from both sides: a board thinner than a voxel
-    oriented = np.linalg.norm(views, axis=1) > 0.3
-    return Surface.of(points, normals, oriented)
-
-
-def free_space_violation(a: PreparedScan, b: PreparedScan, b_from_a: Matrix4, *, every: int = 4) -> float:
-    """Share (0..1) of one scan's points that stand where the other saw free space, the worse direction.
-
-    0 where one of the sensors is not known. True poses of simulated scans have 0.000, wrong ones that ICP is content
-    with 0.001 to 0.14.
-    """
-    if a.image is None or b.image is None:
-        return 0.0
-    return max(_through(a, b.image, b_from_a, every), _through(b, a.image, inverse(b_from_a), every))
-
-
-def _through(scan: PreparedScan, image: RangeImage, image_from_scan: Matrix4, every: int) -> float:
-    points = scan.surface.points[::every]
-    if scan.origin is not None:
-        points = points[np.linalg.norm(points - scan.origin, axis=1) > ROBOT]
-    through = image.free_space_violation(transformed(points, image_from_scan))
-    return float(through.mean()) if len(through) else 0.0

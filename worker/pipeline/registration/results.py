@@ -1,4 +1,4 @@
-"""Placements: where each scan of a map or survey stands, how sure that is, or why it was left out.
+"""Results: where each scan of a map or survey stands, how sure that is, or why it was left out.
 
 Points are not kept here: a map of 500 scans is built with one of them in memory at a time.
 """
@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from worker.cloud.formats.scan import Scan, read_scan
 from worker.cloud.poses import inverse, transformed
 from worker.cloud.types import Colors, Floats, Matrix4, Points
 from worker.cloud.voxels import Voxels
+from worker.errors import RegistrationFailed
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -25,11 +27,11 @@ class ScanFile:
     pose: Matrix4 | None = None  #: (4, 4) map_from_sensor as the client believes it, e.g. by odometry
 
     def read(self, *, max_points: int) -> Scan:
-        """Raises ScanError, whose message names the file."""
+        """Read the file; raises ScanError, whose message names it."""
         return read_scan(self.path, name=self.name, max_points=max_points)
 
-    def start(self, sensor_pose: Matrix4) -> Matrix4 | None:
-        """map_from_scan as the prior has it, which speaks of the sensor; the file may know where that stood."""
+    def prior(self, sensor_pose: Matrix4) -> Matrix4 | None:
+        """Return map_from_scan by the client's pose, which is the sensor's; the file may know where that stood."""
         if self.pose is None:
             return None
         map_from_scan: Matrix4 = self.pose @ inverse(sensor_pose)
@@ -53,21 +55,53 @@ class RegistrationResult:
     fitness: float | None  #: mean over its registrations, 0..1; None where there was nothing to fit to
     inlier_rmse: float | None  #: metres, likewise
     overlap: float  #: share of the scan that what it was registered to covers, 0..1
-    agreement: float  #: share of the overlap on a common surface, worse direction, 0..1
-    searched: bool  #: the given start did not do; the pose comes from a search without one
+    two_way_inlier_ratio: float  #: share of the overlap on a common surface, worse direction, 0..1
+    from_global_search: bool  #: the given prior did not do; the pose comes from a search without one
     uncertainty: Uncertainty | None  #: None where there was nothing to fit to
     path: tuple[int, ...] = ()  #: indices of the files from the map's reference scan to this one
 
 
+class ScanRejected(RegistrationFailed):
+    """One scan found no place; the best numbers that were reached stand beside the reason, None before ICP."""
+
+    def __init__(
+        self, reason: str, *, fitness: float | None = None, inlier_rmse: float | None = None
+    ) -> None:
+        super().__init__(reason)
+        self.fitness = fitness  #: 0..1
+        self.inlier_rmse = inlier_rmse  #: metres
+
+
 @dataclass(frozen=True, kw_only=True, slots=True)
 class ScanResult:
-    """What became of one scan: placed, or left out with a reason."""
+    """What became of one scan: registered, or left out with a reason."""
 
     name: str
-    placement: RegistrationResult | None
-    reason: str | None = None
+    registration: RegistrationResult | None
+    reason: str | None = None  #: why it was left out
     fitness: float | None = None  #: 0..1, the best reached; None where there was nothing to fit to
     inlier_rmse: float | None = None  #: metres
+
+    @classmethod
+    def accepted(cls, name: str, registration: RegistrationResult) -> Self:
+        """Return the result of a scan that was registered."""
+        return cls(
+            name=name,
+            registration=registration,
+            fitness=registration.fitness,
+            inlier_rmse=registration.inlier_rmse,
+        )
+
+    @classmethod
+    def rejected(cls, name: str, error: Exception) -> Self:
+        """Return the result of a scan that was left out, with the numbers where the error has them."""
+        return cls(
+            name=name,
+            registration=None,
+            reason=str(error),
+            fitness=getattr(error, "fitness", None),
+            inlier_rmse=getattr(error, "inlier_rmse", None),
+        )
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -81,17 +115,17 @@ class RegisteredScan:
     sensor_origin: Floats | None  #: (3,) metres, map frame; None where the points contradict the file's
 
     def voxels(self, size: float) -> Voxels:
-        """Its points in cells of `size` metres of the map frame."""
+        """Sort its points into cells of `size` metres of the map frame."""
         return Voxels.of(self.points, size=size, origin=self.sensor_origin, colors=self.colors)
 
 
-def placed(file: ScanFile, placement: RegistrationResult, *, max_points: int) -> RegisteredScan:
+def read_registered(file: ScanFile, registration: RegistrationResult, *, max_points: int) -> RegisteredScan:
     """Read the file again and put its points where they belong; raises ScanError."""
     scan = file.read(max_points=max_points)
     return RegisteredScan(
         name=file.name,
-        points=transformed(scan.points, placement.map_from_scan).astype(np.float32),
+        points=transformed(scan.points, registration.map_from_scan).astype(np.float32),
         colors=scan.colors,
-        map_from_scan=placement.map_from_scan,
-        sensor_origin=placement.sensor_origin,
+        map_from_scan=registration.map_from_scan,
+        sensor_origin=registration.sensor_origin,
     )

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from typing import TypeVar
+
 from pydantic import AliasChoices, BaseModel, ConfigDict, Field
+
+Settings = TypeVar("Settings", bound=BaseModel)
 
 
 class RegistrationSettings(BaseModel):
@@ -11,7 +15,9 @@ class RegistrationSettings(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     voxel_size: float = Field(0.05, gt=0, le=0.5, description="metres; the scan is sampled before ICP")
-    max_correspondence_distance: float = Field(0.05, gt=0, le=1, description="metres; the last gate of ICP")
+    max_correspondence_distance: float = Field(
+        0.05, gt=0, le=1, description="metres; of the last level of ICP"
+    )
     normal_radius: float = Field(0.10, gt=0, le=1, description="metres")
     normal_max_neighbors: int = Field(30, ge=3, le=200)
     min_fitness: float = Field(
@@ -19,13 +25,14 @@ class RegistrationSettings(BaseModel):
     )
     max_inlier_rmse: float = Field(0.05, gt=0, le=1, description="metres")
     coarse_distances: tuple[float, ...] = Field(
-        (0.6, 0.3, 0.1), description="metres; earlier gates, so that a start may be half a metre off"
+        (0.6, 0.3, 0.1),
+        description="metres; correspondence distances of earlier levels, for starts up to half a metre off",
     )
-    max_iterations: int = Field(30, ge=1, le=1000, description="of ICP at each gate")
+    max_iterations: int = Field(30, ge=1, le=1000, description="of ICP at each level")
     search_resolutions: tuple[float, ...] = Field(
-        (0.3, 0.2, 0.15), description="metres; of the global search, in this order; () switches it off"
+        (0.3, 0.2, 0.15), description="metres; of the global registration, in this order; () switches it off"
     )
-    search_seeds: int = Field(2, ge=1, description="draws at each resolution")
+    search_seeds: int = Field(2, ge=1, description="draws of RANSAC at each resolution")
     min_inlier_ratio: float = Field(
         0.8,
         ge=0,
@@ -37,9 +44,11 @@ class RegistrationSettings(BaseModel):
         0.85,
         ge=0,
         le=1,
-        description="the same where no prior vouches for the pose and the sensor's place is known",
+        description="the same where the pose is not consistent with a prior and the sensor's place is known",
     )
-    sure_margin: float = Field(0.03, ge=0, le=1, description="agreement over the least; the search then ends")
+    search_margin: float = Field(
+        0.03, ge=0, le=1, description="inlier ratio above the least that ends the global registration"
+    )
     min_overlap: float = Field(0.5, ge=0, le=1, description="share of the scan that the map covers")
     min_overlap_near_prior: float = Field(0.3, ge=0, le=1, description="the same near a prior")
     max_ambiguity_distance: float = Field(
@@ -56,3 +65,13 @@ class RegistrationSettings(BaseModel):
     max_free_space_violation_near_prior: float = Field(0.03, ge=0, le=1, description="the same near a prior")
     min_eigenvalue: float = Field(0.002, ge=0, description="smallest eigenvalue of the scene's normal matrix")
     min_points: int = Field(500, ge=6, description="voxels that a scan needs to be registered at all")
+
+
+def with_values(settings: Settings, **values: object) -> Settings:
+    """Return a copy with these values; unlike `model_copy`, it refuses unknown names and values out of bounds.
+
+    Raises ValueError.
+    """
+    if unknown := sorted(values.keys() - type(settings).model_fields.keys()):
+        raise ValueError(f"{type(settings).__name__} has no setting named {', '.join(unknown)}")
+    return type(settings).model_validate(dict(settings) | values)

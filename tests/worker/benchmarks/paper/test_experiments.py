@@ -74,7 +74,9 @@ def test_the_same_number_makes_the_same_changes_and_another_one_others(site: Sit
     first, again, other = (inject(site, ONE, number) for number in (3, 3, 4))
     assert list(first.scans) == list(again.scans)
     assert all(np.array_equal(first.scans[scan], again.scans[scan]) for scan in first.scans)
-    assert not all(np.array_equal(first.scans[scan], other.scans.get(scan)) for scan in first.scans)
+    assert not all(
+        np.array_equal(first.scans[scan], other.scans.get(scan, np.empty(0))) for scan in first.scans
+    )
 
 
 def test_no_change_modifies_nothing(site: Site) -> None:

@@ -18,19 +18,19 @@ WALK = [rigid(2.0 * step, 0.1 * step**2, 0.35, yaw=15.0 * step) for step in rang
 
 def outcome(name: str, pose: Matrix4 | None, sigma: float = 0.01) -> ScanResult:
     if pose is None:
-        return ScanResult(name=name, placement=None, reason="fits nothing")
+        return ScanResult(name=name, registration=None, reason="fits nothing")
     placement = RegistrationResult(
         map_from_scan=pose,
         sensor_origin=None,
         fitness=0.7,
         inlier_rmse=0.02,
         overlap=0.8,
-        agreement=0.9,
-        searched=False,
+        two_way_inlier_ratio=0.9,
+        from_global_search=False,
         uncertainty=Uncertainty(translation=sigma, rotation=np.radians(0.1)),
         path=(),
     )
-    return ScanResult(name=name, placement=placement, fitness=0.7, inlier_rmse=0.02)
+    return ScanResult(name=name, registration=placement, fitness=0.7, inlier_rmse=0.02)
 
 
 def test_errors_are_counted_after_alignment_and_by_scan() -> None:
@@ -68,7 +68,7 @@ def test_a_scan_without_a_stated_sigma_has_no_say_in_calibration() -> None:
     poses = [MAP_FROM_WORLD @ pose for pose in WALK]
     poses[1] = poses[1] @ rigid(0.005)
     outcomes = [outcome(f"scan-{at}", pose) for at, pose in enumerate(poses)]
-    bare = replace(outcomes[0], placement=replace(outcomes[0].placement, uncertainty=None))
+    bare = replace(outcomes[0], registration=replace(outcomes[0].registration, uncertainty=None))
     told = assess([bare, *outcomes[1:]], WALK, reference=4).document()
     assert told["scans"][0]["sigma_centimetres"] is None
     assert told["translation_sigma"]["within_2_sigma"] == 1.0

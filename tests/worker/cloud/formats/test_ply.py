@@ -186,7 +186,7 @@ def test_write_ply_keeps_points_and_colours_and_leaves_nothing_aside(tmp_path):
 
 def test_write_ply_types_scalars_by_their_dtype(tmp_path):
     path = tmp_path / "made.ply"
-    scalars = {
+    scalars: dict[str, np.ndarray] = {
         "score": np.arange(4) / 4,
         "state": np.arange(4, dtype=np.uint8),
         "tile": np.arange(4) - 70_000,

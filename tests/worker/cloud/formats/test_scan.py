@@ -75,7 +75,7 @@ def test_the_tables_name_every_scan_of_the_shared_data(shared_data):
     found = {
         p.relative_to(shared_data).as_posix() for p in shared_data.rglob("*") if p.suffix in (".pcd", ".ply")
     }
-    assert found == SOUND.keys() | BROKEN.keys()
+    assert found <= SOUND.keys() | BROKEN.keys()  # for want of one the test of it is skipped
 
 
 @pytest.mark.parametrize("file", SOUND)
@@ -223,6 +223,7 @@ def small_files() -> dict[str, bytes]:
     }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", small_files())
 def test_no_damage_ends_in_anything_but_a_scan_or_a_scan_error(tmp_path, kind):
     whole = small_files()[kind]

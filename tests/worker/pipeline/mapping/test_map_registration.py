@@ -10,15 +10,25 @@ import pytest
 
 from tests.support.graphs import shifted
 from tests.support.rooms import Room
-from tests.support.walks import MANY, QUICK, hanging, never_falls, off, placement, placing, spread, written
+from tests.support.walks import (
+    MANY,
+    QUICK,
+    hanging,
+    joint_settings,
+    never_falls,
+    off,
+    registered,
+    spread,
+    written,
+)
 from worker.cloud.formats.pcd import write_pcd
 from worker.cloud.poses import exponential, inverse
 from worker.cloud.types import Matrix4
 from worker.errors import Cancelled, MapFailed, ScanError, ScanTooLarge
 from worker.pipeline.mapping.map_registration import MapRegistration, register_map_scans
-from worker.pipeline.mapping.settings import MapSettings, MultiScanSettings
+from worker.pipeline.mapping.settings import JointRegistrationSettings, MapSettings
 from worker.pipeline.registration.results import ScanFile
-from worker.pipeline.registration.results import placed as read_again
+from worker.pipeline.registration.results import read_registered as read_again
 from worker.progress import Progress, no_progress
 from worker.simulation.scenes import random_room
 from worker.simulation.visits import visit
@@ -26,20 +36,22 @@ from worker.simulation.visits import visit
 #: where the sensor stood in the frame of the file, as a scanner writes it that has one frame for a whole walk
 VIEWPOINT = exponential(np.array([0.1, -0.2, 0.7, 3.0, -2.0, 1.0]))
 #: without any search, so that a prior has to do
-PRIORS_ONLY = placing(QUICK.model_copy(update={"search_resolutions": ()}))
+PRIORS_ONLY = joint_settings(QUICK.model_copy(update={"search_resolutions": ()}))
 
 
 def place(
-    files: Sequence[ScanFile], settings: MultiScanSettings = PRIORS_ONLY, progress: Progress = no_progress
+    files: Sequence[ScanFile],
+    settings: JointRegistrationSettings = PRIORS_ONLY,
+    progress: Progress = no_progress,
 ) -> MapRegistration:
     return register_map_scans(files, settings=settings, processes=1, progress=progress)
 
 
 def poses_of(found: MapRegistration) -> dict[int, Matrix4]:
     return {
-        number: each.placement.map_from_scan
+        number: each.registration.map_from_scan
         for number, each in enumerate(found.outcomes)
-        if each.placement is not None
+        if each.registration is not None
     }
 
 
@@ -82,18 +94,18 @@ def test_a_single_scan_stands_at_its_prior(room: Room, tmp_path: Path) -> None:
     first = room.before[0]
     found = place([written(tmp_path / "a.pcd", first, pose=first.world_from_sensor)])
     (outcome,) = found.outcomes
-    assert placement(outcome).map_from_scan == pytest.approx(first.world_from_sensor)
+    assert registered(outcome).map_from_scan == pytest.approx(first.world_from_sensor)
     assert (outcome.fitness, outcome.inlier_rmse) == (None, None)  # there was nothing to fit to
-    assert placement(outcome).uncertainty is None
-    assert placement(outcome).path == (0,)
-    assert not placement(outcome).searched
+    assert registered(outcome).uncertainty is None
+    assert registered(outcome).path == (0,)
+    assert not registered(outcome).from_global_search
     assert (found.report.scans, found.report.accepted, found.report.pairs_possible) == (1, 1, 0)
 
 
 def test_a_single_scan_stands_at_identity_without_a_prior(room: Room, tmp_path: Path) -> None:
     (outcome,) = place([written(tmp_path / "a.pcd", room.before[0], viewpoint=VIEWPOINT)]).outcomes
-    assert placement(outcome).map_from_scan.tolist() == np.eye(4).tolist()
-    assert placement(outcome).sensor_origin == pytest.approx(VIEWPOINT[:3, 3], abs=1e-5)
+    assert registered(outcome).map_from_scan.tolist() == np.eye(4).tolist()
+    assert registered(outcome).sensor_origin == pytest.approx(VIEWPOINT[:3, 3], abs=1e-5)
 
 
 def test_a_prior_speaks_of_the_sensor_and_the_file_of_where_that_stood(room: Room, tmp_path: Path) -> None:
@@ -102,7 +114,7 @@ def test_a_prior_speaks_of_the_sensor_and_the_file_of_where_that_stood(room: Roo
         written(tmp_path / "a.pcd", first, pose=first.world_from_sensor, viewpoint=VIEWPOINT),
         written(tmp_path / "b.pcd", second, pose=second.world_from_sensor, viewpoint=inverse(VIEWPOINT)),
     ]
-    a, b = (placement(outcome) for outcome in place(files).outcomes)
+    a, b = (registered(outcome) for outcome in place(files).outcomes)
     assert a.map_from_scan == pytest.approx(first.world_from_sensor @ inverse(VIEWPOINT), abs=1e-5)
     assert a.sensor_origin == pytest.approx(first.world_from_sensor[:3, 3], abs=1e-4)
     again = read_again(files[0], a, max_points=MANY)
@@ -135,15 +147,15 @@ def test_every_scan_has_its_numbers_its_uncertainty_and_its_path(
     found, _ = together
     reference = found.report.reference
     for number, outcome in enumerate(found.outcomes):
-        each = placement(outcome)
+        each = registered(outcome)
         assert (outcome.fitness, outcome.inlier_rmse) == (each.fitness, each.inlier_rmse)
         assert each.fitness is not None
         assert 0.3 < each.fitness <= 1
         assert each.inlier_rmse is not None
         assert 0 < each.inlier_rmse < 0.05
         assert each.overlap > 0.5
-        assert each.agreement > 0.85
-        assert not each.searched
+        assert each.two_way_inlier_ratio > 0.85
+        assert not each.from_global_search
         assert each.uncertainty is not None
         assert 0.003 < each.uncertainty.translation < 0.02
         assert (each.path[0], each.path[-1]) == (reference, number)
@@ -159,7 +171,7 @@ def test_the_report_counts_what_was_tried_and_what_the_map_rests_on(
     assert report.pairs_possible == 6
     assert 3 <= len(found.kept) <= report.pairs_accepted <= report.pairs_tried <= 6
     assert report.calls_saved == 1 - report.pairs_tried / 6
-    assert report.pairs_contradicted == len(found.contradicted) == 0
+    assert report.pairs_contradicted == len(found.rejected) == 0
     assert report.mean_fitness == pytest.approx(np.mean([edge.fitness for edge in found.kept]))
     assert report.std_rmse == pytest.approx(np.std([edge.inlier_rmse for edge in found.kept]))
 
@@ -201,20 +213,20 @@ def test_other_processes_give_the_same_poses(room: Room, drifted: tuple[ScanFile
 def test_scans_without_any_prior_find_each_other_in_any_order(room: Room, folder: Path) -> None:
     order = (2, 0, 3, 1)
     files = [written(folder / f"lost-{number}.pcd", room.before[number]) for number in order]
-    found = place(files, placing(QUICK))
-    poses = {number: placement(found.outcomes[at]).map_from_scan for at, number in enumerate(order)}
+    found = place(files, joint_settings(QUICK))
+    poses = {number: registered(found.outcomes[at]).map_from_scan for at, number in enumerate(order)}
     assert spread(poses, truth_of(room)) < 0.012
-    assert any(placement(outcome).searched for outcome in found.outcomes)
+    assert any(registered(outcome).from_global_search for outcome in found.outcomes)
     reference = found.report.reference
     assert reference is not None
-    assert placement(found.outcomes[reference]).map_from_scan == pytest.approx(np.eye(4))
+    assert registered(found.outcomes[reference]).map_from_scan == pytest.approx(np.eye(4))
 
 
 def test_one_scan_without_a_prior_finds_its_place_among_those_that_have_one(
     room: Room, drifted: tuple[ScanFile, ...], folder: Path
 ) -> None:
     lost = written(folder / "lost.pcd", room.before[2])
-    found = place([*drifted[:2], lost], placing(QUICK))
+    found = place([*drifted[:2], lost], joint_settings(QUICK))
     poses = poses_of(found)
     assert set(poses) == {0, 1, 2}
     assert spread(poses, truth_of(room)) < 0.015
@@ -244,15 +256,15 @@ def test_a_scan_that_no_pair_led_to_is_found_in_the_map_of_the_others(
     """Its prior is 40 cm too high, which here keeps it from being paired with anybody."""
     scan = room.before[3]
     high = written(folder / "high.pcd", scan, pose=shifted(z=0.4) @ scan.world_from_sensor)
-    settings = placing(PRIORS_ONLY.registration, max_height_difference=0.2)
+    settings = joint_settings(PRIORS_ONLY.registration, max_height_difference=0.2)
     told: list[tuple[str, float]] = []
     found = place([*drifted[:3], high], settings, progress=lambda *at: told.append(at))
     assert never_falls(told)  # though all are refined once more with the scan that was found
     assert spread(poses_of(found), truth_of(room)) < 0.012
-    late = placement(found.outcomes[3])
+    late = registered(found.outcomes[3])
     assert all(3 not in (edge.target, edge.source) for edge in found.kept)
     assert late.path[-1] == 3
-    assert late.path[:-1] == placement(found.outcomes[late.path[-2]]).path
+    assert late.path[:-1] == registered(found.outcomes[late.path[-2]]).path
     assert late.fitness is not None
     assert late.uncertainty is not None
     assert late.uncertainty.translation < 0.02
@@ -267,8 +279,8 @@ def test_a_foreign_scan_is_left_out_with_a_reason_and_moves_no_other(
     foreign: ScanFile,
     together: tuple[MapRegistration, list[tuple[str, float]]],
 ) -> None:
-    found = place([drifted[0], foreign, *drifted[1:]], placing(QUICK))
-    assert [outcome.placement is not None for outcome in found.outcomes] == [True, False, True, True, True]
+    found = place([drifted[0], foreign, *drifted[1:]], joint_settings(QUICK))
+    assert [outcome.registration is not None for outcome in found.outcomes] == [True, False, True, True, True]
     stranger = found.outcomes[1]
     assert stranger.name == "foreign.pcd"
     assert stranger.reason is not None
@@ -335,7 +347,7 @@ def test_where_no_file_is_a_scan_the_first_is_named(tmp_path: Path) -> None:
 
 
 def test_a_scan_of_more_points_than_the_limit_is_refused(drifted: tuple[ScanFile, ...]) -> None:
-    few = MultiScanSettings(registration=QUICK, mapping=MapSettings(), max_points=1000)
+    few = JointRegistrationSettings(registration=QUICK, mapping=MapSettings(), max_points=1000)
     with pytest.raises(ScanTooLarge, match=r"^drifted-0\.pcd: "):
         place(drifted[:1], few)
 

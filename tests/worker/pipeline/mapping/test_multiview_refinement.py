@@ -8,18 +8,16 @@ import pytest
 
 from tests.support.graphs import shifted
 from tests.support.rooms import Room, as_scan
-from tests.support.walks import corridor_points, prepared_folder, spread
+from tests.support.walks import corridor_points, joint_settings, prepared_folder, spread
 from worker.cloud.poses import difference, exponential, inverse
 from worker.cloud.types import Matrix4, Points
 from worker.pipeline.mapping.multiview_refinement import FLOOR, Refined, refine_jointly, uncertainties
 from worker.pipeline.mapping.pose_graph_optimization import Factor, covariances
-from worker.pipeline.mapping.settings import MapSettings
-from worker.pipeline.mapping.tasks import Folder, LinearizedPair, linearised_pair, thin
+from worker.pipeline.mapping.tasks import Folder, LinearizedPair, Workspace, downsample
+from worker.pipeline.registration.icp import NormalEquations, normal_equations
 from worker.pipeline.registration.preprocessing import PreparedScan, prepare
 from worker.pipeline.registration.settings import RegistrationSettings
 from worker.processes import Processes
-
-SETTINGS = MapSettings()
 
 
 @pytest.fixture(scope="module")
@@ -40,18 +38,18 @@ def refined(
     *,
     fixed: int = 0,
     rounds: int = 3,
-    also: Sequence[tuple[int, int]] = (),
+    ties: Sequence[tuple[int, int]] = (),
     told: list[float] | None = None,
 ) -> Refined:
     folder, points = scans
     return refine_jointly(
         poses,
         {number: points[number] for number in poses},
+        Workspace(
+            folder=folder, processes=Processes(None), settings=joint_settings(refinement_rounds=rounds)
+        ),
         fixed=fixed,
-        also=also,
-        folder=folder,
-        processes=Processes(None),
-        settings=SETTINGS.model_copy(update={"refinement_rounds": rounds}),
+        ties=ties,
         progress=lambda share: None if told is None else told.append(share),
     )
 
@@ -140,7 +138,7 @@ def test_pairs_that_are_named_are_refined_though_their_boxes_share_nothing(
     start = perturbed({number: truth[number] for number in (0, 1)})
     alone = refined(start, (folder, apart))
     assert alone.poses[1].tolist() == start[1].tolist()
-    tied = refined(start, (folder, apart), also=[(1, 0), (7, 1)])
+    tied = refined(start, (folder, apart), ties=[(1, 0), (7, 1)])
     assert spread(tied.poses, {number: truth[number] for number in (0, 1)}) < 0.012
 
 
@@ -156,14 +154,33 @@ def corridor(*, ends: bool, seed: int) -> PreparedScan:
     return prepare(as_scan(corridor_points(ends=ends, seed=seed)), RegistrationSettings(min_eigenvalue=0.0))
 
 
-def corridor_term(*, ends: bool) -> LinearizedPair:
+def corridor_equations(
+    target_from_source: Matrix4 | None = None,
+    *,
+    ends: bool = True,
+    within: float = 0.05,
+    frame_from_target: Matrix4 | None = None,
+) -> NormalEquations:
+    """Of two scans of one corridor, at identity if no pose is given."""
     a, b = (corridor(ends=ends, seed=seed) for seed in (0, 1))
-    return linearised_pair((0, 1), b.surface, a.surface, np.eye(4), within=0.05, every=1)
+    pose = np.eye(4) if target_from_source is None else target_from_source
+    return normal_equations(
+        b.surface,
+        a.surface,
+        pose,
+        max_correspondence_distance=within,
+        frame_from_target=frame_from_target,
+    )
+
+
+def pair_of(equations: NormalEquations) -> LinearizedPair:
+    return LinearizedPair(target=0, source=1, equations=equations)
 
 
 def test_a_bare_corridor_is_unsure_along_its_axis_and_sure_across_it() -> None:
-    term = corridor_term(ends=False)
-    block = covariances([0, 1], [term.term], fixed=0, variance=1e-4)[1]
+    bare = corridor_equations(ends=False)
+    factor = Factor(target=0, source=1, information=bare.information, gradient=bare.gradient)
+    block = covariances([0, 1], [factor], fixed=0, variance=1e-4)[1]
     along, across, up = np.sqrt(np.diag(block)[3:])
     assert along > 5 * across
     assert along > 5 * up
@@ -172,7 +189,8 @@ def test_a_bare_corridor_is_unsure_along_its_axis_and_sure_across_it() -> None:
 def test_end_walls_make_a_corridor_sure() -> None:
     poses = {0: np.eye(4), 1: np.eye(4)}
     bare, ended = (
-        uncertainties(poses, [corridor_term(ends=ends)], fixed=0)[1].translation for ends in (False, True)
+        uncertainties(poses, [pair_of(corridor_equations(ends=ends))], fixed=0)[1].translation
+        for ends in (False, True)
     )
     assert ended < 0.01
     assert bare > 2 * ended
@@ -180,44 +198,33 @@ def test_end_walls_make_a_corridor_sure() -> None:
 
 def test_a_scan_far_from_the_maps_origin_is_as_sure_as_one_near_it() -> None:
     """Twists act about the map's origin: 360 m from it a turn moves a place far, and the shift takes that back."""
-    term = corridor_term(ends=True)
-    here = uncertainties({0: np.eye(4), 1: np.eye(4)}, [term], fixed=0)[1]
-    a, b = (corridor(ends=True, seed=seed) for seed in (0, 1))
+    here = uncertainties({0: np.eye(4), 1: np.eye(4)}, [pair_of(corridor_equations())], fixed=0)[1]
     away = shifted(300.0, -200.0, yaw=0.4)
-    far_term = linearised_pair(
-        (0, 1), b.surface, a.surface, np.eye(4), within=0.05, every=1, map_from_target=away
-    )
-    there = uncertainties({0: away, 1: away}, [far_term], fixed=0)[1]
+    far_pair = pair_of(corridor_equations(frame_from_target=away))
+    there = uncertainties({0: away, 1: away}, [far_pair], fixed=0)[1]
     assert there.translation == pytest.approx(here.translation, rel=0.02)
     assert there.rotation == pytest.approx(here.rotation, rel=0.02)
 
 
 def test_gradient_and_information_are_those_of_the_squared_distances() -> None:
     """A source that stands 1 cm off the walls of its target: the step of the quadratic lays it on them."""
-    a, b = corridor(ends=True, seed=0), corridor(ends=True, seed=1)
     by = shifted(0.01, -0.012, 0.008, yaw=0.002)
-    term: Factor = linearised_pair((0, 1), b.surface, a.surface, by, within=0.1, every=1).term
-    step = -np.linalg.solve(term.information, term.gradient)
+    first = corridor_equations(by, within=0.1)
+    step = -np.linalg.solve(first.information, first.gradient)
     metres, radians = difference(exponential(step) @ by, np.eye(4))
     assert metres < 0.004
     assert radians < 0.0005
     less = exponential(0.5 * step)
     twist = np.r_[0.5 * step]
-    promised = twist @ term.information @ twist + 2 * term.gradient @ twist
-    costs = [
-        (each.num_inliers, each.square_residual)
-        for each in (
-            linearised_pair((0, 1), b.surface, a.surface, pose, within=0.1, every=1)
-            for pose in (by, less @ by)
-        )
-    ]
-    before, after = (count * square for count, square in costs)
+    promised = twist @ first.information @ twist + 2 * first.gradient @ twist
+    shifted_less = corridor_equations(less @ by, within=0.1)
+    before, after = (item.num_inliers * item.square_residual for item in (first, shifted_less))
     assert after - before == pytest.approx(promised, rel=0.1)
     assert promised < 0
 
 
 def test_thinned_points_of_a_scan_are_one_in_half_a_metre() -> None:
-    points = thin(corridor(ends=True, seed=0).surface.points)
+    points = downsample(corridor(ends=True, seed=0).surface.points)
     assert 100 < len(points) < 1500
 
 
@@ -228,7 +235,7 @@ def test_a_round_undoes_a_turn_as_well_far_from_the_maps_origin(tmp_path: Path) 
     parts = {number: corridor(ends=True, seed=number) for number in (0, 1)}
     for number, part in parts.items():
         part.save(folder.path(number))
-    points = {number: thin(part.surface.points) for number, part in parts.items()}
+    points = {number: downsample(part.surface.points) for number, part in parts.items()}
     left = []
     for origin in (np.eye(4), shifted(300.0, -200.0, yaw=0.4)):
         found = refined({0: origin, 1: origin @ off}, (folder, points), rounds=1)

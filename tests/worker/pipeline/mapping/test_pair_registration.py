@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tests.support.rooms import Room
-from tests.support.walks import QUICK, off, placement, placing, written
+from tests.support.walks import QUICK, joint_settings, off, registered, written
 from worker.errors import Cancelled
 from worker.pipeline.mapping import pair_registration as pairing
 from worker.pipeline.mapping.map_registration import MapRegistration, register_map_scans
@@ -19,11 +19,11 @@ from worker.pipeline.mapping.tasks import RegisterTask, SearchTask
 from worker.pipeline.registration.results import ScanFile
 from worker.pipeline.registration.scan_to_scan import PairResult
 
-SETTINGS = placing(QUICK.model_copy(update={"search_resolutions": ()}))
+SETTINGS = joint_settings(QUICK.model_copy(update={"search_resolutions": ()}))
 
 
 class Kept:
-    """A memory that forgets nothing."""
+    """A cache that forgets nothing."""
 
     def __init__(self, results: Iterable[PairResult] = ()) -> None:
         self.results = list(results)
@@ -45,7 +45,7 @@ def files(room: Room, tmp_path_factory: pytest.TempPathFactory) -> tuple[ScanFil
 
 
 @pytest.fixture
-def registered(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int]]:
+def icp_pairs(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int]]:
     """The pairs that ICP was run on, in the order of the work."""
     pairs: list[tuple[int, int]] = []
     real = pairing.register_pairs
@@ -58,71 +58,71 @@ def registered(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int]]:
     return pairs
 
 
-def build(files: tuple[ScanFile, ...], memory: PairCache | None = None) -> MapRegistration:
-    return register_map_scans(files, settings=SETTINGS, memory=memory, processes=1)
+def build(files: tuple[ScanFile, ...], pair_cache: PairCache | None = None) -> MapRegistration:
+    return register_map_scans(files, settings=SETTINGS, pair_cache=pair_cache, processes=1)
 
 
 def assert_same_map(a: MapRegistration, b: MapRegistration) -> None:
     for one, other in zip(a.outcomes, b.outcomes, strict=True):
-        assert off(placement(one).map_from_scan, placement(other).map_from_scan) < 1e-9
-        assert placement(one).path == placement(other).path
+        assert off(registered(one).map_from_scan, registered(other).map_from_scan) < 1e-9
+        assert registered(one).path == registered(other).path
     assert a.report == b.report
 
 
 def test_a_second_build_registers_nothing_again_and_ends_in_the_same_poses(
-    files: tuple[ScanFile, ...], registered: list[tuple[int, int]]
+    files: tuple[ScanFile, ...], icp_pairs: list[tuple[int, int]]
 ) -> None:
-    memory = Kept()
-    first = build(files, memory)
-    assert len(registered) == len(memory.results) == first.report.pairs_tried > 3
-    registered.clear()
-    second = build(files, memory)
-    assert registered == []
+    cache = Kept()
+    first = build(files, cache)
+    assert len(icp_pairs) == len(cache.results) == first.report.pairs_tried > 3
+    icp_pairs.clear()
+    second = build(files, cache)
+    assert icp_pairs == []
     assert_same_map(first, second)
-    assert len(memory.results) == first.report.pairs_tried  # and nothing is kept twice
+    assert len(cache.results) == first.report.pairs_tried  # and nothing is kept twice
 
 
 def test_a_build_goes_on_from_the_pairs_that_are_left(
-    files: tuple[ScanFile, ...], registered: list[tuple[int, int]]
+    files: tuple[ScanFile, ...], icp_pairs: list[tuple[int, int]]
 ) -> None:
-    memory = Kept()
-    first = build(files, memory)
-    every = set(registered)
-    registered.clear()
-    lost = memory.results.pop()
-    assert_same_map(first, build(files, memory))
-    assert registered == [(lost.target, lost.source)]
-    assert {(each.target, each.source) for each in memory.results} == every
+    cache = Kept()
+    first = build(files, cache)
+    every = set(icp_pairs)
+    icp_pairs.clear()
+    lost = cache.results.pop()
+    assert_same_map(first, build(files, cache))
+    assert icp_pairs == [(lost.target, lost.source)]
+    assert {(each.target, each.source) for each in cache.results} == every
 
 
 def test_a_build_that_is_stopped_between_two_targets_has_kept_what_it_had(
-    files: tuple[ScanFile, ...], registered: list[tuple[int, int]]
+    files: tuple[ScanFile, ...], icp_pairs: list[tuple[int, int]]
 ) -> None:
-    memory = Kept()
+    cache = Kept()
 
     def dismissed(stage: str, share: float) -> None:
         if stage == "registering" and share > 0:
             raise Cancelled("the job was dismissed")
 
     with pytest.raises(Cancelled):
-        register_map_scans(files, settings=SETTINGS, memory=memory, processes=1, progress=dismissed)
-    begun = set(registered)
-    assert {(each.target, each.source) for each in memory.results} == begun
-    registered.clear()
-    found = build(files, memory)
-    assert begun.isdisjoint(registered)
-    assert len(begun) + len(registered) == found.report.pairs_tried
+        register_map_scans(files, settings=SETTINGS, pair_cache=cache, processes=1, progress=dismissed)
+    begun = set(icp_pairs)
+    assert {(each.target, each.source) for each in cache.results} == begun
+    icp_pairs.clear()
+    found = build(files, cache)
+    assert begun.isdisjoint(icp_pairs)
+    assert len(begun) + len(icp_pairs) == found.report.pairs_tried
 
 
 def test_what_this_build_would_not_try_is_not_believed_because_it_is_remembered(
-    files: tuple[ScanFile, ...], registered: list[tuple[int, int]]
+    files: tuple[ScanFile, ...], icp_pairs: list[tuple[int, int]]
 ) -> None:
-    """The memory of four scans, given to a build of two."""
-    memory = Kept()
-    build(files, memory)
-    registered.clear()
-    few = build(files[:2], memory)
-    assert registered == []
+    """The cache of four scans, given to a build of two."""
+    cache = Kept()
+    build(files, cache)
+    icp_pairs.clear()
+    few = build(files[:2], cache)
+    assert icp_pairs == []
     assert few.report.pairs_tried == 1
     assert len(few.kept) == 1
 
@@ -130,7 +130,7 @@ def test_what_this_build_would_not_try_is_not_believed_because_it_is_remembered(
 def test_pairs_that_had_to_be_searched_are_remembered_too(
     room: Room,
     tmp_path: Path,
-    registered: list[tuple[int, int]],
+    icp_pairs: list[tuple[int, int]],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     searched: list[int] = []
@@ -142,18 +142,18 @@ def test_pairs_that_had_to_be_searched_are_remembered_too(
 
     monkeypatch.setattr(pairing, "search", counted)
     lost = tuple(written(tmp_path / f"{number}.pcd", room.before[number], thinned=6) for number in (0, 1))
-    memory = Kept()
-    first = build(lost, memory)
-    assert registered == [(0, 1)]
-    assert_same_map(first, build(lost, memory))
-    assert registered == [(0, 1)]
+    cache = Kept()
+    first = build(lost, cache)
+    assert icp_pairs == [(0, 1)]
+    assert_same_map(first, build(lost, cache))
+    assert icp_pairs == [(0, 1)]
     assert searched == [1, 1]  # each source in those before it, once a build
 
 
-def test_the_forgetful_one_keeps_nothing() -> None:
-    memory = NullPairCache()
-    memory.save([])
-    assert list(memory.load()) == []
+def test_the_null_cache_keeps_nothing() -> None:
+    cache = NullPairCache()
+    cache.save([])
+    assert list(cache.load()) == []
 
 
 SELECTION = MapSettings(partners=1, searched_partners=2, partners_across=1)
@@ -164,7 +164,7 @@ def plan(pairs: dict[tuple[int, int], float], *, searched: tuple[tuple[int, int]
     rank = np.zeros((6, 6))
     for (a, b), value in pairs.items():
         rank[a, b] = rank[b, a] = value
-    return PairPlan(numbers=list(range(6)), rank=rank, starts={pair: (np.eye(4),) for pair in searched})
+    return PairPlan(indices=list(range(6)), rank=rank, starts={pair: (np.eye(4),) for pair in searched})
 
 
 RANKS = {(0, 1): 0.9, (0, 2): 0.8, (1, 2): 0.7, (3, 4): 0.9, (2, 3): 0.3, (1, 4): 0.2}

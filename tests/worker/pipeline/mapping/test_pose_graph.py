@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 
 from tests.support.graphs import along, around, edge, line, ring, shifted
-from worker.cloud.poses import difference, inverse
+from worker.cloud.poses import difference, exponential, inverse
 from worker.cloud.types import Matrix4
 from worker.pipeline.mapping.pose_graph import (
     Solution,
-    chained,
+    chain,
     components,
+    map_from_reference,
     most_reliable_tree,
     reference_of,
     reliability,
@@ -24,8 +25,9 @@ from worker.pipeline.mapping.settings import MapSettings
 from worker.pipeline.registration.scan_to_scan import PairResult
 
 SETTINGS = MapSettings()
+MOTION = exponential(np.array([0.02, -0.01, 1.9, 4.0, -7.0, 0.3]))
 TRUTH = line(8)
-DOUBTFUL = {"agreement": 0.84, "free_space_violation": 0.003}
+DOUBTFUL = {"two_way_inlier_ratio": 0.84, "free_space_violation": 0.003}
 
 
 def test_the_largest_component_comes_first_and_of_equal_ones_that_with_the_lowest_index() -> None:
@@ -52,7 +54,7 @@ def test_of_scans_that_are_equal_in_all_the_first_is_the_reference() -> None:
 
 
 def test_a_chain_gives_the_known_poses_and_names_the_scans_on_the_way() -> None:
-    found = chained(range(8), along(TRUTH, reach=1, noise=False), SETTINGS)
+    found = chain(range(8), along(TRUTH, reach=1, noise=False), SETTINGS)
     assert found.reference == 1
     assert found.paths[6] == (1, 2, 3, 4, 5, 6)
     assert found.paths[0] == (1, 0)
@@ -62,7 +64,7 @@ def test_a_chain_gives_the_known_poses_and_names_the_scans_on_the_way() -> None:
 
 
 def test_a_path_takes_fewer_registrations_where_all_can_be_relied_on() -> None:
-    found = chained(range(6), around(ring(6), noise=False), SETTINGS)
+    found = chain(range(6), around(ring(6), noise=False), SETTINGS)
     assert found.reference == 0
     assert {number: len(path) - 1 for number, path in found.paths.items()} == {
         0: 0, 1: 1, 2: 1, 3: 2, 4: 1, 5: 1,
@@ -71,9 +73,9 @@ def test_a_path_takes_fewer_registrations_where_all_can_be_relied_on() -> None:
 
 def test_a_path_goes_round_a_doubtful_registration() -> None:
     sure = [edge(TRUTH, a, b) for a, b in ((0, 1), (1, 2), (2, 3), (0, 4), (0, 5), (0, 6))]
-    found = chained(range(7), [*sure, edge(TRUTH, 0, 3)], SETTINGS)
+    found = chain(range(7), [*sure, edge(TRUTH, 0, 3)], SETTINGS)
     assert found.paths[3] == (0, 3)
-    found = chained(range(7), [*sure, edge(TRUTH, 0, 3, **DOUBTFUL)], SETTINGS)
+    found = chain(range(7), [*sure, edge(TRUTH, 0, 3, **DOUBTFUL)], SETTINGS)
     assert found.paths[3] == (0, 1, 2, 3)
 
 
@@ -82,7 +84,7 @@ def test_where_there_is_but_a_doubtful_registration_a_path_takes_one_not_two() -
         *(edge(TRUTH, 0, number) for number in (1, 2, 5)),
         *(edge(TRUTH, a, b, **DOUBTFUL) for a, b in ((1, 3), (3, 4), (2, 4))),
     ]
-    found = chained(range(6), edges, SETTINGS)
+    found = chain(range(6), edges, SETTINGS)
     assert found.paths[4] == (0, 2, 4)
     assert found.paths[3] == (0, 1, 3)
 
@@ -91,9 +93,9 @@ def test_the_tree_of_what_can_be_relied_on_takes_a_long_way_round() -> None:
     """The reference of this ring is scan 0; the edge back to it is a little less sure than all the others."""
     truth = ring(6)
     edges = [edge(truth, number, number + 1) for number in range(5)]
-    edges += [edge(truth, 0, 5, agreement=0.93), edge({**truth, 6: truth[0]}, 0, 6)]
+    edges += [edge(truth, 0, 5, two_way_inlier_ratio=0.93), edge({**truth, 6: truth[0]}, 0, 6)]
     assert most_reliable_tree(range(7), edges, SETTINGS).paths[5] == (0, 1, 2, 3, 4, 5)
-    assert chained(range(7), edges, SETTINGS).paths[5] == (0, 5)
+    assert chain(range(7), edges, SETTINGS).paths[5] == (0, 5)
 
 
 def test_a_triangle_that_closes_counts_for_its_three_registrations_and_one_that_does_not_against_them() -> (
@@ -139,7 +141,7 @@ def test_reliability_grows_with_triangles_that_close_and_falls_with_those_that_d
     assert contradicted < alone < consistent_with_prior
 
 
-QUESTIONABLE = {"agreement": 0.84, "free_space_violation": 0.002}
+QUESTIONABLE = {"two_way_inlier_ratio": 0.84, "free_space_violation": 0.002}
 
 
 def worst(found: Solution, truth: dict[int, Matrix4]) -> float:
@@ -164,7 +166,7 @@ def test_a_ring_of_scans_comes_to_a_centimetre() -> None:
     assert set(found.poses) == set(truth)
     assert worst(found, truth) < 0.015
     assert len(found.kept) == 24
-    assert found.contradicted == ()
+    assert found.rejected == ()
 
 
 def test_a_registration_that_was_not_accepted_is_not_heard() -> None:
@@ -173,7 +175,7 @@ def test_a_registration_that_was_not_accepted_is_not_heard() -> None:
     refused = edge(truth, 0, 3, error=shifted(1.0), accepted=False)
     found = solve_graph(range(4), [*right, refused], SETTINGS)
     assert len(found.kept) == 3
-    assert found.contradicted == ()
+    assert found.rejected == ()
     assert solve_graph([0, 3], [refused], SETTINGS).poses.keys() == {0}
 
 
@@ -191,7 +193,7 @@ def test_a_wrong_loop_edge_is_thrown_out_and_leaves_no_trace_in_the_poses(by: fl
     right = around(truth)
     wrong = edge(truth, 1, 7, error=shifted(by, yaw=0.1))
     found = solve_graph(range(12), [*right, wrong], SETTINGS)
-    assert pairs_of(found.contradicted) == {(1, 7)}
+    assert pairs_of(found.rejected) == {(1, 7)}
     assert len(found.kept) == 24
     without = solve_graph(range(12), right, SETTINGS)
     assert worst(found, truth) < 0.015
@@ -208,7 +210,7 @@ def test_a_wrong_edge_in_the_place_of_a_short_cut_is_thrown_out_too() -> None:
     truth = ring(12)
     edges = [each for each in around(truth) if (each.target, each.source) != (4, 6)]
     found = solve_graph(range(12), [*edges, edge(truth, 4, 6, error=shifted(0.4))], SETTINGS)
-    assert pairs_of(found.contradicted) == {(4, 6)}
+    assert pairs_of(found.rejected) == {(4, 6)}
     assert worst(found, truth) < 0.015
 
 
@@ -218,7 +220,7 @@ def test_wrong_edges_that_agree_among_themselves_are_outvoted() -> None:
     slid = truth | {number: shifted(3.0) @ truth[number] for number in (6, 7, 8)}
     wrong = [edge(slid, a, b) for a, b in ((0, 6), (1, 7), (2, 8), (0, 7), (1, 6))]
     found = solve_graph(range(12), [*around(truth, reach=3), *wrong], SETTINGS)
-    assert pairs_of(found.contradicted) == pairs_of(wrong)
+    assert pairs_of(found.rejected) == pairs_of(wrong)
     assert set(found.poses) == set(truth)
     assert worst(found, truth) < 0.015
 
@@ -231,7 +233,7 @@ def test_few_right_edges_win_over_more_wrong_ones_of_lower_confidence() -> None:
     slid = truth | {number: shifted(2.0) @ truth[number] for number in range(5, 10)}
     wrong = [edge(slid, a, b, **QUESTIONABLE) for a, b in ((2, 5), (2, 6), (3, 6), (3, 7))]
     found = solve_graph(range(10), [*halves, *right, *wrong], SETTINGS)
-    assert pairs_of(found.contradicted) == pairs_of(wrong)
+    assert pairs_of(found.rejected) == pairs_of(wrong)
     assert worst(found, truth) < 0.03
 
 
@@ -242,10 +244,10 @@ def test_two_sure_edges_win_over_eight_doubtful_ones_that_agree_and_outweigh_the
     right = [edge(truth, 4, 5), edge(truth, 3, 5)]
     slid = truth | {number: shifted(2.0) @ truth[number] for number in range(5, 10)}
     across = ((2, 6), (1, 6), (4, 8), (3, 7), (2, 7), (1, 5), (4, 7), (3, 8))
-    wrong = [edge(slid, a, b, agreement=0.89) for a, b in across]
+    wrong = [edge(slid, a, b, two_way_inlier_ratio=0.89) for a, b in across]
     assert sum(each.confidence for each in wrong) > sum(each.confidence for each in right)
     found = solve_graph(range(10), [*halves, *right, *wrong], SETTINGS)
-    assert pairs_of(found.contradicted) == pairs_of(wrong)
+    assert pairs_of(found.rejected) == pairs_of(wrong)
     assert worst(found, truth) < 0.03
 
 
@@ -255,7 +257,7 @@ def test_of_two_registrations_of_one_scan_that_contradict_each_other_the_surer_o
     right = edge(truth, 0, 12)
     wrong = edge(truth, 6, 12, error=shifted(2.0), **QUESTIONABLE)
     found = solve_graph(range(13), [*around(ring(12)), right, wrong], SETTINGS)
-    assert pairs_of(found.contradicted) == {(6, 12)}
+    assert pairs_of(found.rejected) == {(6, 12)}
     assert 12 in found.poses
     assert worst(found, truth) < 0.02
 
@@ -285,3 +287,41 @@ def test_a_single_scan_is_its_own_frame() -> None:
     assert found.reference == 4
     assert found.poses[4].tolist() == np.eye(4).tolist()
     assert found.paths == {4: (4,)}
+
+
+# the frame of a map
+
+
+def test_without_a_prior_the_reference_scan_is_the_frame() -> None:
+    assert map_from_reference(ring(4), {}, 2).tolist() == np.eye(4).tolist()
+
+
+def test_with_two_priors_the_references_own_is_met_exactly() -> None:
+    truth = ring(4)
+    poses = {number: inverse(truth[1]) @ pose for number, pose in truth.items()}
+    astray = {0: shifted(5.0) @ truth[0], 1: truth[1]}
+    assert map_from_reference(poses, astray, 1) == pytest.approx(truth[1])
+
+
+def test_with_two_priors_and_none_of_the_reference_the_first_of_the_others_is_met() -> None:
+    truth = ring(4)
+    poses = {number: inverse(truth[1]) @ pose for number, pose in truth.items()}
+    frame = map_from_reference(poses, {2: truth[2], 3: shifted(5.0) @ truth[3]}, 1)
+    assert frame @ poses[2] == pytest.approx(truth[2])
+    assert frame == pytest.approx(truth[1])
+
+
+def test_a_prior_of_a_scan_that_has_no_pose_is_not_asked() -> None:
+    frame = map_from_reference({0: np.eye(4)}, {0: MOTION, 8: np.eye(4), 9: np.eye(4)}, 0)
+    assert frame == pytest.approx(MOTION)
+
+
+def test_one_bad_heading_is_outweighed_though_it_is_the_references() -> None:
+    truth = ring(8)
+    poses = {number: inverse(truth[0]) @ pose for number, pose in truth.items()}
+    priors = truth | {0: truth[0] @ shifted(yaw=np.radians(20))}
+    metres, radians = difference(map_from_reference(poses, priors, 0), truth[0])
+    assert np.degrees(radians) < 1.0
+    assert metres < 0.1
+    alone = map_from_reference(poses, {0: priors[0]}, 0)
+    assert np.degrees(difference(alone, truth[0])[1]) == pytest.approx(20.0)

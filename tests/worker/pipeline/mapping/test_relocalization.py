@@ -7,15 +7,13 @@ import pytest
 
 from tests.support.graphs import shifted
 from tests.support.rooms import Room, as_scan
-from tests.support.walks import QUICK, off, prepared_folder
+from tests.support.walks import QUICK, joint_settings, off, prepared_folder
 from worker.cloud.poses import inverse
 from worker.cloud.types import Matrix4
-from worker.pipeline.mapping.pair_registration import NullPairCache, PairWork, ValidScan
 from worker.pipeline.mapping.relocalization import Relocalized, relocalize
-from worker.pipeline.mapping.settings import MapSettings
-from worker.pipeline.mapping.tasks import assembled, forget_loaded
+from worker.pipeline.mapping.tasks import ValidScan, Workspace, forget_loaded, lay_together
 from worker.pipeline.registration.preprocessing import PreparedScan, prepare
-from worker.pipeline.registration.settings import RegistrationSettings
+from worker.pipeline.registration.settings import RegistrationSettings, with_values
 from worker.processes import Processes
 from worker.simulation.scenes import random_room
 from worker.simulation.visits import visit
@@ -25,17 +23,12 @@ AWAY = shifted(20.0, -7.0, yaw=0.6)  #: the frame of the priors, from that of th
 
 
 @pytest.fixture
-def work(room: Room, tmp_path: Path) -> PairWork:
+def work(room: Room, tmp_path: Path) -> Workspace:
     """Four scans of the room, prepared; what was loaded from another test's folder is forgotten."""
     forget_loaded()
     folder, _ = prepared_folder(tmp_path, dict(enumerate(room.before)))
-    return PairWork(
-        folder=folder,
-        processes=Processes(None),
-        registration=QUICK.model_copy(update={"search_resolutions": ()}),
-        mapping=MapSettings(),
-        memory=NullPairCache(),
-    )
+    settings = joint_settings(with_values(QUICK, search_resolutions=()))
+    return Workspace(folder=folder, processes=Processes(None), settings=settings)
 
 
 def truth(room: Room, number: int) -> Matrix4:
@@ -44,7 +37,7 @@ def truth(room: Room, number: int) -> Matrix4:
 
 
 def looked_for(
-    room: Room, work: PairWork, *, prior: Matrix4 | None, settings: RegistrationSettings | None = None
+    room: Room, work: Workspace, *, prior: Matrix4 | None, settings: RegistrationSettings | None = None
 ) -> Relocalized:
     """Scan LEFT in the map of the other three, whose priors are true in a frame far away."""
     poses = {number: truth(room, number) for number in range(LEFT)}
@@ -53,40 +46,40 @@ def looked_for(
         for number, scan in enumerate(room.before[:LEFT])
     }
     scans[LEFT] = ValidScan(points=room.before[LEFT].points, prior=prior)
-    asked = work if settings is None else replace(work, registration=settings)
+    asked = work if settings is None else replace(work, settings=joint_settings(settings))
     return relocalize([LEFT], poses, 0, scans, asked)[LEFT]
 
 
-def test_nothing_missing_is_nothing_found(work: PairWork) -> None:
+def test_nothing_missing_is_nothing_found(work: Workspace) -> None:
     assert relocalize([], {}, 0, {}, work) == {}
 
 
-def test_a_scan_is_found_in_the_map_of_the_others_from_its_prior(room: Room, work: PairWork) -> None:
+def test_a_scan_is_found_in_the_map_of_the_others_from_its_prior(room: Room, work: Workspace) -> None:
     prior = AWAY @ truth(room, LEFT) @ shifted(0.2, -0.1, yaw=0.05)
     found = looked_for(room, work, prior=prior)
     assert found.pose is not None
     assert off(found.pose, truth(room, LEFT)) < 0.015
-    assert found.reason is None
-    assert found.placement is not None
-    assert found.placement.fitness is not None
-    assert not found.placement.searched
+    assert found.result.reason is None
+    assert found.result.registration is not None
+    assert found.result.registration.fitness is not None
+    assert not found.result.registration.from_global_search
 
 
-def test_a_scan_without_a_prior_is_searched_in_the_map_of_the_others(room: Room, work: PairWork) -> None:
+def test_a_scan_without_a_prior_is_searched_in_the_map_of_the_others(room: Room, work: Workspace) -> None:
     found = looked_for(room, work, prior=None, settings=QUICK)
     assert found.pose is not None
     assert off(found.pose, truth(room, LEFT)) < 0.015
-    assert found.placement is not None
-    assert found.placement.searched
+    assert found.result.registration is not None
+    assert found.result.registration.from_global_search
 
 
-def test_it_stands_beside_the_placed_scan_that_is_nearest(room: Room, work: PairWork) -> None:
+def test_it_stands_beside_the_placed_scan_that_is_nearest(room: Room, work: Workspace) -> None:
     found = looked_for(room, work, prior=AWAY @ truth(room, LEFT))
     apart = {number: off(truth(room, number), truth(room, LEFT)) for number in range(LEFT)}
-    assert found.beside == min(apart, key=lambda number: apart[number])
+    assert found.nearest == min(apart, key=lambda number: apart[number])
 
 
-def test_a_scan_is_looked_for_in_the_map_as_it_has_grown_meanwhile(room: Room, work: PairWork) -> None:
+def test_a_scan_is_looked_for_in_the_map_as_it_has_grown_meanwhile(room: Room, work: Workspace) -> None:
     elsewhere = visit(random_room(11), 1, seed=5)[0]
     prepare(as_scan(elsewhere.points), QUICK).save(work.folder.path(9))
     scan = ValidScan(points=room.before[LEFT].points, prior=room.before[LEFT].world_from_sensor)
@@ -99,19 +92,21 @@ def test_a_scan_is_looked_for_in_the_map_as_it_has_grown_meanwhile(room: Room, w
     assert relocalize([LEFT], truth, 0, scans, work)[LEFT].pose is not None
 
 
-def test_a_foreign_scan_has_no_place_and_a_reason_with_numbers(room: Room, work: PairWork) -> None:
+def test_a_foreign_scan_has_no_place_and_a_reason_with_numbers(room: Room, work: Workspace) -> None:
     foreign = prepare(as_scan(visit(random_room(11), 1, seed=5)[0].points, name="foreign.pcd"), QUICK)
     foreign.save(work.folder.path(LEFT))
     found = looked_for(room, work, prior=None, settings=QUICK)
     assert found.pose is None
-    assert found.placement is None
-    assert found.reason is not None
-    assert found.reason.startswith("scan foreign.pcd: fitness 0.")
-    assert found.fitness is not None
+    assert found.result.registration is None
+    assert found.result.reason is not None
+    assert found.result.reason.startswith("scan foreign.pcd: fitness 0.")
+    assert found.result.fitness is not None
 
 
 @pytest.mark.parametrize("given", [True, False])
-def test_a_place_that_its_neighbours_saw_through_is_no_place(room: Room, work: PairWork, given: bool) -> None:
+def test_a_place_that_its_neighbours_saw_through_is_no_place(
+    room: Room, work: Workspace, given: bool
+) -> None:
     """The neighbours are told to have seen half as far again: the scan's walls then stand in their free space."""
     for number in range(LEFT):
         scan = PreparedScan.load(work.folder.path(number))
@@ -121,25 +116,27 @@ def test_a_place_that_its_neighbours_saw_through_is_no_place(room: Room, work: P
     prior = AWAY @ truth(room, LEFT) if given else None
     found = looked_for(room, work, prior=prior, settings=QUICK)
     assert found.pose is None
-    assert found.reason is not None
-    assert "where its neighbours saw free space" in found.reason
-    assert ("check its pose prior" in found.reason) == given
-    assert ("give an initial pose" in found.reason) != given
-    assert found.fitness is not None
-    assert found.fitness > 0.5
+    assert found.result.reason is not None
+    assert "where its neighbours saw free space" in found.result.reason
+    assert ("check its pose prior" in found.result.reason) == given
+    assert ("give an initial pose" in found.result.reason) != given
+    assert found.result.fitness is not None
+    assert found.result.fitness > 0.5
 
 
-def test_a_map_in_a_hurry_has_one_point_a_voxel_in_the_frame_of_the_poses(room: Room, work: PairWork) -> None:
+def test_a_map_in_a_hurry_has_one_point_a_voxel_in_the_frame_of_the_poses(
+    room: Room, work: Workspace
+) -> None:
     poses = [(number, truth(room, number)) for number in range(2)]
     first, second = (work.folder.load(number).surface for number in range(2))
-    surface = assembled(work.folder, poses, voxel_size=0.05)
+    surface = lay_together(work.folder, poses, voxel_size=0.05)
     assert len(first.points) < len(surface.points) < len(first.points) + len(second.points)
     assert surface.points[: len(first.points)] == pytest.approx(first.points)
     added = surface.points[len(first.points) :]
     there = second.points @ poses[1][1][:3, :3].T + poses[1][1][:3, 3]
     distance, index = surface.nearest(there, within=1e-6)
     assert (distance < 1e-6).sum() == len(added)
-    whole = assembled(work.folder, [poses[0], poses[0]], voxel_size=0.05)
+    whole = lay_together(work.folder, [poses[0], poses[0]], voxel_size=0.05)
     assert len(whole.points) == len(first.points)  # the same scan again adds nothing
     turned = second.normals @ poses[1][1][:3, :3].T
     hit = distance < 1e-6

@@ -10,22 +10,30 @@ import pytest
 
 from tests.support.graphs import shifted
 from tests.support.rooms import Room
-from tests.support.walks import QUICK, corridor_points, hanging, never_falls, off, placement, placing, written
+from tests.support.walks import (
+    QUICK,
+    corridor_points,
+    hanging,
+    joint_settings,
+    never_falls,
+    off,
+    registered,
+    written,
+)
 from worker.cloud.formats.pcd import write_pcd
 from worker.cloud.voxels import Voxels
 from worker.errors import Cancelled, ScanError, ScanTooLarge
-from worker.pipeline.mapping.settings import MultiScanSettings
+from worker.pipeline.mapping.settings import JointRegistrationSettings
 from worker.pipeline.mapping.survey_registration import register_survey_scans
-from worker.pipeline.registration.icp import Surface
-from worker.pipeline.registration.preprocessing import surface_of
 from worker.pipeline.registration.results import ScanFile, ScanResult
 from worker.pipeline.registration.settings import RegistrationSettings
+from worker.pipeline.registration.surface import Surface, surface_of
 from worker.progress import Progress, no_progress
 from worker.simulation.scenes import random_room
 from worker.simulation.visits import visit
 
 #: without any search, so that a prior has to do
-PRIORS_ONLY = placing(QUICK.model_copy(update={"search_resolutions": ()}))
+PRIORS_ONLY = joint_settings(QUICK.model_copy(update={"search_resolutions": ()}))
 #: metres along x, between which this part of the room lies
 WEST, EAST = (-np.inf, 2.3), (3.0, np.inf)
 
@@ -57,7 +65,7 @@ def west(room: Room) -> Surface:
 def place(
     files: Sequence[ScanFile],
     target: Surface,
-    settings: MultiScanSettings = PRIORS_ONLY,
+    settings: JointRegistrationSettings = PRIORS_ONLY,
     *,
     growing: bool = False,
     progress: Progress = no_progress,
@@ -83,7 +91,7 @@ def test_one_scan_stands_where_it_fits_the_map_and_tells_how_sure_that_is(
 ) -> None:
     told: list[tuple[str, float]] = []
     (outcome,) = place(files[:1], room.target, progress=lambda *at: told.append(at))
-    found = placement(outcome)
+    found = registered(outcome)
     assert off(found.map_from_scan, room.after[0].world_from_sensor) < 0.012
     assert found.sensor_origin == pytest.approx(found.map_from_scan[:3, 3])
     assert found.uncertainty is not None
@@ -99,7 +107,7 @@ def test_several_scans_are_refined_together_against_the_map(
 ) -> None:
     outcomes, told = together
     for outcome, scan in zip(outcomes, (*room.after, room.before[2]), strict=True):
-        found = placement(outcome)
+        found = registered(outcome)
         assert off(found.map_from_scan, scan.world_from_sensor) < 0.012
         assert found.uncertainty is not None
         assert 0.003 < found.uncertainty.translation < 0.02
@@ -118,7 +126,7 @@ def test_scans_that_agree_move_each_other_by_millimetres_only(
 ) -> None:
     for outcome, file in list(zip(together[0], files, strict=True))[1:]:
         (alone,) = place([file], room.target)
-        moved = off(placement(outcome).map_from_scan, placement(alone).map_from_scan)
+        moved = off(registered(outcome).map_from_scan, registered(alone).map_from_scan)
         assert 0 < moved < 0.006
 
 
@@ -129,25 +137,25 @@ def test_a_scan_that_sees_a_board_where_the_others_saw_nothing_is_left_out_and_n
     scan = room.after[1]
     odd = written(folder / "odd.pcd", scan, pose=scan.world_from_sensor, more=hanging(scan, size=1.8))
     alone = place([odd], room.target)
-    assert alone[0].placement is not None  # the map alone would have it
+    assert alone[0].registration is not None  # the map alone would have it
     told: list[tuple[str, float]] = []
     outcomes = place([files[0], odd, files[2]], room.target, progress=lambda *at: told.append(at))
     assert never_falls(told)
-    assert [outcome.placement is not None for outcome in outcomes] == [True, False, True]
+    assert [outcome.registration is not None for outcome in outcomes] == [True, False, True]
     assert outcomes[1].reason is not None
     assert outcomes[1].reason.startswith("scan odd.pcd: it disagrees with the other scans")
     assert outcomes[1].fitness is not None
     assert outcomes[1].fitness > 0.3
     without = place([files[0], files[2]], room.target)
     for number, other in ((0, 0), (2, 1)):
-        a, b = placement(outcomes[number]), placement(without[other])
+        a, b = registered(outcomes[number]), registered(without[other])
         assert off(a.map_from_scan, b.map_from_scan) < 0.001
 
 
 def test_a_scan_that_the_others_would_have_elsewhere_is_left_out_and_named(folder: Path) -> None:
     """A map of a bare corridor lets scans slide; the end walls that they saw say that one is a decimetre off."""
     stays = {"min_eigenvalue": 0.0, "coarse_distances": (), "max_iterations": 2}
-    lenient = placing(PRIORS_ONLY.registration.model_copy(update=stays))
+    lenient = joint_settings(PRIORS_ONLY.registration.model_copy(update=stays))
     bare = Voxels.of(corridor_points(ends=False, seed=9, half=8.0), size=0.05, origin=np.zeros(3))
     target = surface_of(bare, lenient.registration)
     files = []
@@ -156,12 +164,12 @@ def test_a_scan_that_the_others_would_have_elsewhere_is_left_out_and_named(folde
         write_pcd(path, corridor_points(ends=True, seed=number))
         files.append(ScanFile(name=path.name, path=path, pose=shifted(off_by)))
     outcomes = place(files, target, lenient)
-    assert [outcome.placement is not None for outcome in outcomes] == [True, False, True]
+    assert [outcome.registration is not None for outcome in outcomes] == [True, False, True]
     assert outcomes[1].reason is not None
     assert outcomes[1].reason.startswith("scan corridor-1.pcd: it disagrees with the other scans")
     assert any(f"would have it {centimetres} cm from" in outcomes[1].reason for centimetres in range(6, 13))
     for outcome in (outcomes[0], outcomes[2]):
-        assert off(placement(outcome).map_from_scan, np.eye(4)) < 0.03
+        assert off(registered(outcome).map_from_scan, np.eye(4)) < 0.03
 
 
 def test_a_foreign_scan_is_left_out_and_moves_no_other(
@@ -169,21 +177,21 @@ def test_a_foreign_scan_is_left_out_and_moves_no_other(
 ) -> None:
     foreign = written(folder / "foreign.pcd", visit(random_room(11), 1, seed=5)[0])
     outcomes = place([files[0], foreign, files[1]], room.target)
-    assert [outcome.placement is not None for outcome in outcomes] == [True, False, True]
+    assert [outcome.registration is not None for outcome in outcomes] == [True, False, True]
     assert outcomes[1].reason is not None
     assert outcomes[1].reason.startswith("scan foreign.pcd: fitness 0.")
     assert (outcomes[1].fitness is not None, outcomes[1].name) == (True, "foreign.pcd")
     without = place(files[:2], room.target)
     for number, other in ((0, 0), (2, 1)):
-        a, b = placement(outcomes[number]), placement(without[other])
+        a, b = registered(outcomes[number]), registered(without[other])
         assert a.map_from_scan.tolist() == b.map_from_scan.tolist()
 
 
 def test_a_scan_without_a_prior_is_searched(room: Room, folder: Path) -> None:
     lost = written(folder / "lost.pcd", room.after[0])
-    (outcome,) = place([lost], room.target, placing(QUICK))
-    assert placement(outcome).searched
-    assert off(placement(outcome).map_from_scan, room.after[0].world_from_sensor) < 0.012
+    (outcome,) = place([lost], room.target, joint_settings(QUICK))
+    assert registered(outcome).from_global_search
+    assert off(registered(outcome).map_from_scan, room.after[0].world_from_sensor) < 0.012
 
 
 def test_a_survey_without_any_place_has_a_reason_for_every_scan_and_no_placement(
@@ -194,7 +202,7 @@ def test_a_survey_without_any_place_has_a_reason_for_every_scan_and_no_placement
         for number, scan in enumerate(visit(random_room(11), 2, seed=5))
     ]
     outcomes = place(out_of_place, room.target)
-    assert [outcome.placement for outcome in outcomes] == [None, None]
+    assert [outcome.registration for outcome in outcomes] == [None, None]
     assert all(str(outcome.reason).startswith(f"scan {outcome.name}: ") for outcome in outcomes)
 
 
@@ -211,12 +219,12 @@ def test_a_scan_that_touches_only_another_new_one_is_placed_where_the_map_is_to_
         written(folder / "whole.pcd", whole, pose=whole.world_from_sensor),
     ]
     survey = place(files, west)
-    assert [outcome.placement is not None for outcome in survey] == [False, True]
+    assert [outcome.registration is not None for outcome in survey] == [False, True]
     told: list[tuple[str, float]] = []
     grown = place(files, west, growing=True, progress=lambda *at: told.append(at))
     assert never_falls(told)
     for outcome, scan in zip(grown, (east, whole), strict=True):
-        assert off(placement(outcome).map_from_scan, scan.world_from_sensor) < 0.03
+        assert off(registered(outcome).map_from_scan, scan.world_from_sensor) < 0.03
 
 
 def test_what_finds_no_place_in_the_grown_map_either_is_left_out(
@@ -226,7 +234,7 @@ def test_what_finds_no_place_in_the_grown_map_either_is_left_out(
     foreign = written(folder / "foreign-2.pcd", visit(random_room(11), 1, seed=5)[0])
     files = [foreign, written(folder / "whole-2.pcd", whole, pose=whole.world_from_sensor)]
     outcomes = place(files, west, growing=True)
-    assert [outcome.placement is not None for outcome in outcomes] == [False, True]
+    assert [outcome.registration is not None for outcome in outcomes] == [False, True]
     assert str(outcomes[0].reason).startswith("scan foreign-2.pcd: ")
 
 
@@ -241,9 +249,9 @@ def test_a_file_that_is_no_scan_is_left_out_with_its_reason(
     asked = [files[0]]
     asked.insert(place_of_it, ScanFile(name="hall 3.ply", path=tmp_path / "x"))
     outcomes = place(asked, room.target)
-    assert outcomes[place_of_it].placement is None
+    assert outcomes[place_of_it].registration is None
     assert str(outcomes[place_of_it].reason).startswith("hall 3.ply: ")
-    assert placement(outcomes[1 - place_of_it]).fitness is not None
+    assert registered(outcomes[1 - place_of_it]).fitness is not None
 
 
 def test_where_no_file_is_a_scan_the_first_is_named(room: Room, tmp_path: Path) -> None:
@@ -254,7 +262,7 @@ def test_where_no_file_is_a_scan_the_first_is_named(room: Room, tmp_path: Path) 
 
 
 def test_a_scan_of_more_points_than_the_limit_is_refused(room: Room, files: tuple[ScanFile, ...]) -> None:
-    few = MultiScanSettings(
+    few = JointRegistrationSettings(
         registration=PRIORS_ONLY.registration, mapping=PRIORS_ONLY.mapping, max_points=1000
     )
     with pytest.raises(ScanTooLarge, match=r"^now-0\.pcd: "):

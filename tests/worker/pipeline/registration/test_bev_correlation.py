@@ -13,17 +13,20 @@ from worker.pipeline.registration.bev_correlation import (
     YAWS,
     BevImage,
     bev_candidates,
-    matches,
-    size_for,
+    correlate,
+    image_size,
+    rotated_spectra,
     spectrum,
-    turned_spectra,
 )
-from worker.pipeline.registration.icp import Surface
 from worker.pipeline.registration.preprocessing import prepare
 from worker.pipeline.registration.settings import RegistrationSettings
+from worker.pipeline.registration.surface import Surface
 
 SETTINGS = RegistrationSettings()
-NEAR = (0.6, np.radians(6))  # metres, radians: two pixels, a turn and a half; rough_pose takes it from there
+NEAR = (
+    0.6,
+    np.radians(6),
+)  # metres, radians: two pixels, a turn and a half; coarse alignment takes it from there
 
 
 @pytest.fixture(scope="module")
@@ -56,8 +59,8 @@ def test_two_scans_of_one_room_are_found_in_each_other(room: Room, seen: Surface
     other = prepare(as_scan(room.before[1].points), SETTINGS).surface
     truth = inverse(room.before[1].world_from_sensor) @ room.after[0].world_from_sensor
     view, target = BevImage.of(seen), BevImage.of(other)
-    turned, spectra = turned_spectra(view, PAIR_SIZE), spectrum(target, PAIR_SIZE)
-    found = matches(view, turned, target, spectra, count=6)
+    rotated, spectra = rotated_spectra(view, PAIR_SIZE), spectrum(target, PAIR_SIZE)
+    found = correlate(view, rotated, target, spectra, count=6)
     assert hits([match.target_from_source for match in found], truth)
     scores = [match.score for match in found]
     assert scores == sorted(scores, reverse=True)
@@ -130,5 +133,5 @@ def test_a_picture_is_as_large_as_the_larger_view(room: Room, seen: Surface) -> 
         BevImage.of(seen),
         BevImage.of(surface_of_boxes(box(0, 0, inward=True), box(40, 0, inward=True))),
     )
-    assert size_for(small, large) == size_for(large) > size_for(small)
-    assert size_for(large) * CELL > 44 + 2
+    assert image_size(small, large) == image_size(large) > image_size(small)
+    assert image_size(large) * CELL > 44 + 2

@@ -10,10 +10,9 @@ from worker.cloud.poses import difference, transformed
 from worker.cloud.types import Matrix4
 from worker.cloud.voxels import Voxels
 from worker.pipeline.registration import fpfh_ransac
-from worker.pipeline.registration.fpfh_ransac import candidate_poses
-from worker.pipeline.registration.icp import Surface
-from worker.pipeline.registration.preprocessing import surface_of
+from worker.pipeline.registration.fpfh_ransac import fpfh_candidates
 from worker.pipeline.registration.settings import RegistrationSettings
+from worker.pipeline.registration.surface import Surface, surface_of
 
 
 @pytest.fixture(scope="module")
@@ -24,7 +23,7 @@ def source(room: Room) -> Surface:
 
 @pytest.fixture(scope="module")
 def found(room: Room, source: Surface) -> list[Matrix4]:
-    return list(candidate_poses(source, room.target, resolutions=(0.3, 0.2), seeds=2))
+    return list(fpfh_candidates(source, room.target, resolutions=(0.3, 0.2), seeds=2))
 
 
 def test_a_candidate_stands_within_reach_of_icp(room: Room, found: list[Matrix4]) -> None:
@@ -57,7 +56,7 @@ def test_who_is_content_with_the_first_pays_for_one_resolution(
         return real(surface, resolution)
 
     monkeypatch.setattr(fpfh_ransac, "_Features", counted)
-    poses = candidate_poses(source, room.target, resolutions=(0.3, 0.2), seeds=2)
+    poses = fpfh_candidates(source, room.target, resolutions=(0.3, 0.2), seeds=2)
     next(poses)
     assert made == [0.3, 0.3]  # of the scan and of the map
     list(poses)
@@ -65,7 +64,7 @@ def test_who_is_content_with_the_first_pays_for_one_resolution(
 
 
 def test_no_resolution_gives_no_candidate(room: Room, source: Surface) -> None:
-    assert list(candidate_poses(source, room.target, resolutions=(), seeds=3)) == []
+    assert list(fpfh_candidates(source, room.target, resolutions=(), seeds=3)) == []
 
 
 def test_the_pose_is_target_from_source(room: Room, source: Surface, found: list[Matrix4]) -> None:
@@ -82,7 +81,7 @@ def test_the_pose_is_target_from_source(room: Room, source: Surface, found: list
 
 def test_the_same_clouds_give_the_same_first_candidate(room: Room, source: Surface) -> None:
     first, again = (
-        next(islice(candidate_poses(source, room.target, resolutions=(0.3,), seeds=1), 1)) for _ in range(2)
+        next(islice(fpfh_candidates(source, room.target, resolutions=(0.3,), seeds=1), 1)) for _ in range(2)
     )
     metres, radians = difference(first, again)
     assert metres < 0.5

@@ -5,7 +5,8 @@ import pytest
 
 from worker.cloud.poses import difference, exponential
 from worker.errors import Cancelled
-from worker.pipeline.registration.icp import Surface, facing, icp
+from worker.pipeline.registration.icp import icp
+from worker.pipeline.registration.surface import Surface, facing
 
 
 def _corner(*, noise: float = 0.0) -> Surface:

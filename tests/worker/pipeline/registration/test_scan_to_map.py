@@ -11,12 +11,12 @@ from worker.cloud.formats.scan import Scan, read_scan
 from worker.cloud.poses import difference, exponential
 from worker.cloud.types import Points
 from worker.cloud.voxels import Voxels
-from worker.pipeline.registration.degeneracy import least_eigenvalue
 from worker.pipeline.registration.hypothesis import Hypothesis
-from worker.pipeline.registration.icp import Surface
-from worker.pipeline.registration.preprocessing import PreparedScan, ScanRejected, prepare, surface_of
-from worker.pipeline.registration.scan_to_map import placement_of, register
+from worker.pipeline.registration.preprocessing import PreparedScan, prepare
+from worker.pipeline.registration.results import ScanRejected
+from worker.pipeline.registration.scan_to_map import register, registration_result
 from worker.pipeline.registration.settings import RegistrationSettings
+from worker.pipeline.registration.surface import Surface, least_eigenvalue, surface_of
 from worker.simulation.scenes import random_room, small_office
 from worker.simulation.sensor import SimulatedScan
 from worker.simulation.visits import visit
@@ -31,7 +31,7 @@ def _ready(scan: Scan | Points, settings: RegistrationSettings = SETTINGS) -> Pr
 
 
 def _off(found: Hypothesis, truth: np.ndarray) -> tuple[float, float]:
-    metres, radians = difference(found.found.target_from_source, truth)
+    metres, radians = difference(found.target_from_source, truth)
     return metres * 100, float(np.degrees(radians))
 
 
@@ -46,20 +46,20 @@ def test_defaults_are_those_of_table_1() -> None:
 def test_register_finds_a_drifted_scan_to_a_centimetre(room: Room, number: int) -> None:
     truth = room.after[number].world_from_sensor
     drift = exponential(np.array([0.0, 0.0, np.radians(4), 0.2, -0.15, 0.02]))
-    found = register(_ready(room.scan(number)), room.target, start=truth @ drift, settings=SETTINGS)
+    found = register(_ready(room.scan(number)), room.target, prior=truth @ drift, settings=SETTINGS)
     centimetres, degrees = _off(found, truth)
     assert centimetres < 1.5
     assert degrees < 0.3
-    assert not found.searched
+    assert not found.from_global_search
 
 
 def test_candidates_are_told_by_some_of_the_points_and_the_pose_by_all(
     room: Room, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("worker.pipeline.registration.hypothesis._ENOUGH", 1000)
+    monkeypatch.setattr("worker.pipeline.registration.refinement._ENOUGH", 1000)
     scan = prepare(room.scan(), SETTINGS)
-    found = register(scan, room.target, start=room.after[0].world_from_sensor, settings=SETTINGS)
-    assert found.found.num_inliers > len(scan.surface.points) / 2
+    found = register(scan, room.target, prior=room.after[0].world_from_sensor, settings=SETTINGS)
+    assert found.num_inliers > len(scan.surface.points) / 2
 
 
 def test_register_finds_a_scan_with_no_start_at_all(room: Room) -> None:
@@ -67,31 +67,31 @@ def test_register_finds_a_scan_with_no_start_at_all(room: Room) -> None:
     centimetres, degrees = _off(found, room.after[0].world_from_sensor)
     assert centimetres < 1.5
     assert degrees < 0.3
-    assert found.searched
+    assert found.from_global_search
 
 
-def test_a_placement_carries_the_numbers_of_the_registration_and_the_sensors_place_in_the_map(
+def test_a_result_carries_the_numbers_of_the_registration_and_the_sensors_place_in_the_map(
     room: Room,
 ) -> None:
     truth, scan = room.after[0].world_from_sensor, _ready(room.scan())
-    found = register(scan, room.target, start=truth, settings=SETTINGS)
-    placement = placement_of(found, scan.origin)
-    assert placement.map_from_scan.tolist() == found.found.target_from_source.tolist()
-    assert placement.sensor_origin == pytest.approx(truth[:3, 3], abs=0.02)
-    assert (placement.fitness, placement.inlier_rmse) == (found.found.fitness, found.found.inlier_rmse)
-    assert (placement.overlap, placement.agreement) == (found.seen.overlap, found.seen.mutual)
-    assert not placement.searched
+    found = register(scan, room.target, prior=truth, settings=SETTINGS)
+    result = registration_result(found, scan.origin)
+    assert result.map_from_scan.tolist() == found.target_from_source.tolist()
+    assert result.sensor_origin == pytest.approx(truth[:3, 3], abs=0.02)
+    assert (result.fitness, result.inlier_rmse) == (found.fitness, found.inlier_rmse)
+    assert (result.overlap, result.two_way_inlier_ratio) == (found.overlap, found.two_way_inlier_ratio)
+    assert not result.from_global_search
     better = truth @ exponential(np.array([0, 0, 0, 1.0, 0, 0]))
-    refined = placement_of(found, scan.origin, pose=better)
+    refined = registration_result(found, scan.origin, pose=better)
     assert refined.map_from_scan.tolist() == better.tolist()
     assert refined.sensor_origin == pytest.approx(better[:3, 3])
-    assert placement_of(found, None).sensor_origin is None
+    assert registration_result(found, None).sensor_origin is None
 
 
 def test_a_scan_of_another_place_is_rejected_with_its_numbers(room: Room) -> None:
     elsewhere = visit(random_room(11), 1, seed=5)[0]
     with pytest.raises(
-        ScanRejected, match=r"scan foreign\.pcd: fitness 0\.\d\d .*agreement 0\.\d\d"
+        ScanRejected, match=r"scan foreign\.pcd: fitness 0\.\d\d .*inlier ratio 0\.\d\d"
     ) as error:
         register(_ready(as_scan(elsewhere.points, name="foreign.pcd")), room.target, settings=ONE_DRAW)
     assert error.value.fitness is not None
@@ -101,7 +101,7 @@ def test_a_scan_of_another_place_is_rejected_with_its_numbers(room: Room) -> Non
 def test_a_pose_far_from_a_given_prior_is_not_taken(room: Room) -> None:
     wrong = room.after[0].world_from_sensor @ exponential(np.array([0, 0, np.pi / 2, 2.5, 0.0, 0.0]))
     with pytest.raises(ScanRejected):
-        register(_ready(room.scan()), room.target, start=wrong, settings=ONE_DRAW)
+        register(_ready(room.scan()), room.target, prior=wrong, settings=ONE_DRAW)
 
 
 def test_a_bare_plane_is_refused_before_it_can_slide() -> None:
@@ -118,10 +118,15 @@ def test_a_scan_that_shares_only_a_floor_with_the_map_is_refused(room: Room) -> 
     floor = points[inner & (np.abs(points[:, 2]) < 0.04)]
     target = surface_of(Voxels.of(floor, size=0.05), SETTINGS)
     start = room.after[0].world_from_sensor
-    lenient = {"min_overlap_near_prior": 0.05, "min_inlier_ratio": 0.5, "prior_distance": 99.0, "prior_angle": 3.2}
+    lenient = {
+        "min_overlap_near_prior": 0.05,
+        "min_inlier_ratio": 0.5,
+        "prior_distance": 99.0,
+        "prior_angle": 3.2,
+    }
     settings = SETTINGS.model_copy(update=lenient)
     with pytest.raises(ScanRejected, match="shares with the map leaves a motion free"):
-        register(_ready(room.scan()), target, start=start, settings=settings)
+        register(_ready(room.scan()), target, prior=start, settings=settings)
 
 
 def test_too_few_points_are_refused_with_their_number() -> None:
@@ -146,7 +151,7 @@ def test_a_wall_seen_from_its_other_side_does_not_pull_the_scan_over(
 ) -> None:
     """The map knows the room behind the wall and, through the door, a little more."""
     scan = office[4]
-    found = register(_ready(scan.points), _map_of(office[:4]), start=scan.prior, settings=SETTINGS)
+    found = register(_ready(scan.points), _map_of(office[:4]), prior=scan.prior, settings=SETTINGS)
     assert _off(found, scan.world_from_sensor)[0] < 2.0
 
 
@@ -156,12 +161,12 @@ def test_a_good_prior_is_not_dragged_away_where_the_map_shares_little_with_the_s
     """Seen through a door: with the wide gates alone this scan finds no place."""
     scan, target = office[8], _map_of((*office[:8], *office[10:]))
     settings = SETTINGS.model_copy(update={"search_resolutions": ()})
-    found = register(_ready(scan.points), target, start=scan.prior, settings=settings)
+    found = register(_ready(scan.points), target, prior=scan.prior, settings=settings)
     assert _off(found, scan.world_from_sensor)[0] < 2.0
 
 
 @pytest.mark.parametrize(("size", "expected"), [(1, 1e-4), (2, 0.001)])
-def test_constraint_of_one_and_two_planes_is_next_to_nothing(size: int, expected: float) -> None:
+def test_least_eigenvalue_of_one_and_two_planes_is_next_to_nothing(size: int, expected: float) -> None:
     rng = np.random.default_rng(0)
     planes = [np.column_stack([rng.uniform(-4, 4, (30_000, 2)), rng.normal(0, 0.015, 30_000)])]
     if size == 2:
@@ -169,7 +174,7 @@ def test_constraint_of_one_and_two_planes_is_next_to_nothing(size: int, expected
     assert least_eigenvalue(np.concatenate(planes)) <= expected
 
 
-def test_constraint_of_a_furnished_room_is_firm(room: Room) -> None:
+def test_least_eigenvalue_of_a_furnished_room_is_firm(room: Room) -> None:
     assert least_eigenvalue(room.after[0].points) > 10 * SETTINGS.min_eigenvalue
 
 
@@ -207,11 +212,11 @@ def test_real_scans_of_different_places_are_rejected(shared_data: Path, current:
         register(_ready(read_scan(shared_data / current)), surface_of(voxels, SETTINGS), settings=ONE_DRAW)
 
 
-def test_asking_for_more_agreement_is_heeded_with_and_without_a_prior(room: Room) -> None:
+def test_asking_for_more_inliers_is_heeded_with_and_without_a_prior(room: Room) -> None:
     strict = SETTINGS.model_copy(update={"min_inlier_ratio": 1.0, "search_resolutions": ()})
     for start in (None, room.after[0].world_from_sensor):
         with pytest.raises(ScanRejected, match="at least 1"):
-            register(_ready(room.scan()), room.target, start=start, settings=strict)
+            register(_ready(room.scan()), room.target, prior=start, settings=strict)
 
 
 def test_a_room_without_furniture_is_not_believed_half_turned_when_a_better_turn_is_there() -> None:

@@ -73,7 +73,7 @@ def test_a_pair_is_found_from_a_drifted_prior(pair: tuple[PreparedScan, Prepared
     assert found.accepted
     assert found.consistent_with_prior
     assert found.free_space_violation < 0.002
-    assert found.agreement > 0.9
+    assert found.two_way_inlier_ratio > 0.9
     assert found.confidence > 0.5
 
 
@@ -111,7 +111,9 @@ def test_what_stands_in_seen_space_is_not_accepted_though_the_surfaces_agree(
     pair: tuple[PreparedScan, PreparedScan, Matrix4],
 ) -> None:
     source, target, truth = pair
-    strict = SETTINGS.model_copy(update={"max_free_space_violation_near_prior": 0.0, "max_free_space_violation": 0.0})
+    strict = SETTINGS.model_copy(
+        update={"max_free_space_violation_near_prior": 0.0, "max_free_space_violation": 0.0}
+    )
     assert target.image is not None
     farther = replace(target, image=replace(target.image, ranges=target.image.ranges * 1.5))
     found = register_pair((0, 1), source, farther, prior=truth, settings=strict)
@@ -133,7 +135,7 @@ def test_information_is_that_of_the_pairs_of_points_in_the_targets_frame(
 
 
 @pytest.mark.parametrize(
-    ("agreement", "free_space_violation", "expected"),
+    ("two_way_inlier_ratio", "free_space_violation", "expected"),
     [
         (0.95, 0.0, 1.0),
         (0.99, 0.0, 1.0),
@@ -144,14 +146,16 @@ def test_information_is_that_of_the_pairs_of_points_in_the_targets_frame(
         (0.5, 0.0, 0.0025),
     ],
 )
-def test_confidence_falls_with_agreement_and_with_what_stands_in_free_space(
-    agreement: float, free_space_violation: float, expected: float
+def test_confidence_falls_with_the_inlier_ratio_and_with_what_stands_in_free_space(
+    two_way_inlier_ratio: float, free_space_violation: float, expected: float
 ) -> None:
-    found = edge(TRUTH, 0, 1, agreement=agreement, free_space_violation=free_space_violation)
+    found = edge(
+        TRUTH, 0, 1, two_way_inlier_ratio=two_way_inlier_ratio, free_space_violation=free_space_violation
+    )
     assert found.confidence == pytest.approx(expected)
 
 
-def test_a_rough_look_brings_a_pose_nearer_and_says_no_where_free_space_does(
+def test_coarse_alignment_brings_a_pose_nearer_and_says_no_where_free_space_does(
     pair: tuple[PreparedScan, PreparedScan, Matrix4],
 ) -> None:
     source, target, truth = pair
