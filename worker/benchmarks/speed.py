@@ -198,7 +198,7 @@ def tables(figures: Document) -> Group:
     """Show the seconds of each stage and each way of scoring on a terminal."""
     scene, poses = figures["scene"], figures["map_poses"]
     title = f"{scene['scans']} scans of {scene['points_per_scan']:,} points, {scene['tiles']} tiles"
-    stages = titled_table(title, "stage", "map", "survey, drifted prior", "survey, no prior")
+    stages = titled_table(title, "seconds of a stage", "map", "survey, drifted prior", "survey, no prior")
     columns = [figures["map"], figures["survey_with_prior"], figures["survey_without_prior"]]
     names = dict.fromkeys(
         name for column in columns for name, value in column.items() if isinstance(value, float)
