@@ -8,7 +8,7 @@ from typing import Annotated
 import pytest
 import typer
 
-from worker.cli.command_line import as_given
+from worker.cli.command_line import command_line
 
 
 def told(*words: str) -> str:
@@ -23,7 +23,7 @@ def told(*words: str) -> str:
         quick: Annotated[bool, typer.Option("--quick")] = False,
         out: Annotated[Path | None, typer.Option()] = None,
     ) -> None:
-        found.append(as_given(context))
+        found.append(command_line(context))
 
     app = typer.Typer()
     app.command("taste")(taste)

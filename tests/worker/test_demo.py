@@ -12,13 +12,10 @@ from rich.console import Console
 
 from tests.support.models import make_untrained
 from worker.cloud.tiling import TileGrid
-from worker.demo.child import ServiceChild
-from worker.demo.failure import DemoFailed
-from worker.demo.placement import placement_line
+from worker.demo.judgement import Verdict, grid_of, judge, placement_line, show_judgement
 from worker.demo.run import DemoSettings, run
-from worker.demo.show import show_judgement
+from worker.demo.service import DemoFailed, ServiceChild
 from worker.demo.story import OFFICE, Story, edits, tell
-from worker.demo.verdict import Verdict, grid_of, judge
 from worker.simulation.scenes import small_office
 from worker.simulation.truth import TileTruth
 

@@ -10,7 +10,7 @@ import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from importlib.util import find_spec
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,20 +23,8 @@ from worker.threads import query_threads
 
 FARTHEST = 1.0  #: metres; no nearest distance counts as more, and none is searched beyond
 FAR = 0.10  #: metres; two voxels of the fused maps
+PACKAGE = "py4dgeo"  #: of the real M3C2, an extra of the install
 NORMAL_RADIUS, NORMAL_NEIGHBORS = 0.15, 30  #: metres; of the plane that M3C2-approx puts through a point
-
-
-class Baseline(Protocol):
-    """A method that needs no training."""
-
-    @property
-    def name(self) -> str:
-        """As tables call it."""
-        ...
-
-    def score(self, pairs: TilePairs) -> Floats:
-        """(T,) the higher the more changed; NaN where the tile was not observed."""
-        ...
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -72,7 +60,7 @@ class M3c2Approximation:
     mean distance in metres. Along the plane nothing is measured, so a removed or a shifted flat thing shows little.
     """
 
-    _known: tuple[Tiles, Normals] | None = field(default=None, init=False)  # of the reference scored last
+    _reference: tuple[Tiles, Normals] | None = field(default=None, init=False)  # of the reference scored last
 
     @property
     def name(self) -> str:
@@ -91,14 +79,14 @@ class M3c2Approximation:
         return _where_observed(_means(_parts(off, pairs.current)), pairs)
 
     def _normals(self, reference: Tiles, points: Points) -> Normals:
-        if self._known is None or self._known[0] is not reference:
-            found = estimate_normals(points, radius=NORMAL_RADIUS, max_neighbors=NORMAL_NEIGHBORS)
-            self._known = (reference, found)
-        return self._known[1]
+        if self._reference is None or self._reference[0] is not reference:
+            normals = estimate_normals(points, radius=NORMAL_RADIUS, max_neighbors=NORMAL_NEIGHBORS)
+            self._reference = (reference, normals)
+        return self._reference[1]
 
 
 def _nearest(points: Sequence[Points], others: Sequence[Points]) -> list[Floats]:
-    """For each tile, (n,) metres from its points to the nearest of all the others' points, at most FARTHEST."""
+    """Return for each tile the metres (n,) from its points to the nearest of all the others', at most FARTHEST."""
     sought, cloud = np.concatenate(points), np.concatenate(others)
     if not len(cloud):
         return [np.full(len(part), FARTHEST) for part in points]
@@ -107,12 +95,12 @@ def _nearest(points: Sequence[Points], others: Sequence[Points]) -> list[Floats]
 
 
 def _parts(values: Floats, tiles: Sequence[Points]) -> list[Floats]:
-    """(N,) -> one array a tile, as its points."""
+    """Split values (N,) into one array a tile, as its points."""
     return list(np.split(values, np.cumsum([len(part) for part in tiles])[:-1]))
 
 
 def _means(parts: Sequence[Floats]) -> Floats:
-    """(T,) NaN for a tile without points."""
+    """Return the mean of each part: (T,), NaN for a tile without points."""
     return np.array([part.mean() if len(part) else np.nan for part in parts])
 
 
@@ -120,20 +108,13 @@ def _where_observed(scores: Floats, pairs: TilePairs) -> Floats:
     return np.where(pairs.observed, scores, np.nan)
 
 
-PACKAGE = "py4dgeo"
-
-
-def m3c2_is_installed() -> bool:
-    """Whether `M3c2` can be used."""
-    return find_spec(PACKAGE) is not None
-
-
 @dataclass(frozen=True, kw_only=True, slots=True)
 class M3c2:
     """Signed distances along local normals, each with its level of detection.
 
     The score of a tile is the share of its core points that changed: those whose distance is significant at
-    95%, and those with points of one cloud only in their cylinder, for something is gone. Core points are every `every`th of the reference.
+    95%, and those with points of one cloud only in their cylinder, for something is gone. Core points are every
+    `every`th of the reference.
     """
 
     every: int = 4
@@ -173,6 +154,20 @@ class M3c2:
         one_sided = (uncertainties["num_samples1"] > 0) != (uncertainties["num_samples2"] > 0)
         changed: NDArray[np.bool_] = one_sided | (np.abs(distances) > uncertainties["lodetection"])
         return changed
+
+
+Baseline = CloudToCloud | M3c2Approximation | M3c2
+
+
+def installed_baselines() -> tuple[Baseline, ...]:
+    """Return those that this machine can run: the real M3C2 needs a library that is an extra of the install."""
+    always = (CloudToCloud(), CloudToCloud(statistic="far"), M3c2Approximation())
+    return (*always, M3c2()) if m3c2_is_installed() else always
+
+
+def m3c2_is_installed() -> bool:
+    """Tell whether `M3c2` can be used."""
+    return find_spec(PACKAGE) is not None
 
 
 def _library() -> Any:

@@ -27,39 +27,39 @@ def record_figures(model_store: Path, model: str, files: Mapping[str, Path]) -> 
     no such benchmark's, or was made with other weights.
     """
     card = open_card(model_store, model)
-    found = {name: _section(name, path, card) for name, path in files.items()}
+    sections = {name: _section(name, path, card) for name, path in files.items()}
     folder = model_store / model
-    write_card(folder, card.model_copy(update={"evaluation": {**card.evaluation, **found}}))
+    write_card(folder, card.model_copy(update={"evaluation": {**card.evaluation, **sections}}))
     return folder / "card.json"
 
 
 def out_of_place(card: Card) -> list[str]:
     """The benchmarks whose figures on this card were measured with other weights than it vouches for."""
-    there = {name: card.evaluation[name] for name in SECTIONS if name in card.evaluation}
-    return [name for name, section in there.items() if section.get("sha256") != card.sha256]
+    measured = {name: card.evaluation[name] for name in SECTIONS if name in card.evaluation}
+    return [name for name, section in measured.items() if section.get("sha256") != card.sha256]
 
 
-def paper_figures(told: Figures, sha256: str) -> Figures:
+def paper_figures(document: Figures, sha256: str) -> Figures:
     """Of `evaluate paper`, at the threshold that was chosen on another corridor unless the name says otherwise.
 
     Raises KeyError, and ValueError for other weights or a part of the experiments.
     """
-    if told["sha256"] != sha256:
-        raise ValueError(f"measured with weights {told['sha256']}, and not with the card's {sha256}")
-    ours, *baselines = told["table_6"]
-    *experiments, whole = told["table_5"]
+    if document["sha256"] != sha256:
+        raise ValueError(f"measured with weights {document['sha256']}, and not with the card's {sha256}")
+    ours, *baselines = document["table_6"]
+    *experiments, whole = document["table_5"]
     if whole["paper"] is None:
         raise ValueError("measured on a part of the experiments; leave out --quick")
     return {
-        "command": told["command"],
+        "command": document["command"],
         "sha256": sha256,
-        "tiles": told["map"]["tiles"],
+        "tiles": document["map"]["tiles"],
         **_operating(ours),
         **_picked(ours, AREAS),
         "at_test_threshold": _operating(ours["at_test_threshold"], ours["test_threshold"]),
         "false_positives_with_no_change": _quiet(experiments),
         "f1_by_experiment": {row["name"]: row["f1"] for row in experiments if row["operation"]},
-        "f1_by_kind": {kind: rows[ours["method"]] for kind, rows in told["by_kind"].items()},
+        "f1_by_kind": {kind: rows[ours["method"]] for kind, rows in document["by_kind"].items()},
         "baselines": {
             row["method"]: {
                 **_picked(row, ("threshold", *RATIOS, *AREAS)),
@@ -70,27 +70,27 @@ def paper_figures(told: Figures, sha256: str) -> Figures:
     }
 
 
-def revisit_figures(told: Figures, sha256: str) -> Figures:
+def revisit_figures(document: Figures, sha256: str) -> Figures:
     """Of `evaluate revisit`, at the threshold chosen on other buildings unless the name says otherwise.
 
     Raises KeyError, and ValueError where no method had these weights.
     """
-    measured = [row["sha256"] for row in told["methods"] if row["sha256"] is not None]
+    measured = [row["sha256"] for row in document["methods"] if row["sha256"] is not None]
     if sha256 not in measured:
         raise ValueError(f"measured with weights {', '.join(measured)}, and not with the card's {sha256}")
-    ours = next(row for row in told["methods"] if row["sha256"] == sha256)
-    there = told["test"]
+    ours = next(row for row in document["methods"] if row["sha256"] == sha256)
+    test = document["test"]
     return {
-        "command": told["command"],
+        "command": document["command"],
         "sha256": sha256,
-        "visits": there["visits"],
-        "tiles": there["observed"],
-        "changed_tiles": there["changed"]["counted"],
+        "visits": test["visits"],
+        "tiles": test["observed"],
+        "changed_tiles": test["changed"]["counted"],
         **_visited(ours),
         **_picked(ours["chosen"], COUNTS),
         "at_test_threshold": _operating(ours["best"]),
-        "recall_by_kind": {kind: found["recall"] for kind, found in ours["groups"]["kind"].items()},
-        "baselines": {row["name"]: _visited(row) for row in told["methods"] if row["sha256"] is None},
+        "recall_by_kind": {kind: counts["recall"] for kind, counts in ours["groups"]["kind"].items()},
+        "baselines": {row["name"]: _visited(row) for row in document["methods"] if row["sha256"] is None},
     }
 
 

@@ -1,40 +1,37 @@
-"""`make bench`: seconds in each stage of a map and of a survey, and what the network costs.
+"""`make bench`: seconds in each stage of a map and of a survey, and what scoring the tiles costs.
 
 A simulated corridor of 25 scans with about 100,000 points each.
 """
 
 from __future__ import annotations
 
-import json
-import platform
 import resource
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
+from rich.console import Group
+from rich.table import Table
 
-from worker.benchmarks.plain_inference import plain_scores
-from worker.cloud.formats.pcd import write_pcd
-from worker.cloud.poses import difference, fit_poses
-from worker.cloud.tiling import TilePairs, Tiles, cut, grid_over, pair_tiles
+from worker.benchmarks.baselines import CloudToCloud
+from worker.benchmarks.documents import Document, pose_spread, shown, spread, titled_table
+from worker.benchmarks.methods import TileScore, change_scores, encode_reference, open_model, tile_scores
+from worker.benchmarks.tiles import selected
+from worker.benchmarks.timing import StageClock, machine
+from worker.benchmarks.trajectory import map_frame, placed_scans, scan_files
+from worker.cloud.poses import transformed
+from worker.cloud.tiling import TilePairs, pair_tiles
 from worker.cloud.types import Arrays, Matrix4
 from worker.cloud.voxels import Voxels
 from worker.detectors.card import MODEL_STORE
-from worker.detectors.spicd_net.detector import SpicdNet
-from worker.detectors.store import open_detector
+from worker.detectors.detector import Detector
 from worker.pipeline import archive
-from worker.pipeline.flow import PipelineSettings
-from worker.pipeline.mapping.fusion import ReferenceMap, current_map, fuse, reference_map
-from worker.pipeline.mapping.map_registration import register_map_scans
-from worker.pipeline.mapping.survey_registration import register_survey_scans
-from worker.pipeline.registration.results import ScanFile, ScanResult, read_registered
+from worker.pipeline.flow import BuiltMap, NoScanAccepted, PipelineSettings, build_map, locate_survey
+from worker.pipeline.registration.results import ScanFile
 from worker.pipeline.results.changes import decide
 from worker.pipeline.results.export import tile_results, write_coloured_cloud
 from worker.pipeline.results.picture import draw_picture
@@ -44,6 +41,7 @@ from worker.simulation.sensor import SimulatedScan
 from worker.simulation.visits import visit
 
 PAPER_TILES = 172  # of the paper's map; its GTX 1650 takes 22.4 s for them (Table 6)
+YARDSTICK = "c2c"  #: what the others are held against: nearest distances by a k-d tree, no training
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -53,251 +51,178 @@ class BenchSettings:
     scans: int = 25
     seed: int = 1
     prior_error: tuple[float, float] = (0.1, 2.0)  #: sigma of the odometry, metres and degrees
-    tiles: int = PAPER_TILES  #: that the network is timed on
-    repeats: int = 3  #: of each way of running the network, in turn
+    tiles: int = PAPER_TILES  #: that are scored
+    repeats: int = 3  #: of each way of scoring, in turn
     model_store: Path = MODEL_STORE
     model: str = "spicd-net/1"
 
 
-@dataclass(slots=True)
-class Stopwatch:
-    """Seconds by stage, in the order they were run."""
-
-    seconds: dict[str, float] = field(default_factory=dict)
-
-    @contextmanager
-    def stage(self, name: str) -> Iterator[None]:
-        """Time what runs within; a name that comes back adds up."""
-        begun = time.perf_counter()
-        yield
-        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - begun
-
-
-def bench(settings: BenchSettings, progress: Progress = no_progress) -> dict[str, Any]:
+def bench(settings: BenchSettings, progress: Progress = no_progress) -> Document:
     """Run everything once and return the figures, JSON-ready; seconds unless the name says otherwise."""
-    detector = open_detector(settings.model_store, settings.model)
-    if not isinstance(detector, SpicdNet):
-        raise ValueError(f"bench compares ways of running SPICD-Net; {settings.model} is another detector")
+    detector = open_model(settings.model_store, settings.model)
     pipeline = PipelineSettings().for_model(detector.card.preprocessing)
-    with TemporaryDirectory(prefix="spicd-bench-") as folder:
-        scratch = Path(folder)
+    with TemporaryDirectory(prefix="spicd-bench-") as name:
+        folder = Path(name)
         progress("simulating", 0.0)
-        scene = corridor(settings.seed)
-        first = visit(scene, settings.scans, seed=settings.seed, prior_error=settings.prior_error)
-        second = visit(scene, settings.scans, seed=settings.seed + 1, prior_error=settings.prior_error)
-        files = [_written(scratch / f"map-{number}.pcd", scan) for number, scan in enumerate(first)]
-        built = _map(files, detector, pipeline, progress)
-        one = _written(scratch / "survey.pcd", second[settings.scans // 2])
+        first, second = (_visit(settings, number, folder) for number in range(2))
+        clock = StageClock(progress)
+        built = build_map(scan_files(first), settings=pipeline, progress=clock)
+        clock("describe", 0.0)
+        embedding = encode_reference(detector, built.tiles)
+        map_seconds = clock.seconds()
+        frame = map_frame(built.outcomes, first)
         progress("one-scan survey", 0.0)
-        with_prior = _survey(one, built, detector, pipeline, scratch)
-        without = _survey(replace(one, pose=None), built, detector, pipeline, scratch)
-        pairs = resized(_full_visit(second, first, built), settings.tiles)
-        network = network_bench(pairs, detector, repeats=settings.repeats, progress=progress)
+        one = scan_files(second)[settings.scans // 2]
+        with_prior, without = (
+            _survey(file, built, embedding, detector, pipeline, folder)
+            for file in (one, replace(one, pose=None))
+        )
+        pairs = resized(_full_visit(second, built, frame), settings.tiles)
+        scoring = scoring_bench(pairs, detector, repeats=settings.repeats, progress=progress)
+    errors = [scan.error for scan in placed_scans(built.outcomes, first, frame)]
     return {
-        "machine": _machine(),
+        "machine": machine(
+            cores=torch.get_num_threads(),
+            torch=torch.__version__,
+            device="cuda" if torch.cuda.is_available() else "cpu",
+        ),
         "scene": {
             "scans": len(first),
             "points_per_scan": round(float(np.mean([len(scan.points) for scan in first]))),
             "map_points": len(built.reference.points),
             "tiles": len(built.tiles.points),
         },
-        "map": built.seconds | {"total": sum(built.seconds.values())},
-        "map_poses": _pose_errors(first, built.outcomes, built.map_from_world(first)),
+        "map": map_seconds,
+        "map_poses": {
+            "accepted": len(errors),
+            "of": len(first),
+            **pose_spread(errors, "median", "most"),
+        },
         "survey_with_prior": with_prior,
         "survey_without_prior": without,
-        "network": network,
+        "network": scoring,
         "peak_memory_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024),
     }
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class _Built:
-    reference: ReferenceMap
-    tiles: Tiles
-    description: Arrays
-    outcomes: tuple[ScanResult, ...]
-    seconds: dict[str, float]
-
-    def map_from_world(self, scans: tuple[SimulatedScan, ...]) -> Matrix4:
-        """By all scans together: a map has the frame of the priors, which drifted."""
-        pairs = [
-            (scan.world_from_sensor, outcome.registration.map_from_scan)
-            for scan, outcome in zip(scans, self.outcomes, strict=True)
-            if outcome.registration
-        ]
-        return fit_poses([world for world, _ in pairs], [pose for _, pose in pairs], arm=2.0)
-
-
-def _written(path: Path, scan: SimulatedScan) -> ScanFile:
-    write_pcd(path, scan.points)
-    return ScanFile(name=path.name, path=path, pose=scan.prior)
-
-
-def _map(files: list[ScanFile], detector: SpicdNet, settings: PipelineSettings, progress: Progress) -> _Built:
-    watch = Stopwatch()
-    with watch.stage("read and register"):
-        outcomes = register_map_scans(files, settings=settings.joint_registration, progress=progress).outcomes
-    with watch.stage("read and fuse"):
-        accepted = (
-            read_registered(file, outcome.registration, max_points=settings.max_scan_points)
-            for file, outcome in zip(files, outcomes, strict=True)
-            if outcome.registration
-        )
-        fused = fuse(accepted, voxel_size=settings.registration.voxel_size)
-    with watch.stage("normals"):
-        reference = reference_map(fused, settings=settings.registration)
-    with watch.stage("tile"):
-        grid = grid_over(reference.points, tile_size=settings.tiling.tile_size, voxel_size=fused.size)
-        tiles = cut(reference.points, grid, min_points=settings.tiling.min_points)
-    with watch.stage("describe"):
-        description = detector.describe(tiles, progress=progress)
-    return _Built(
-        reference=reference,
-        tiles=tiles,
-        description=description,
-        outcomes=outcomes,
-        seconds=watch.seconds,
+def _visit(settings: BenchSettings, number: int, folder: Path) -> tuple[SimulatedScan, ...]:
+    return visit(
+        corridor(settings.seed),
+        settings.scans,
+        seed=settings.seed + number,
+        prior_error=settings.prior_error,
+        folder=folder,
+        name=f"visit-{number}-{{:02d}}",
     )
 
 
 def _survey(
-    file: ScanFile, built: _Built, detector: SpicdNet, settings: PipelineSettings, scratch: Path
-) -> dict[str, Any]:
-    """A survey of one scan from file to files, as the jobs run it."""
-    watch = Stopwatch()
-    archive.save_reference(scratch / "reference.npz", built.reference)
-    with watch.stage("load map"):
-        reference = archive.load_reference(scratch / "reference.npz")
-        surface = reference.surface()
-    with watch.stage("read and register"):
-        (outcome,) = register_survey_scans([file], surface, settings=settings.joint_registration)
-    if outcome.registration is None:
-        return {"rejected": outcome.reason, **watch.seconds}
-    with watch.stage("fuse and tile"):
-        scan = read_registered(file, outcome.registration, max_points=settings.max_scan_points)
-        current = current_map([scan], voxel_size=reference.voxel_size)
-        pairs = pair_tiles(built.tiles, current.points, settings=settings.tiling)
-    with watch.stage("score"):
-        scores = detector.score(pairs, description=built.description)
-    with watch.stage("decide and export"):
-        changes = decide(pairs, scores, threshold=detector.card.threshold)
-        write_coloured_cloud(scratch / "cloud.ply", current, changes)
-        tile_results(changes)
-    with watch.stage("picture"):
-        draw_picture(scratch / "picture.png", reference.points, current, changes, title="bench")
-    total = sum(watch.seconds.values())
-    return {"observed_tiles": int(pairs.observed.sum()), **watch.seconds, "total": total}
+    file: ScanFile,
+    built: BuiltMap,
+    embedding: Arrays,
+    detector: Detector,
+    settings: PipelineSettings,
+    folder: Path,
+) -> Document:
+    """Time a survey of one scan from file to files, as the jobs run it."""
+    archive.save_reference(folder / "reference.npz", built.reference)
+    clock = StageClock(no_progress)
+    clock("load map", 0.0)
+    reference = archive.load_reference(folder / "reference.npz")
+    try:
+        survey = locate_survey([file], reference, built.tiles, settings=settings, progress=clock)
+    except NoScanAccepted as refused:
+        return {"rejected": str(refused), **clock.seconds()}
+    clock("score", 0.0)
+    scores = tile_scores(detector, survey.pairs, embedding)
+    clock("decide and export", 0.0)
+    changes = decide(survey.pairs, scores, threshold=detector.card.threshold)
+    write_coloured_cloud(folder / "cloud.ply", survey.current, changes)
+    tile_results(changes)
+    clock("picture", 0.0)
+    draw_picture(folder / "picture.png", reference.points, survey.current, changes, title="bench")
+    return {"observed_tiles": int(survey.pairs.observed.sum()), **clock.seconds()}
 
 
-def _full_visit(
-    second: tuple[SimulatedScan, ...], first: tuple[SimulatedScan, ...], built: _Built
-) -> TilePairs:
-    """The second visit at its true poses, so that nearly every tile is observed."""
-    map_from_world = built.map_from_world(first)
-    points = np.concatenate([scan.world_points for scan in second])
-    moved = points @ map_from_world[:3, :3].T + map_from_world[:3, 3]
-    fused = Voxels.of(moved, size=built.reference.voxel_size)
+def _full_visit(scans: tuple[SimulatedScan, ...], built: BuiltMap, map_from_world: Matrix4) -> TilePairs:
+    """Pair the second visit, at its true poses, with the map, so that nearly every tile is observed."""
+    points = np.concatenate([scan.world_points for scan in scans])
+    fused = Voxels.of(transformed(points, map_from_world), size=built.reference.voxel_size)
     return pair_tiles(built.tiles, fused.points, settings=PipelineSettings().tiling)
 
 
-def _pose_errors(
-    scans: tuple[SimulatedScan, ...], outcomes: tuple[ScanResult, ...], map_from_world: Matrix4
-) -> dict[str, Any]:
-    off = [
-        difference(outcome.registration.map_from_scan, map_from_world @ scan.world_from_sensor)
-        for scan, outcome in zip(scans, outcomes, strict=True)
-        if outcome.registration
-    ]
-    metres, radians = np.array(off).T
-    return {
-        "accepted": len(off),
-        "of": len(scans),
-        "centimetres": {"median": float(np.median(metres) * 100), "most": float(metres.max() * 100)},
-        "degrees": {
-            "median": float(np.degrees(np.median(radians))),
-            "most": float(np.degrees(radians.max())),
-        },
-    }
-
-
-def _machine() -> dict[str, Any]:
-    return {
-        "processor": platform.processor() or platform.machine(),
-        "cores": torch.get_num_threads(),
-        "python": platform.python_version(),
-        "torch": torch.__version__,
-        "device": "cuda" if torch.cuda.is_available() else "cpu",
-    }
-
-
-def save(figures: dict[str, Any], path: Path) -> None:
-    """Write the figures as JSON, aside and renamed."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    aside = path.with_name(path.name + ".tmp")
-    aside.write_text(json.dumps(figures, indent=2) + "\n")
-    aside.replace(path)
-
-
-PLAIN = "plain"  #: what the others are held against
-
-Way = Callable[[], NDArray[np.float32]]  #: to (T, 3) probabilities
-
-
-def network_bench(
-    pairs: TilePairs, detector: SpicdNet, *, repeats: int, progress: Progress = no_progress
-) -> dict[str, Any]:
-    """Run each way `repeats` times, in turn; JSON-ready, seconds for all pairs.
+def scoring_bench(
+    pairs: TilePairs, detector: Detector, *, repeats: int, progress: Progress = no_progress
+) -> Document:
+    """Run each way of scoring `repeats` times, in turn; JSON-ready, seconds for all pairs.
 
     On a shared machine seconds are worth little by themselves, so all ways run in one go and are given as ratios too.
     """
-    every = ways(pairs, detector)
-    seconds: dict[str, list[float]] = {name: [] for name in every}
-    scores: dict[str, NDArray[np.float32]] = {}
+    runs = ways(pairs, detector)
+    seconds: dict[str, list[float]] = {name: [] for name in runs}
+    scores: dict[str, TileScore] = {}
     for turn in range(repeats):
-        for number, (name, run) in enumerate(every.items()):
-            progress(f"network, {name}", (turn + number / len(every)) / repeats)
+        for number, (name, run) in enumerate(runs.items()):
+            progress(f"scoring, {name}", (turn + number / len(runs)) / repeats)
             begun = time.perf_counter()
             scores[name] = run()
             seconds[name].append(time.perf_counter() - begun)
-    plain = float(np.median(seconds[PLAIN]))
+    yardstick = float(np.median(seconds[YARDSTICK]))
     return {
         "tiles": len(pairs.observed),
         "distinct_points_per_tile": round(float(np.mean([len(points) for points in pairs.current]))),
-        "seconds": {name: _spread(values) for name, values in seconds.items()},
-        "times_faster_than_plain": {
-            name: round(plain / float(np.median(values)), 1) for name, values in seconds.items()
+        "seconds": {name: spread(values, "median", "least", "most") for name, values in seconds.items()},
+        "times_c2c": {
+            name: round(float(np.median(values)) / yardstick, 2) for name, values in seconds.items()
         },
-        "largest_score_difference": max(
-            float(np.nanmax(np.abs(found - scores[PLAIN]))) for found in scores.values()
-        ),
+        "largest_score_difference": float(np.nanmax(np.abs(scores["cached"] - scores["uncached"]))),
     }
 
 
-def ways(pairs: TilePairs, detector: SpicdNet) -> dict[str, Way]:
-    """The slowest first; each spares something that the one before does not."""
-    description = detector.describe(pairs.reference)
+def ways(pairs: TilePairs, detector: Detector) -> dict[str, Callable[[], TileScore]]:
+    """Return the yardstick, and the detector without and with the reference embedding that a map keeps."""
+    embedding = encode_reference(detector, pairs.reference)
     return {
-        PLAIN: lambda: plain_scores(detector, pairs),
-        "uncached_padded": lambda: detector.score(pairs, padded=True).probabilities,
-        "uncached_distinct": lambda: detector.score(pairs).probabilities,
-        "cached_distinct": lambda: detector.score(pairs, description=description).probabilities,
+        YARDSTICK: lambda: CloudToCloud().score(pairs),
+        "uncached": lambda: change_scores(detector, pairs),
+        "cached": lambda: change_scores(detector, pairs, embedding),
     }
 
 
 def resized(pairs: TilePairs, count: int) -> TilePairs:
-    """`count` observed pairs, the first ones or some twice."""
-    chosen = np.resize(np.flatnonzero(pairs.observed), count)
-    reference = pairs.reference
-    return TilePairs(
-        reference=replace(
-            reference,
-            indices=reference.indices[chosen],
-            points=tuple(reference.points[tile] for tile in chosen),
-        ),
-        current=tuple(pairs.current[tile] for tile in chosen),
-        observed=np.ones(count, bool),
+    """Return `count` observed pairs, the first ones or some twice."""
+    return selected(pairs, np.resize(np.flatnonzero(pairs.observed), count))
+
+
+def tables(figures: Document) -> Group:
+    """Show the seconds of each stage and each way of scoring on a terminal."""
+    scene, poses = figures["scene"], figures["map_poses"]
+    title = f"{scene['scans']} scans of {scene['points_per_scan']:,} points, {scene['tiles']} tiles"
+    stages = titled_table(title, "seconds of a stage", "map", "survey, drifted prior", "survey, no prior")
+    columns = [figures["map"], figures["survey_with_prior"], figures["survey_without_prior"]]
+    names = dict.fromkeys(
+        name for column in columns for name, value in column.items() if isinstance(value, float)
+    )
+    for name in [*(name for name in names if name != "total"), "total"]:
+        stages.add_row(name, *(shown(column.get(name), ".2f") for column in columns))
+    return Group(
+        stages,
+        _scoring_table(figures["network"]),
+        f"scans placed: {poses['accepted']} of {poses['of']}, off by {poses['centimetres']['median']:.1f} cm "
+        f"(most {poses['centimetres']['most']:.1f}) and {poses['degrees']['median']:.2f} degrees "
+        f"(most {poses['degrees']['most']:.2f})",
+        f"peak memory {figures['peak_memory_mb']} MB",
     )
 
 
-def _spread(values: list[float]) -> dict[str, float]:
-    return {"median": float(np.median(values)), "least": min(values), "most": max(values)}
+def _scoring_table(scoring: Document) -> Table:
+    title = f"{scoring['tiles']} tiles, {scoring['distinct_points_per_tile']} distinct points each"
+    table = titled_table(title, "scoring", "seconds (median)", "least to most", "times C2C")
+    names = {"c2c": "C2C by k-d tree", "uncached": "detector", "cached": "detector, map encoded before"}
+    for name, seconds in scoring["seconds"].items():
+        least_to_most = f"{seconds['least']:.2f} to {seconds['most']:.2f}"
+        ratio = f"{scoring['times_c2c'][name]:.1f}"
+        table.add_row(names[name], f"{seconds['median']:.2f}", least_to_most, ratio)
+    difference = scoring["largest_score_difference"]
+    table.caption = f"largest difference between the detector's scores: {difference:.1e}"
+    return table

@@ -13,8 +13,8 @@ import typer
 PLACES = ("out", "model_store", "as_json")
 
 
-def as_given(context: typer.Context, *, without: Collection[str] = PLACES) -> str:
-    """The command with every option that differs from its default, also one that the environment set."""
+def command_line(context: typer.Context, *, without: Collection[str] = PLACES) -> str:
+    """Return the command with every option that differs from its default, also one that the environment set."""
     words = [context.command_path]
     for option in context.command.params:
         value = context.params.get(str(option.name))
@@ -27,10 +27,10 @@ def _spelled(option: Any, value: Any) -> list[str]:
     if isinstance(value, bool):
         return [option.opts[0] if value else option.secondary_opts[0]]
     values = value if isinstance(value, list | tuple) else [value]
-    return [word for one in values for word in (option.opts[0], shlex.quote(str(_from_here(one))))]
+    return [word for item in values for word in (option.opts[0], shlex.quote(str(_from_here(item))))]
 
 
 def _from_here(value: Any) -> Any:
-    """A file below the working folder by its way from there."""
+    """Name a file below the working folder by its way from there."""
     here = Path.cwd()
     return value.relative_to(here) if isinstance(value, Path) and value.is_relative_to(here) else value

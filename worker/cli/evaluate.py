@@ -1,14 +1,21 @@
-"""`spicd-worker evaluate`: the benchmarks, each a command of its own, and one that puts their figures on a card."""
+"""`spicd-worker evaluate`: the benchmarks, each a command of its own, and one that puts their figures on a card.
+
+What a command needs of the benchmarks is imported within it: torch, Open3D and Matplotlib take seconds, which `--help`
+need not wait for.
+"""
 
 from __future__ import annotations
 
-import json
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import typer
 
-from worker.cli import evaluate_paper, evaluate_record, evaluate_revisit, terminal
+from worker.cli import terminal
+from worker.cli.command_line import command_line
+from worker.cli.options import DEFAULT_MODEL, AsJson, Model, ModelStore
+from worker.detectors.card import MODEL_STORE
 
 
 def register(commands: typer.Typer) -> None:
@@ -16,10 +23,8 @@ def register(commands: typer.Typer) -> None:
     group = typer.Typer(
         name="evaluate", no_args_is_help=True, help="How good it is, measured where the truth is known."
     )
-    group.command("registration")(registration)
-    evaluate_paper.register(group)
-    evaluate_revisit.register(group)
-    evaluate_record.register(group)
+    for command in (registration, paper, revisit, record):
+        group.command(command.__name__)(command)
     commands.add_typer(group)
 
 
@@ -32,10 +37,10 @@ def registration(
         Literal["loop", "room"], typer.Option(help="A corridor with a loop, or one room.")
     ] = "loop",
     scans: Annotated[int, typer.Option(min=2, help="Stops of the walk.")] = 42,
-    foreign: Annotated[int, typer.Option(min=1, max=17, help="Scans of another building.")] = 5,
+    foreign: Annotated[int, typer.Option(min=1, max=17, help="Out-of-place scans, of another building.")] = 5,
     standing: Annotated[float, typer.Option(min=0.1, help="Seconds at each stop.")] = 5.0,
     plain: Annotated[
-        bool, typer.Option("--plain", help="Also all pairs in one process with Open3D's ICP: minutes.")
+        bool, typer.Option("--plain", help="Also the baseline: all pairs in one process with Open3D's ICP.")
     ] = False,
     plain_pairs: Annotated[
         int | None,
@@ -44,15 +49,18 @@ def registration(
     survey: Annotated[bool, typer.Option(help="Also time one scan against the first map.")] = True,
     real: Annotated[Path | None, typer.Option(help="Folder of real scans: see docs/simulator.md.")] = None,
     out: Annotated[Path | None, typer.Option(help="Folder for registration.json and pictures.")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Figures as JSON on stdout.")] = False,
+    as_json: AsJson = False,
 ) -> None:
-    """Build maps from simulated walks, with and without priors and strangers, and hold them against the truth."""
-    # Not at the head of the file: Open3D and Matplotlib take seconds, which `--help` need not wait for.
-    from worker.benchmarks.registration.benchmark import BenchmarkSettings, evaluate  # noqa: PLC0415
-    from worker.benchmarks.registration.scenario import WalkSettings, kinds_named  # noqa: PLC0415
-    from worker.benchmarks.registration.tables import tables  # noqa: PLC0415
+    """Build maps from simulated walks, with and without priors and out-of-place scans, and measure them."""
+    from worker.benchmarks.documents import write_json  # noqa: PLC0415
+    from worker.benchmarks.registration.benchmark import (  # noqa: PLC0415
+        RegistrationBenchmarkSettings,
+        evaluate,
+    )
+    from worker.benchmarks.registration.report import tables  # noqa: PLC0415
+    from worker.benchmarks.registration.scenarios import WalkSettings, kinds_named  # noqa: PLC0415
 
-    settings = BenchmarkSettings(
+    settings = RegistrationBenchmarkSettings(
         walk=WalkSettings(building=building, scans=scans, foreign=foreign, duration_s=standing),
         seeds=_numbers(seeds),
         kinds=kinds_named(scenarios),
@@ -65,23 +73,138 @@ def registration(
     with terminal.progress_bar() as progress:
         result = evaluate(settings, progress)
     if out is not None:
-        _save(result, out / "registration.json")
+        write_json(out / "registration.json", result)
     if as_json:
         terminal.print_json(result)
     else:
         terminal.output().print(tables(result), highlight=False)
 
 
+def paper(
+    context: typer.Context,
+    model: Model = DEFAULT_MODEL,
+    model_store: ModelStore = MODEL_STORE,
+    weights: Annotated[
+        Path | None, typer.Option(help="Checkpoint of training to measure, under the model's card.")
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Of the corridor and the walk.")] = 1,
+    validation_seed: Annotated[
+        int, typer.Option(help="Of the corridor that thresholds are chosen on.")
+    ] = 101,
+    true_poses: Annotated[
+        bool, typer.Option("--true-poses", help="Scans stand where they were taken; no registration.")
+    ] = False,
+    everywhere: Annotated[
+        bool, typer.Option("--everywhere", help="Changes are in all scans of a tile, not in one alone.")
+    ] = False,
+    robustness: Annotated[
+        bool, typer.Option(help="Also disturb one experiment of each kind, level by level.")
+    ] = True,
+    quick: Annotated[
+        bool,
+        typer.Option(
+            "--quick", help="Three experiments on a short corridor: whether it runs, no figures to cite."
+        ),
+    ] = False,
+    out: Annotated[Path | None, typer.Option(help="Folder for report.html, paper.json and pictures.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Repeat the fourteen experiments of the paper on a simulated corridor, its figures beside ours."""
+    from worker.benchmarks.paper.benchmark import QUICK, PaperSettings, evaluate  # noqa: PLC0415
+    from worker.benchmarks.paper.report import document, tables, write_report  # noqa: PLC0415
+    from worker.benchmarks.paper.site import QUICK_SITE, SiteSettings  # noqa: PLC0415
+
+    settings = PaperSettings(
+        site=replace(QUICK_SITE if quick else SiteSettings(), seed=seed, true_poses=true_poses),
+        validation_seed=validation_seed,
+        model=model,
+        model_store=model_store,
+        weights=weights,
+        everywhere=everywhere,
+        robustness=robustness,
+        only=QUICK if quick else None,
+    )
+    with terminal.progress_bar() as progress:
+        measured = evaluate(settings, progress)
+        result = {"command": command_line(context), **document(measured)}
+        report = None if out is None else write_report(measured, result, out)
+    if as_json:
+        terminal.print_json(result)
+        return
+    terminal.output().print(tables(result), highlight=False)
+    if report is not None:
+        terminal.output().print(f"report: {report}", highlight=False)
+
+
+def revisit(
+    context: typer.Context,
+    visits: Annotated[
+        int, typer.Option(min=1, help="Second visits; every three go to a building of their own.")
+    ] = 24,
+    validation: Annotated[
+        int, typer.Option(min=1, help="Visits to other buildings, on which thresholds are chosen.")
+    ] = 12,
+    model: Model = DEFAULT_MODEL,
+    model_store: ModelStore = MODEL_STORE,
+    weights: Annotated[
+        list[Path] | None,
+        typer.Option(help="Checkpoint of `train`, instead of the model's weights; may be given again."),
+    ] = None,
+    buildings: Annotated[
+        str, typer.Option(help="Of room, office, corridor, loop, with commas; taken in turn.")
+    ] = "room,office,corridor,loop",
+    out: Annotated[
+        Path, typer.Option(help="Folder for revisit.json, pictures, and the visits, which are kept.")
+    ] = Path("bench/revisit"),
+    as_json: AsJson = False,
+) -> None:
+    """Two independent visits, whole objects added, removed, moved between them: the model and what else there is.
+
+    Simulating and registering the visits takes minutes and is done once: another model on the same visits takes one.
+    """
+    from worker.benchmarks.documents import write_json  # noqa: PLC0415
+    from worker.benchmarks.revisit.benchmark import RevisitBenchmarkSettings, evaluate  # noqa: PLC0415
+    from worker.benchmarks.revisit.plan import RevisitSettings, kinds_named  # noqa: PLC0415
+    from worker.benchmarks.revisit.report import tables  # noqa: PLC0415
+
+    settings = RevisitBenchmarkSettings(
+        out=out,
+        visits=visits,
+        validation=validation,
+        model=model,
+        model_store=model_store,
+        weights=tuple(weights or ()),
+        made=RevisitSettings(kinds=kinds_named(buildings)),
+    )
+    with terminal.progress_bar() as progress:
+        result = {"command": command_line(context), **evaluate(settings, progress)}
+    write_json(out / "revisit.json", result)
+    if as_json:
+        terminal.print_json(result)
+        return
+    terminal.output().print(tables(result), highlight=False)
+    terminal.output().print(f"saved in {out}", highlight=False)
+
+
+def record(
+    paper: Annotated[Path | None, typer.Option(help="paper.json of `evaluate paper`.")] = None,
+    revisit: Annotated[Path | None, typer.Option(help="revisit.json of `evaluate revisit`.")] = None,
+    model: Model = DEFAULT_MODEL,
+    model_store: ModelStore = MODEL_STORE,
+) -> None:
+    """Put the figures of the benchmarks on a model's card; refused where they were measured with other weights."""
+    from worker.benchmarks.card_figures import record_figures  # noqa: PLC0415
+
+    files = {name: path for name, path in (("paper", paper), ("revisit", revisit)) if path is not None}
+    if not files:
+        raise ValueError("nothing to record: give --paper, --revisit, or both")
+    path = record_figures(model_store, model, files)
+    terminal.output().print(f"{path}: {', '.join(files)}", highlight=False)
+
+
 def _numbers(words: str) -> tuple[int, ...]:
-    """Raises ValueError for what is no list of numbers."""
+    """Read whole numbers with commas. Raises ValueError for what is no list of them."""
     try:
         return tuple(int(word) for word in words.split(","))
     except ValueError:
         raise ValueError(f"--seeds {words}: give whole numbers with commas, as in 1,2,3") from None
-
-
-def _save(figures: dict[str, Any], path: Path) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    aside = path.with_name(path.name + ".tmp")
-    aside.write_text(json.dumps(figures, indent=2) + "\n")
-    aside.replace(path)

@@ -7,7 +7,7 @@ import sys
 import typer
 
 from worker.cli import bench, demo, detect, evaluate, register, terminal, train
-from worker.demo.failure import DemoFailed
+from worker.demo.service import DemoFailed
 from worker.errors import PipelineError
 from worker.threads import wait_passively
 

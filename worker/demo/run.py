@@ -12,15 +12,12 @@ from pathlib import Path
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.text import Text
 
 from service.client import Client, ClientError, Document
-from worker.cloud.formats.pcd import write_pcd
-from worker.demo.child import ServiceChild
-from worker.demo.failure import DemoFailed
-from worker.demo.placement import placement_line
-from worker.demo.show import show_files, show_judgement
+from worker.demo.judgement import Judgement, grid_of, judge, placement_line, show_judgement
+from worker.demo.service import DemoFailed, ServiceChild
 from worker.demo.story import Story, tell
-from worker.demo.verdict import Judgement, grid_of, judge
 from worker.simulation.sensor import SimulatedScan
 
 MAP_ID = "office"
@@ -64,8 +61,8 @@ def run(out: Path, settings: DemoSettings, *, out_console: Console, err_console:
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
     try:
-        with _steps(err_console) as steps, ServiceChild(fresh[0], out / "service.log") as child:
-            result, story = _through_the_service(child, out, settings, steps)
+        with _progress(err_console) as progress, ServiceChild(fresh[0], out / "service.log") as child:
+            result, story = _through_the_service(child, out, settings, progress)
     except ClientError as error:
         raise DemoFailed(str(error)) from error
     show_judgement(out_console, result.judgement)
@@ -74,90 +71,84 @@ def run(out: Path, settings: DemoSettings, *, out_console: Console, err_console:
         ("survey", result.survey["scans"], story.second),
     ):
         out_console.print(placement_line(visit, outcomes, scans), highlight=False)
-    show_files(out_console, result.files)
+    for what, path in result.files.items():
+        out_console.print(Text.assemble((f"{what:<10}", "bold"), str(path)))
     out_console.print(f"all in {time.monotonic() - began:.0f} s", highlight=False)
     return result
 
 
-class _Steps:
-    """A line for each step, with its time."""
-
-    def __init__(self, progress: Progress) -> None:
-        self._progress = progress
-
-    @contextmanager
-    def step(self, name: str) -> Iterator[_Step]:
-        task = self._progress.add_task(name, total=1.0, stage="")
-        step = _Step(self._progress, task)
-        yield step
-        step.at("", 1.0)
-
-
 class _Step:
-    def __init__(self, progress: Progress, task: int) -> None:
-        self._progress, self._task = progress, task
+    """One line of the progress display."""
+
+    def __init__(self, progress: Progress, name: str) -> None:
+        self._progress, self._task = progress, progress.add_task(name, total=1.0, stage="")
 
     def at(self, stage: str, share: float) -> None:
-        self._progress.update(self._task, stage=stage, completed=share)  # type: ignore[arg-type]
+        self._progress.update(self._task, stage=stage, completed=share)
 
     def follow(self, job: Document) -> None:
-        """As a listener of `Client.wait`."""
+        """Listen to `Client.wait`."""
         self.at(job["message"], (job["progress"] or 0) / 100)
 
 
 @contextmanager
-def _steps(console: Console) -> Iterator[_Steps]:
+def _step(progress: Progress, name: str) -> Iterator[_Step]:
+    """Show a line for a step, with its time."""
+    step = _Step(progress, name)
+    yield step
+    step.at("", 1.0)
+
+
+def _progress(console: Console) -> Progress:
     columns = (
         TextColumn("{task.description:<34}"),
         BarColumn(bar_width=24),
         TimeElapsedColumn(),
         TextColumn("[dim]{task.fields[stage]}"),
     )
-    with Progress(*columns, console=console) as progress:
-        yield _Steps(progress)
+    return Progress(*columns, console=console)
 
 
 def _through_the_service(
-    child: ServiceChild, out: Path, settings: DemoSettings, steps: _Steps
+    child: ServiceChild, out: Path, settings: DemoSettings, progress: Progress
 ) -> tuple[DemoResult, Story]:
-    with steps.step("simulate two visits to an office"):
+    with _step(progress, "simulate two visits to an office"):
         story = tell(
             seed=settings.seed,
             stops=settings.stops,
             duration_s=settings.duration_s,
             prior_error=settings.prior_error,
+            folder=out / "demo-scans",
         )
-    with steps.step("start the service"):
+    with _step(progress, "start the service"):
         url = child.await_ready()["url"]
     with Client(url) as client:
-        with steps.step("upload the first visit") as step:
-            first = _uploaded(client, story.first, out / "demo-scans", "first", step)
-        with steps.step("build the map") as step:
+        with _step(progress, "upload the first visit") as step:
+            first = _uploaded(client, story.first, step)
+        with _step(progress, "build the map") as step:
             accepted = client.create_map(first, map_id=MAP_ID, name="The demo's office")
             client.wait(accepted["job_id"], step.follow)
-        with steps.step("upload the second visit") as step:
-            second = _uploaded(client, story.second, out / "demo-scans", "second", step)
-        with steps.step("compare it with the map") as step:
+        with _step(progress, "upload the second visit") as step:
+            second = _uploaded(client, story.second, step)
+        with _step(progress, "compare it with the map") as step:
             accepted = client.submit_survey(MAP_ID, second, device_id="demo-robot")
             client.wait(accepted["job_id"], step.follow)
         survey_id = accepted["survey_id"]
-        with steps.step("fetch the results"):
+        with _step(progress, "fetch the results"):
             files = _downloaded(client, survey_id, out)
             survey, built = client.survey(survey_id), client.map(MAP_ID)
             judgement = _judged(client, survey_id, story, out)
     return DemoResult(map=built, survey=survey, judgement=judgement, files=files), story
 
 
-def _uploaded(
-    client: Client, scans: Sequence[SimulatedScan], folder: Path, visit: str, step: _Step
-) -> list[str]:
-    """Ids of the scans, each written as PCD and sent with the pose that the robot believes."""
+def _uploaded(client: Client, scans: Sequence[SimulatedScan], step: _Step) -> list[str]:
+    """Send the scans' files with the poses that the robot believes; return the scans' ids."""
     ids = []
     for number, scan in enumerate(scans):
-        path = folder / f"{visit}-{number + 1:02d}.pcd"
-        step.at(path.name, number / len(scans))
-        write_pcd(path, scan.points)
-        sent = client.upload_scan(path, device_id="demo-robot", pose=scan.prior.tolist())
+        if scan.path is None:
+            raise ValueError("the visit was simulated without files")
+        step.at(scan.path.name, number / len(scans))
+        sent = client.upload_scan(scan.path, device_id="demo-robot", pose=scan.prior.tolist())
         ids.append(sent["scan_id"])
     return ids
 
@@ -177,5 +168,5 @@ def _judged(client: Client, survey_id: str, story: Story, out: Path) -> Judgemen
     manifest = json.loads(client.download(f"/maps/{MAP_ID}/manifest", out / "manifest.json").read_text())
     grid = grid_of(manifest)
     names = [edit.sentence for edit in story.edits]
-    each = list(zip(names, story.truth_of_each(grid), strict=True))
-    return judge(client.tiles(survey_id)["features"], story.truth(grid), each)
+    edits = list(zip(names, story.truth_of_each(grid), strict=True))
+    return judge(client.tiles(survey_id)["features"], story.truth(grid), edits)

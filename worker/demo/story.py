@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 from worker.cloud.tiling import TileGrid
 from worker.simulation.scenes import Change, Mesh, Scene, small_office
@@ -33,7 +34,7 @@ class Story:
     second: tuple[SimulatedScan, ...]
 
     def truth(self, grid: TileGrid) -> TileTruth:
-        """What changed in each tile (map frame) where a sensor could see it."""
+        """Tell what changed in each tile (map frame) where a sensor could see it."""
         return self._between(self.edits[0].before, self.edits[-1].after, grid)
 
     def truth_of_each(self, grid: TileGrid) -> tuple[TileTruth, ...]:
@@ -67,26 +68,41 @@ _STEPS: tuple[Step, ...] = (
 
 
 def edits(scene: Scene) -> tuple[Edit, ...]:
-    """What was done, one after the other."""
-    found: list[Edit] = []
+    """Make every edit, one after the other."""
+    done: list[Edit] = []
     for sentence, step in _STEPS:
-        before = found[-1].after if found else scene
+        before = done[-1].after if done else scene
         after, _ = step(before)
-        found.append(Edit(sentence=sentence, before=before, after=after))
-    return tuple(found)
+        done.append(Edit(sentence=sentence, before=before, after=after))
+    return tuple(done)
 
 
 def _big_crate() -> Mesh:
     return crate(0.7, 0.5, 0.6)
 
 
-def tell(*, seed: int, stops: tuple[int, int], duration_s: float, prior_error: tuple[float, float]) -> Story:
+def tell(
+    *,
+    seed: int,
+    stops: tuple[int, int],
+    duration_s: float,
+    prior_error: tuple[float, float],
+    folder: Path | None = None,
+) -> Story:
     """Walk the office before and after, with so many stops; `prior_error` is the sigma in metres and degrees."""
     made = edits(small_office(OFFICE))
-    scenes = (made[0].before, made[-1].after)
+    scenes = {"first": made[0].before, "second": made[-1].after}
     first, second = (
-        visit(scene, count, seed=10 * seed + number, prior_error=prior_error, duration_s=duration_s)
-        for number, (scene, count) in enumerate(zip(scenes, stops, strict=True))
+        visit(
+            scene,
+            stops[number],
+            seed=10 * seed + number,
+            prior_error=prior_error,
+            duration_s=duration_s,
+            folder=folder,
+            name=f"{name}-{{:02d}}",
+        )
+        for number, (name, scene) in enumerate(scenes.items())
     )
     exact = replace(first[0], prior=first[0].world_from_sensor)
     return Story(edits=made, first=(exact, *first[1:]), second=second)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,6 +57,7 @@ class SimulatedScan:
     prior: (
         Matrix4  #: (4, 4) world_from_sensor as the robot believes it; the true pose unless a visit drifts it
     )
+    path: Path | None = None  #: of the PCD file with these points, where a visit was asked to write one
 
     @property
     def world_points(self) -> Points:

@@ -1,11 +1,10 @@
-"""One simulated building, walked again and again: what a training set takes of it."""
+"""A training set: simulated buildings, each walked again and again, their tiles with further observations of them."""
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from typing import Literal
+from dataclasses import dataclass, replace
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
@@ -17,20 +16,13 @@ from worker.cloud.types import Bools, Matrix4, Points
 from worker.cloud.voxels import Voxels, merged_in_order
 from worker.processes import default_processes, open_processes
 from worker.progress import Progress, no_progress
-from worker.simulation.scenes import Scene, corridor, random_edits, random_room, rigid, small_office
+from worker.simulation.scenes import BUILDINGS, BuildingKind, Scene, rigid
 from worker.simulation.sensor import SimulatedScan
-from worker.simulation.truth import KINDS, TileTruth, changed_tiles
-from worker.simulation.visits import stops, visit
+from worker.simulation.truth import TileTruth, true_changes
+from worker.simulation.visits import edited, visit
 from worker.training.anomalies import OPERATIONS, Change
 from worker.training.dataset import Look, TileSet, joined
 
-Kind = Literal["office", "corridor", "room"]
-MAKERS: Mapping[Kind, Callable[[int], Scene]] = {
-    "office": small_office,
-    "corridor": corridor,
-    "room": random_room,
-}
-DRAWS, ANOTHER = 20, 100_000_000  #: of edits, and between the seeds of two draws
 MARGIN = 1e-4  #: metres that a synthetic change keeps from the tile's border, which belongs to the next tile
 
 
@@ -39,7 +31,7 @@ class WalkSettings(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    stops: dict[Kind, int] = Field(
+    stops: dict[BuildingKind, int] = Field(
         {"office": 14, "corridor": 24, "room": 5}, description="scans of the first visit"
     )
     second_share: tuple[float, float] = Field(
@@ -49,7 +41,7 @@ class WalkSettings(BaseModel):
         (0.01, 0.15), description="sigma of each registered scan's shift in metres and yaw in degrees"
     )
     edited_visits: int = Field(3, ge=0, description="each after edits of its own")
-    edits: dict[Kind, int] = Field(
+    edits: dict[BuildingKind, int] = Field(
         {"office": 12, "corridor": 12, "room": 4},
         description="pieces added, removed, moved, in turn, before an edited visit",
     )
@@ -68,128 +60,159 @@ class WalkSettings(BaseModel):
     tiling: TilingSettings = TilingSettings.model_validate({})
 
 
-def walked(kind: Kind, seed: int, settings: WalkSettings) -> TileSet:
-    """The tiles of one building that two honest visits saw well, with further looks at them.
+class TrainingSetSettings(BaseModel):
+    """Which buildings are walked."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    offices: int = Field(14, ge=0, description="four rooms and a corridor each")
+    corridors: int = Field(8, ge=0, description="L-shaped, about 170 tiles each")
+    rooms: int = Field(50, ge=0, description="single furnished rooms")
+    walks: WalkSettings = WalkSettings.model_validate({})
+    seed: int = Field(1000, description="of the first building; keep test buildings apart from it")
+
+    def kinds(self) -> list[BuildingKind]:
+        """List the kind of every building, in the order of their seeds."""
+        counts: dict[BuildingKind, int] = {
+            "office": self.offices,
+            "corridor": self.corridors,
+            "room": self.rooms,
+        }
+        return [kind for kind, count in counts.items() for _ in range(count)]
+
+
+def build_training_set(
+    settings: TrainingSetSettings, progress: Progress = no_progress, *, processes: int | None = None
+) -> TileSet:
+    """Walk every building, by default as many at a time as there are cores; the same set however many."""
+    tasks = [
+        (number, kind, settings.seed + number, settings.walks) for number, kind in enumerate(settings.kinds())
+    ]
+    walks: dict[int, TileSet] = {}
+    with open_processes(min(processes or default_processes(), len(tasks))) as pool:
+        for number, tiles in pool.each(_numbered_walk, tasks):
+            walks[number] = tiles
+            progress("build training set", len(walks) / len(tasks))
+    source = f"simulated visits: {settings.model_dump_json()}"
+    return joined([walks[number] for number in sorted(walks)], source=source)
+
+
+def _numbered_walk(task: tuple[int, BuildingKind, int, WalkSettings]) -> tuple[int, TileSet]:
+    number, kind, seed, settings = task
+    return number, walk_building(kind, seed, settings)
+
+
+def walk_building(kind: BuildingKind, seed: int, settings: WalkSettings) -> TileSet:
+    """Take the tiles of one building that two honest visits saw well, with further observations of them.
 
     It stands at a random yaw in its map, as it does when the first scan sets the frame.
     """
     rng = np.random.default_rng((seed, 7))
-    scene, map_from_world = MAKERS[kind](seed), rigid(yaw=float(rng.uniform(0, 360)))
-    scans = _visit(scene, settings.stops[kind], 10 * seed, settings)
-    parts = _voxels(scans, map_from_world, settings)
-    a = merged_in_order(parts).points
-    grid = grid_over(a, tile_size=settings.tiling.tile_size, voxel_size=settings.voxel_size)
-    tiles = cut(a, grid, min_points=settings.tiling.min_points)
-    second = _visit(scene, _fewer(kind, settings, rng), 10 * seed + 1, settings)
-    again = pair_tiles(
-        tiles, merged_in_order(_voxels(second, map_from_world, settings)).points, settings=settings.tiling
+    scene, map_from_world = BUILDINGS[kind](seed), rigid(yaw=float(rng.uniform(0, 360)))
+    scans = visit(scene, settings.stops[kind], seed=10 * seed, prior_error=settings.pose_error)
+    voxels = _voxels(scans, map_from_world, settings)
+    points = merged_in_order(voxels).points
+    grid = grid_over(points, tile_size=settings.tiling.tile_size, voxel_size=settings.voxel_size)
+    walk = _Walk(
+        kind=kind,
+        seed=seed,
+        scene=scene,
+        map_from_world=map_from_world,
+        scans=scans,
+        voxels=tuple(voxels),
+        tiles=cut(points, grid, min_points=settings.tiling.min_points),
+        settings=settings,
+        rng=rng,
     )
-    looks = [
-        *_edited_looks(scene, scans, tiles, map_from_world, settings, (kind, seed), rng),
-        *_rebuilt_looks(scans, parts, tiles, map_from_world, settings, rng),
-    ]
-    return _set(again, looks, settings)
+    _, matched = walk.again(scene, 10 * seed + 1)
+    observations = [*_after_edits(walk), *_rebuilt(walk)]
+    return _tile_set(matched, observations, settings)
 
 
-def _fewer(kind: Kind, settings: WalkSettings, rng: np.random.Generator) -> int:
-    """Stops of a further visit."""
-    return max(1, round(settings.stops[kind] * rng.uniform(*settings.second_share)))
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class _Walk:
+    """A building with its map, which further visits are compared with."""
 
+    kind: BuildingKind
+    seed: int
+    scene: Scene
+    map_from_world: Matrix4
+    scans: tuple[SimulatedScan, ...]  #: of the first visit
+    voxels: tuple[Voxels, ...]  #: each of these scans in the map frame, a point a voxel
+    tiles: Tiles  #: of the map
+    settings: WalkSettings
+    rng: np.random.Generator
 
-def _visit(scene: Scene, count: int, seed: int, settings: WalkSettings) -> tuple[SimulatedScan, ...]:
-    return visit(scene, count, seed=seed, prior_error=settings.pose_error)
+    def again(self, scene: Scene, seed: int) -> tuple[tuple[SimulatedScan, ...], TilePairs]:
+        """Visit the building, as `scene` has it now, with a random number of stops; pair its tiles with the map's."""
+        settings = self.settings
+        count = max(1, round(settings.stops[self.kind] * self.rng.uniform(*settings.second_share)))
+        scans = visit(scene, count, seed=seed, prior_error=settings.pose_error)
+        current = merged_in_order(_voxels(scans, self.map_from_world, settings)).points
+        return scans, pair_tiles(self.tiles, current, settings=settings.tiling)
 
 
 def _voxels(scans: Sequence[SimulatedScan], map_from_world: Matrix4, settings: WalkSettings) -> list[Voxels]:
-    """Each scan at its prior, map frame, a point a voxel."""
-    placed = (transformed(scan.points, map_from_world @ scan.prior).astype(np.float32) for scan in scans)
-    return [Voxels.of(points, size=settings.voxel_size) for points in placed]
+    """Move each scan to its prior, map frame, a point a voxel."""
+    moved = (transformed(scan.points, map_from_world @ scan.prior).astype(np.float32) for scan in scans)
+    return [Voxels.of(points, size=settings.voxel_size) for points in moved]
 
 
-def _edited_looks(
-    scene: Scene,
-    before: Sequence[SimulatedScan],
-    tiles: Tiles,
-    map_from_world: Matrix4,
-    settings: WalkSettings,
-    building: tuple[Kind, int],
-    rng: np.random.Generator,
-) -> Iterator[Look]:
-    """Visits after whole things were added, removed and moved: tiles that changed in sight, and those around them.
+def _after_edits(walk: _Walk) -> Iterator[Look]:
+    """Visit after whole things were added, removed and moved: tiles that changed in sight, and those around them.
 
     A tile in which something changed out of sight, or too little to count, is neither changed nor unchanged.
     """
-    kind, seed = building
-    for number in range(settings.edited_visits):
-        own = 10 * seed + 2 + number
-        after = _edited(scene, settings.edits[kind], own)
-        scans = _visit(after, _fewer(kind, settings, rng), own, settings)
-        current = merged_in_order(_voxels(scans, map_from_world, settings)).points
-        pairs = pair_tiles(tiles, current, settings=settings.tiling)
-        changed, still = _truth((scene, after), (before, scans), tiles, map_from_world)
+    for number in range(walk.settings.edited_visits):
+        seed, after = 10 * walk.seed + 2 + number, walk.scene
+        with suppress(ValueError):  # no edits leave a way: nothing is edited
+            after, _ = edited(walk.scene, walk.settings.edits[walk.kind], seed=seed, count=1)
+        scans, pairs = walk.again(after, seed)
+        changed, still = _truth(walk, after, scans)
         for tile in np.flatnonzero(pairs.observed & (changed | still)).tolist():
             yield Look(tile=tile, points=pairs.current[tile], changed=bool(changed[tile]), rebuilt=False)
 
 
-def _edited(scene: Scene, edits: int, seed: int) -> Scene:
-    """The building with whole things added, removed and moved; a robot still has a way through it."""
-    kinds = [KINDS[number % len(KINDS)] for number in range(edits)]
-    for draw in range(DRAWS):
-        after = random_edits(scene, seed=seed + draw * ANOTHER, kinds=kinds)[0]
-        with suppress(ValueError):
-            stops(after, 1, seed=seed)
-            return after
-    return scene
-
-
-def _truth(
-    scenes: tuple[Scene, Scene],
-    visits: tuple[Sequence[SimulatedScan], Sequence[SimulatedScan]],
-    tiles: Tiles,
-    map_from_world: Matrix4,
-) -> tuple[Bools, Bools]:
-    """(T,) tiles that changed in sight, and (T,) tiles beside those in which nothing changed at all."""
-    old, new = (scene.placed(map_from_world) for scene in scenes)
-    sensors = [[map_from_world @ scan.world_from_sensor for scan in scans] for scans in visits]
-    exists = changed_tiles(old, new, tiles.grid)
-    seen = changed_tiles(old, new, tiles.grid, sensors_before=sensors[0], sensors_after=sensors[1])
+def _truth(walk: _Walk, after: Scene, scans: Sequence[SimulatedScan]) -> tuple[Bools, Bools]:
+    """Return (T,) tiles that changed in sight, and (T,) tiles beside those in which nothing changed at all."""
+    grid, indices = walk.tiles.grid, walk.tiles.indices
+    first, second = (
+        [walk.map_from_world @ scan.world_from_sensor for scan in visit] for visit in (walk.scans, scans)
+    )
+    exists, visible = true_changes(
+        walk.scene, after, grid, map_from_world=walk.map_from_world, first=first, second=second
+    )
     near = binary_dilation(exists.changed, np.ones((3, 3, 3), bool))
-    still = TileTruth(grid=tiles.grid, cells=exists.cells, min_cells=1).of(tiles.indices)
-    beside: Bools = near[tuple(tiles.indices.T)] & ~still
-    return seen.of(tiles.indices), beside
+    touched = TileTruth(grid=grid, cells=exists.cells, min_cells=1).of(indices)
+    beside: Bools = near[tuple(indices.T)] & ~touched
+    return visible.of(indices), beside
 
 
-def _rebuilt_looks(
-    scans: Sequence[SimulatedScan],
-    parts: Sequence[Voxels],
-    tiles: Tiles,
-    map_from_world: Matrix4,
-    settings: WalkSettings,
-    rng: np.random.Generator,
-) -> Iterator[Look]:
-    """The same visit fused anew, a few scans registered again and changed at a few tiles (paper, Section 4.2).
+def _rebuilt(walk: _Walk) -> Iterator[Look]:
+    """Fuse the same visit anew, a few scans registered again and changed at a few tiles (paper, Section 4.2).
 
     Tiles that come out as they were are left out: that pair every tile makes with itself.
     """
-    most = min(settings.rebuilt_scans, max(1, len(scans) // 4))
+    settings, tiles, rng = walk.settings, walk.tiles, walk.rng
+    most = min(settings.rebuilt_scans, max(1, len(walk.scans) // 4))
     for _ in range(settings.rebuilds):
-        rebuilt, injected = list(parts), np.zeros(len(tiles.points), bool)
-        for scan in rng.choice(len(scans), most, replace=False).tolist():
-            placed = _again(scans[scan], map_from_world, settings.again_error, rng)
-            for tile in _own_tiles(parts[scan], tiles, settings, rng):
-                placed = _injected(placed, tiles, tile, settings, rng)
+        rebuilt, injected = list(walk.voxels), np.zeros(len(tiles.points), bool)
+        for scan in rng.choice(len(walk.scans), most, replace=False).tolist():
+            points = _registered_again(walk.scans[scan], walk.map_from_world, settings.again_error, rng)
+            for tile in _own_tiles(walk.voxels[scan], tiles, settings, rng):
+                points = _injected(points, tiles, tile, settings, rng)
                 injected[tile] = True
-            rebuilt[scan] = Voxels.of(placed, size=settings.voxel_size)
+            rebuilt[scan] = Voxels.of(points, size=settings.voxel_size)
         pairs = pair_tiles(tiles, merged_in_order(rebuilt).points, settings=settings.tiling)
         for tile in np.flatnonzero(pairs.observed).tolist():
             if not np.array_equal(pairs.current[tile], tiles.points[tile]):
                 yield Look(tile=tile, points=pairs.current[tile], changed=bool(injected[tile]), rebuilt=True)
 
 
-def _again(
+def _registered_again(
     scan: SimulatedScan, map_from_world: Matrix4, error: tuple[float, float], rng: np.random.Generator
 ) -> Points:
-    """(n, 3) map frame, where a second registration puts the scan."""
+    """Move a scan to where a second registration puts it: (n, 3) map frame."""
     metres, degrees = error
     pose = map_from_world @ scan.prior
     off = rigid(*rng.normal(0.0, metres, 3), yaw=float(rng.normal(0.0, degrees)))
@@ -199,7 +222,7 @@ def _again(
 
 
 def _own_tiles(part: Voxels, tiles: Tiles, settings: WalkSettings, rng: np.random.Generator) -> list[int]:
-    """Some of the tiles that the scan alone sees densely enough."""
+    """Choose some of the tiles that the scan alone sees densely enough."""
     own = pair_tiles(
         tiles, part.points, settings=settings.tiling.model_copy(update={"min_observed_share": 0.0})
     )
@@ -211,7 +234,7 @@ def _own_tiles(part: Voxels, tiles: Tiles, settings: WalkSettings, rng: np.rando
 def _injected(
     points: Points, tiles: Tiles, tile: int, settings: WalkSettings, rng: np.random.Generator
 ) -> Points:
-    """The scan (n, 3), map frame, with a synthetic change in one tile."""
+    """Put a synthetic change into one tile of a scan (n, 3), map frame."""
     grid = tiles.grid
     lower = grid.lower(tiles.indices[tile])
     inside = np.all((points >= lower) & (points < lower + grid.size), axis=1)
@@ -224,73 +247,21 @@ def _injected(
     return np.concatenate([points[~inside], (after + centre).astype(np.float32)])
 
 
-def _set(again: TilePairs, looks: Sequence[Look], settings: WalkSettings) -> TileSet:
-    """Of the tiles that the second visit saw well, each about its centre."""
-    tiles = again.reference
-    middle = tiles.grid.centers(tiles.indices)
+def _tile_set(matched: TilePairs, observations: Sequence[Look], settings: WalkSettings) -> TileSet:
+    """Keep the tiles that the second visit saw well, each about its centre."""
+    tiles = matched.reference
+    centres = tiles.grid.centers(tiles.indices)
 
-    def about(points: Points, tile: int) -> Points:
-        local: Points = (points - middle[tile]).astype(np.float32)
+    def centred(points: Points, tile: int) -> Points:
+        local: Points = (points - centres[tile]).astype(np.float32)
         return local
 
-    every = range(len(tiles.points))
     return TileSet(
-        points_a=tuple(about(tiles.points[tile], tile) for tile in every),
-        points_b=tuple(about(again.current[tile], tile) for tile in every),
-        looks=tuple(
-            Look(
-                tile=look.tile,
-                points=about(look.points, look.tile),
-                changed=look.changed,
-                rebuilt=look.rebuilt,
-            )
-            for look in looks
-        ),
-        centres=middle,
-        buildings=np.zeros(len(middle), np.int32),
+        points_a=tuple(centred(points, tile) for tile, points in enumerate(tiles.points)),
+        points_b=tuple(centred(points, tile) for tile, points in enumerate(matched.current)),
+        looks=tuple(replace(look, points=centred(look.points, look.tile)) for look in observations),
+        centres=centres,
+        buildings=np.zeros(len(centres), np.int32),
         tile_size=settings.tiling.tile_size,
         source="",
-    ).subset(again.observed)
-
-
-class TrainingSetSettings(BaseModel):
-    """Which buildings are walked."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    offices: int = Field(14, ge=0, description="four rooms and a corridor each")
-    corridors: int = Field(8, ge=0, description="L-shaped, about 170 tiles each")
-    rooms: int = Field(50, ge=0, description="single furnished rooms")
-    walks: WalkSettings = WalkSettings.model_validate({})
-    seed: int = Field(1000, description="of the first building; keep test buildings apart from it")
-
-
-def build_training_set(
-    settings: TrainingSetSettings, progress: Progress = no_progress, *, processes: int | None = None
-) -> TileSet:
-    """Walk every building, by default as many at a time as there are cores; the same set however many."""
-    tasks = [
-        (number, kind, settings.seed + number, settings.walks) for number, kind in enumerate(_kinds(settings))
-    ]
-    found: dict[int, TileSet] = {}
-    with open_processes(min(processes or default_processes(), len(tasks))) as pool:
-        for number, part in pool.each(_walked, tasks):
-            found[number] = part
-            progress("build training set", len(found) / len(tasks))
-    source = f"simulated visits: {settings.model_dump_json()}"
-    return joined([found[number] for number in sorted(found)], source=source)
-
-
-def _kinds(settings: TrainingSetSettings) -> Iterator[Kind]:
-    counts: dict[Kind, int] = {
-        "office": settings.offices,
-        "corridor": settings.corridors,
-        "room": settings.rooms,
-    }
-    for kind, count in counts.items():
-        yield from itertools.repeat(kind, count)
-
-
-def _walked(task: tuple[int, Kind, int, WalkSettings]) -> tuple[int, TileSet]:
-    number, kind, seed, settings = task
-    return number, walked(kind, seed, settings)
+    ).subset(matched.observed)

@@ -76,6 +76,26 @@ def changed_tiles(
     return TileTruth(grid=grid, cells=cells, min_cells=min_cells)
 
 
+def true_changes(
+    before: Scene,
+    after: Scene,
+    grid: TileGrid,
+    *,
+    map_from_world: Matrix4,
+    first: Sequence[Matrix4],
+    second: Sequence[Matrix4],
+) -> tuple[TileTruth, TileTruth]:
+    """Return what exists in one visit only, and of that what a sensor could see.
+
+    The scenes are in the world frame, the grid in the map's, and so are the sensors of both visits (map_from_sensor).
+    """
+    old, new = (scene.placed(map_from_world) for scene in (before, after))
+    exists = changed_tiles(old, new, grid)
+    if not exists.cells.any():
+        return exists, exists
+    return exists, changed_tiles(old, new, grid, sensors_before=first, sensors_after=second)
+
+
 def sampled(mesh: Mesh, rng: np.random.Generator) -> Floats:
     """(N, 3) points uniformly on the surface."""
     a, b, c = (mesh.vertices[mesh.triangles[:, corner]] for corner in range(3))
@@ -105,7 +125,11 @@ def _count(
     if len(sensors):
         points = points[_reached(points, own, sensors)]
     voxels = np.unique(np.floor((points - grid.origin) / CELL).astype(np.int64), axis=0)
-    centres = (voxels + 0.5) * CELL
+    _count_by_tile(cells, CELL * (voxels + 0.5).astype(np.float64), grid)
+
+
+def _count_by_tile(cells: NDArray[np.int32], centres: Floats, grid: TileGrid) -> None:
+    """Add one to the tile of each centre (N, 3), metres from the grid's origin; centres outside are left out."""
     tiles = np.floor(centres / grid.size).astype(np.int64)
     inside = np.all((tiles >= 0) & (tiles < np.array(grid.shape)), axis=1)
     np.add.at(cells, tuple(tiles[inside].T), 1)

@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 
+from worker.cloud.formats.pcd import write_pcd
 from worker.cloud.types import Floats, Matrix4, Points
-from worker.simulation.scenes.mesh import rigid
-from worker.simulation.scenes.scene import Scene
+from worker.simulation.scenes import Scene, edit_kinds, random_edits, rigid
 from worker.simulation.sensor import SensorModel, SimulatedScan, scan
-from worker.simulation.truth import TileTruth, changed_tiles
-
-__all__ = ["Drift", "TileTruth", "changed_tiles", "drifted", "drifted_within", "merged", "stops", "visit"]
 
 SENSOR_HEIGHT = 0.35  #: metres above the floor
 CLEARANCE = 0.25  #: metres between the sensor and anything else
+#: The most that the benchmarks' priors are off by: metres over the floor, and degrees of yaw.
+DRIFT = (0.25, 4.0)
+#: Draws of edits, and what lies between the seeds of two: no visit's is as high.
+DRAWS, NEXT_DRAW = 20, 100_000_000
 
 
 class Drift(Protocol):
@@ -28,7 +30,7 @@ class Drift(Protocol):
 
 
 def stops(scene: Scene, count: int, *, seed: int) -> tuple[Matrix4, ...]:
-    """`count` poses, world_from_sensor, evenly along the scene's route and a little off it, looking ahead.
+    """Return `count` poses, world_from_sensor, evenly along the scene's route and a little off it, looking ahead.
 
     Another seed gives other places (up to half a metre off), headings (sigma 12 degrees) and postures of the
     robot (sigma 0.5 degrees, 1 cm). Raises ValueError where the scene has no route or no free place beside it.
@@ -53,7 +55,7 @@ def stops(scene: Scene, count: int, *, seed: int) -> tuple[Matrix4, ...]:
 
 
 def drifted(world_from_sensor: Matrix4, error: tuple[float, float], rng: np.random.Generator) -> Matrix4:
-    """The pose shifted and turned about its own place by errors of the given sigma (metres, degrees)."""
+    """Shift a pose and turn it about its own place by errors of the given sigma (metres, degrees)."""
     metres, degrees = error
     shift = rng.normal(0.0, 1.0, 3) * metres * np.array([1.0, 1.0, 0.1])
     return _off_by(world_from_sensor, shift, yaw=float(rng.normal(0.0, 1.0)) * degrees)
@@ -62,7 +64,7 @@ def drifted(world_from_sensor: Matrix4, error: tuple[float, float], rng: np.rand
 def drifted_within(
     world_from_sensor: Matrix4, error: tuple[float, float], rng: np.random.Generator
 ) -> Matrix4:
-    """As `drifted` by errors of at most (metres, degrees): every length and angle up to them is equally likely.
+    """Shift and turn a pose by errors of at most (metres, degrees): all up to them are equally likely.
 
     The length is that of the shift over the floor, in any direction; the height is off by at most a tenth.
     """
@@ -82,12 +84,15 @@ def visit(
     prior_error: tuple[float, float] = (0.0, 0.0),
     drift: Drift = drifted,
     duration_s: float = 5.0,
+    folder: Path | None = None,
+    name: str = "scan-{:02d}",
 ) -> tuple[SimulatedScan, ...]:
-    """One scan a stop; `poses` are the stops (world_from_sensor) or how many to make along the route.
+    """Simulate one scan a stop; `poses` are the stops (world_from_sensor) or how many to make along the route.
 
     Each scan's prior is off, independently of the others, by `prior_error` (metres, degrees of yaw): with
     `drifted` that is sigma, with `drifted_within` the most there can be. Each scan's noise depends on the seed
-    and its place in the visit only.
+    and its place in the visit only. With a folder each scan is written there as PCD, its points in the sensor frame;
+    `name` takes the scan's number, from 1. Raises ValueError as `stops` does, OSError for the folder.
     """
     sensor = sensor or SensorModel()
     where = stops(scene, poses, seed=seed) if isinstance(poses, int) else poses
@@ -95,12 +100,30 @@ def visit(
     for number, world_from_sensor in enumerate(where):
         rng = np.random.default_rng([seed, 2, number])
         seen = scan(scene, world_from_sensor, duration_s=duration_s, sensor=sensor, rng=rng)
-        scans.append(replace(seen, prior=drift(world_from_sensor, prior_error, rng)))
+        path = None if folder is None else folder / f"{name.format(number + 1)}.pcd"
+        if path is not None:
+            write_pcd(path, seen.points)
+        scans.append(replace(seen, prior=drift(world_from_sensor, prior_error, rng), path=path))
     return tuple(scans)
 
 
+def edited(scene: Scene, edits: int, *, seed: int, count: int) -> tuple[Scene, tuple[Matrix4, ...]]:
+    """Add, remove and move `edits` things in turn; return the edited scene and `count` stops in it.
+
+    Edits that leave a robot no way are drawn again. Raises ValueError where no draw leaves one.
+    """
+    blocked = ValueError(scene.name)
+    for draw in range(DRAWS):
+        after, _ = random_edits(scene, seed=seed + draw * NEXT_DRAW, kinds=edit_kinds(edits))
+        try:
+            return after, stops(after, count, seed=seed)
+        except ValueError as error:
+            blocked = error
+    raise blocked
+
+
 def merged(scans: tuple[SimulatedScan, ...]) -> Points:
-    """(N, 3) float32, world frame: all points by the true poses."""
+    """Return all points by the true poses, (N, 3) float32, world frame."""
     return np.concatenate([seen.world_points for seen in scans])
 
 

@@ -11,6 +11,7 @@ from worker.simulation.scenes import (
     Scene,
     corridor,
     corridor_with_loop,
+    edit_kinds,
     random_edits,
     random_room,
     rigid,
@@ -141,3 +142,15 @@ def test_random_edits_do_what_was_asked_and_leave_the_pieces_apart():
     assert len({change.name for change in changes}) == 4
     assert len(edited.objects) == len(scene.objects) + 1
     assert overlapping(edited) == []
+
+
+def test_a_scene_in_another_frame_keeps_names_and_ids_of_its_things(bare_room):
+    moved = bare_room.placed(rigid(1.0))
+    assert [(item.name, item.object_id) for item in moved.objects] == [
+        (item.name, item.object_id) for item in bare_room.objects
+    ]
+    assert moved.bounds[0, 0] == bare_room.bounds[0, 0] + 1.0
+
+
+def test_edits_take_turns():
+    assert edit_kinds(4) == ("add", "remove", "move", "add")

@@ -29,7 +29,7 @@ def nearest(points: np.ndarray, others: np.ndarray) -> np.ndarray:
     return np.linalg.norm(points[:, None] - others, axis=2).min(axis=1)
 
 
-def looks(room: TileSet, *, changed: bool, rebuilt: bool) -> list[Look]:
+def observations(room: TileSet, *, changed: bool, rebuilt: bool) -> list[Look]:
     return [look for look in room.looks if (look.changed, look.rebuilt) == (changed, rebuilt)]
 
 
@@ -50,8 +50,8 @@ def test_the_two_visits_are_independent_but_of_the_same_place(room):
     assert np.median(near) < 0.05  # a voxel
 
 
-def test_a_look_after_edits_shows_a_surface_that_the_map_has_not_or_misses_one_that_it_has(room):
-    changed, beside = (looks(room, changed=which, rebuilt=False) for which in (True, False))
+def test_an_observation_after_edits_shows_a_surface_that_the_map_has_not_or_misses_one_that_it_has(room):
+    changed, beside = (observations(room, changed=which, rebuilt=False) for which in (True, False))
     assert changed
     assert beside
     far = {which: [_far(room, look) for look in found] for which, found in ((1, changed), (0, beside))}
@@ -59,7 +59,7 @@ def test_a_look_after_edits_shows_a_surface_that_the_map_has_not_or_misses_one_t
 
 
 def test_a_rebuilt_map_keeps_most_points_to_the_bit_and_differs_where_a_change_was_made(room):
-    changed, untouched = (looks(room, changed=which, rebuilt=True) for which in (True, False))
+    changed, untouched = (observations(room, changed=which, rebuilt=True) for which in (True, False))
     assert changed
     assert untouched
     for look in (*changed, *untouched):
@@ -71,7 +71,7 @@ def test_a_rebuilt_map_keeps_most_points_to_the_bit_and_differs_where_a_change_w
     assert np.median([_far(room, look) for look in untouched]) < 5
 
 
-def test_without_further_visits_there_are_no_further_looks():
+def test_without_further_visits_there_are_no_further_observations():
     bare = WALKS.model_copy(update={"edited_visits": 0, "rebuilds": 0})
     assert build_training_set(ONE_ROOM.model_copy(update={"walks": bare}), processes=1).looks == ()
 

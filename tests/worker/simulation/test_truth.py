@@ -8,7 +8,7 @@ import pytest
 from worker.cloud.tiling import TileGrid
 from worker.simulation.scenes import rigid
 from worker.simulation.scenes.mesh import block, box
-from worker.simulation.truth import changed_tiles
+from worker.simulation.truth import changed_tiles, true_changes
 
 GRID = TileGrid(origin=np.zeros(3), size=np.array([1.5, 1.5, 1.0]), shape=(4, 3, 3))  # fills the bare room
 
@@ -77,3 +77,28 @@ def test_changes_outside_the_grid_are_left_out(bare_room):
     after, _ = bare_room.with_added("carton", box(0.5, 0.5, 0.5).at(2.25, 3.75))
     elsewhere = TileGrid(origin=np.array([0.0, 0.0, 1.0]), size=GRID.size, shape=(4, 3, 2))
     assert marked(changed_tiles(bare_room, after, elsewhere)) == []
+
+
+def test_the_truth_follows_the_scene_into_the_frame_of_the_map(bare_room):
+    after, _ = bare_room.with_added("carton", box(0.5, 0.5, 0.5).at(2.25, 3.75))
+    map_from_world = rigid(10.0, 20.0, 1.0, yaw=90)  # the carton's middle goes to (6.25, 22.25, 1.25)
+    grid = TileGrid(origin=np.array([5.5, 20.0, 1.0]), size=np.array([1.5, 1.5, 1.0]), shape=(3, 4, 3))
+    near = map_from_world @ rigid(2.25, 2.0, 0.35)
+    exists, visible = true_changes(
+        bare_room, after, grid, map_from_world=map_from_world, first=[near], second=[near]
+    )
+    assert np.argwhere(exists.changed).tolist() == [[0, 1, 0]]
+    assert np.argwhere(visible.changed).tolist() == [[0, 1, 0]]
+    assert visible.cells.sum() < exists.cells.sum()  # not the side that is turned away
+
+
+def test_a_change_behind_a_screen_exists_and_is_in_nobodys_sight(bare_room):
+    screened, _ = bare_room.with_added("screen", box(0.1, 4.5, 3.0).at(3.05, 2.25))
+    after, _ = screened.with_added("carton", box(0.5, 0.5, 0.5).at(5.25, 0.75))
+    grid = TileGrid(origin=np.zeros(3), size=np.array([1.5, 1.5, 1.0]), shape=(4, 3, 3))
+    sensors = [rigid(1.0, 1.0, 0.35)]
+    exists, visible = true_changes(
+        screened, after, grid, map_from_world=np.eye(4), first=sensors, second=sensors
+    )
+    assert np.argwhere(exists.changed).tolist() == [[3, 0, 0]]
+    assert not visible.changed.any()

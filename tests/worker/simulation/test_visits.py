@@ -5,9 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from worker.cloud.formats.scan import read_scan
+from worker.simulation import visits
 from worker.simulation.scenes import corridor, corridor_with_loop, rigid, small_office
+from worker.simulation.scenes.mesh import box
 from worker.simulation.sensor import PERFECT
-from worker.simulation.visits import CLEARANCE, drifted, drifted_within, merged, stops, visit
+from worker.simulation.visits import CLEARANCE, drifted, drifted_within, edited, merged, stops, visit
 
 
 @pytest.mark.slow
@@ -88,3 +91,41 @@ def test_a_corridor_of_25_scans_holds_about_as_many_tiles_as_the_paper():
     tiles = np.floor((voxels * 0.05 - voxels.min(axis=0) * 0.05 + 0.025) / [1.5, 1.5, 1.0]).astype(int)
     counts = np.unique(tiles, axis=0, return_counts=True)[1]
     assert 150 <= np.sum(counts >= 512) <= 190
+
+
+def test_a_visit_writes_its_scans_where_it_is_asked_to(bare_room, tmp_path):
+    scans = visit(bare_room, 2, seed=3, duration_s=0.05, folder=tmp_path, name="stop-{:02d}")
+    assert [scan.path for scan in scans] == [tmp_path / "stop-01.pcd", tmp_path / "stop-02.pcd"]
+    for scan in scans:
+        assert np.array_equal(read_scan(scan.path).points, scan.points)
+    assert [scan.path for scan in visit(bare_room, 2, seed=3, duration_s=0.05)] == [None, None]
+
+
+def test_other_seeds_draw_other_edits_and_no_edits_leave_the_scene_as_it_is():
+    office = small_office(5)
+    assert edited(office, 0, seed=53, count=14)[0] is office
+    first, second = (edited(office, 6, seed=seed, count=5)[0] for seed in (51, 52))
+    assert {item.name for item in first.objects} != {item.name for item in second.objects}
+
+
+def test_edits_that_leave_the_robot_no_way_are_drawn_again(monkeypatch: pytest.MonkeyPatch):
+    drawn = []
+
+    def walled_up_at_first(scene, *, seed, kinds):
+        drawn.append(seed)
+        block = box(9.0, 9.0, 2.0).at(5.0, 4.0)
+        return scene.with_added("block", block) if len(drawn) == 1 else (scene, ())
+
+    monkeypatch.setattr(visits, "random_edits", walled_up_at_first)
+    before = small_office(5)
+    after, poses = edited(before, 6, seed=51, count=14)
+    assert after is before
+    assert len(poses) == 14
+    assert len(set(drawn)) == 2
+
+
+def test_a_building_without_any_way_is_an_error(monkeypatch: pytest.MonkeyPatch):
+    block = box(9.0, 9.0, 2.0).at(5.0, 4.0)
+    monkeypatch.setattr(visits, "random_edits", lambda scene, **_: scene.with_added("block", block))
+    with pytest.raises(ValueError, match="no free place"):
+        edited(small_office(5), 6, seed=52, count=5)

@@ -1,38 +1,129 @@
-"""Figures 5 to 7, 9 to 12 and 15 of the paper, drawn from our own scores, and a ROC."""
+"""Figures 5 to 15 of the paper, drawn from our own scores, and a ROC."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from worker.benchmarks.paper.benchmark import Method, PaperResult
-from worker.benchmarks.paper.document import KINDS, counts_of
-from worker.benchmarks.paper.embedding import Embedding
-from worker.benchmarks.paper.published import published
-from worker.benchmarks.paper.robustness import LEVELS
-from worker.metrics import PAPER_SWEEP, precision_recall, roc, sweep
+from worker.benchmarks.paper.benchmark import PaperResult
+from worker.benchmarks.paper.experiments import published
+from worker.benchmarks.paper.robustness import LEVELS, chosen_trials
+from worker.benchmarks.paper.scores import Embedding, outcomes_of
+from worker.benchmarks.plots import (
+    COLORS,
+    QUIET,
+    ScoredTiles,
+    TileStyle,
+    draw_precision_recall,
+    draw_roc,
+    label,
+    single,
+    tile_map,
+    training_curves,
+)
+from worker.cloud.tiling import tile_id
+from worker.metrics import PAPER_SWEEP, sweep
+from worker.simulation.truth import KINDS
 
-OUTCOMES = {"TN": "#bdbdbd", "TP": "#2e7d32", "FN": "#1565c0", "FP": "#c62828"}  #: the paper's colours
-INK, QUIET = "#1a1a1a", "#666666"
-LINES = ("#1565c0", "#c62828", "#2e7d32", "#ef6c00", "#6a1b9a")
+OUTCOMES = {"TP": "#2e7d32", "FN": "#1565c0", "FP": "#c62828", "TN": "#bdbdbd"}  #: the paper's colours
+PREFERRED = "magnitude_15cm"  #: of the paper's Figure 13
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Picture:
+    """One of the report's pictures, or why it is missing."""
+
+    name: str  #: of its file, without the ending
+    caption: str  #: with the paper's number
+    figure: Figure | None
+    missing: str = ""  #: why there is no figure, where there is none
+
+    @property
+    def left_out(self) -> str:
+        """A line for the report in the picture's place."""
+        return f"{self.caption.partition(':')[0]}; {self.missing}."
+
+
+def pictures(result: PaperResult) -> list[Picture]:
+    """Draw Figures 5 to 15, and a ROC, in the order of the paper; say why one cannot be drawn."""
+    types = ("type_add", "type_remove", "type_move")
+    borders = ("baseline_no_change", "challenge_easy", "challenge_hard")
+    not_run = "none of its experiments was run"
+    disturbed = ", ".join(trial.experiment.name for trial in chosen_trials(result.trials))
+    return [
+        Picture("figure-05", "Figure 5: sensitivity to the threshold.", threshold_sensitivity(result)),
+        Picture("figure-06", "Figure 6: precision and recall.", precision_recall_curves(result)),
+        Picture("roc", "Section 4.3: ROC.", roc_curves(result)),
+        Picture("figure-07", "Figure 7: sensitivity by kind of change.", sensitivity_by_kind(result)),
+        Picture(
+            "figure-08",
+            "Figure 8: the training behind the weights.",
+            None if result.training is None else training_curves(result.training),
+            "no log of the training lies beside the weights",
+        ),
+        Picture(
+            "figure-09",
+            "Figure 9: the type series.",
+            confusion_matrices(result, types, "Type series"),
+            not_run,
+        ),
+        Picture(
+            "figure-10",
+            "Figure 10: baseline and challenges.",
+            confusion_matrices(result, borders, "Baseline and challenges"),
+            not_run,
+        ),
+        Picture(
+            "figure-11",
+            f"Figure 11: robustness, over {disturbed}; a shifted map is not registered again. "
+            "Diamonds: F1 as far as the paper's text tells it, on experiments that it does not name.",
+            robustness(result) if result.robustness else None,
+            "it was not asked for",
+        ),
+        Picture(
+            "figure-12",
+            "Figure 12: fused embeddings; of the true negatives 15 an experiment.",
+            embedding(result.embedding) if result.embedding else None,
+            "the detector has no descriptors",
+        ),
+        Picture(
+            "figure-13",
+            "Figure 13: tiles from above; green found, blue missed, red false alarms.",
+            tiles_from_above(result),
+        ),
+        Picture(
+            "figure-14",
+            "Figure 14: the missed change with the highest score.",
+            failure_case(result),
+            "no change was missed",
+        ),
+        Picture(
+            "figure-15",
+            "Figure 15: scores of changed and unchanged tiles.",
+            score_distributions(result),
+        ),
+    ]
 
 
 def threshold_sensitivity(result: PaperResult) -> Figure:
-    """Figure 5."""
-    figure, axes = _one("Precision, recall and F1 over the threshold")
-    found = sweep(result.detector.test.pooled, result.detector.test.truth)
-    for name, color in zip(("precision", "recall", "f1"), LINES, strict=False):
-        axes.plot(found.thresholds, getattr(found, name), color=color, label=name)
+    """Draw Figure 5."""
+    figure, axes = single("Precision, recall and F1 over the threshold")
+    rates = sweep(result.detector.test.pooled, result.detector.test.truth)
+    for name, color in zip(("precision", "recall", "f1"), COLORS, strict=False):
+        axes.plot(rates.thresholds, getattr(rates, name), color=color, label=name)
     _mark_thresholds(axes, result)
-    _labels(axes, "threshold", "share")
+    label(axes, "threshold", "share")
     return figure
 
 
 def sensitivity_by_kind(result: PaperResult) -> Figure:
-    """Figure 7."""
-    figure, axes = _one("F1 over the threshold, by kind of change")
-    for kind, color in zip(KINDS, LINES, strict=False):
+    """Draw Figure 7."""
+    figure, axes = single("F1 over the threshold, by kind of change")
+    for kind, color in zip(KINDS, COLORS, strict=False):
         rows = [place for place, one in enumerate(result.trials) if one.experiment.operation == kind]
         if not rows:
             continue
@@ -42,54 +133,53 @@ def sensitivity_by_kind(result: PaperResult) -> Figure:
         )
         axes.plot(PAPER_SWEEP, sweep(scores, truths).f1, color=color, label=kind)
     _mark_thresholds(axes, result)
-    _labels(axes, "threshold", "F1")
+    label(axes, "threshold", "F1")
     return figure
 
 
 def precision_recall_curves(result: PaperResult) -> Figure:
-    """Figure 6, with the baselines."""
-    figure, axes = _one("Precision over recall")
-    for method, color in zip(result.methods, LINES, strict=False):
-        found = precision_recall(method.test.pooled, method.test.truth)
-        label = f"{method.test.name}: average precision {found.average_precision:.2f}"
-        axes.step(found.recall, found.precision, where="post", color=color, label=label)
+    """Draw Figure 6, with the baselines."""
+    figure, axes = single("Precision over recall")
+    draw_precision_recall(axes, _scored_tiles(result))
     paper = published()["table_6"]["SPICD-Net"]
     axes.plot(paper["recall"], paper["precision"], "k*", markersize=11, label="the paper's SPICD-Net")
-    _labels(axes, "recall", "precision")
-    axes.set_ylim(0, 1.03)
+    label(axes, "recall", "precision")
     return figure
 
 
 def roc_curves(result: PaperResult) -> Figure:
-    """Section 4.3."""
-    figure, axes = _one("Receiver operating characteristic")
-    for method, color in zip(result.methods, LINES, strict=False):
-        found = roc(method.test.pooled, method.test.truth)
-        label = f"{method.test.name}: area {found.area:.2f}"
-        axes.plot(found.false_positive_rate, found.recall, color=color, label=label)
-    axes.plot([0, 1], [0, 1], color=QUIET, linewidth=0.7, linestyle=":")
-    _labels(axes, "false positive rate", "recall")
+    """Draw the ROC of Section 4.3."""
+    figure, axes = single("Receiver operating characteristic")
+    draw_roc(axes, _scored_tiles(result))
+    label(axes, "false positive rate", "recall")
     return figure
 
 
+def _scored_tiles(result: PaperResult) -> list[ScoredTiles]:
+    return [
+        ScoredTiles(name=method.test.name, scores=method.test.pooled, truth=method.test.truth)
+        for method in result.methods
+    ]
+
+
 def score_distributions(result: PaperResult) -> Figure:
-    """Figure 15."""
-    figure, axes = _one("Probability of change, all experiments")
+    """Draw Figure 15."""
+    figure, axes = single("Probability of change, all experiments")
     scores, truth = result.detector.test.pooled, result.detector.test.truth
     bins = [place / 40 for place in range(41)]
-    for chosen, color, label in ((~truth, OUTCOMES["TN"], "unchanged"), (truth, LINES[0], "changed")):
+    for chosen, color, name in ((~truth, OUTCOMES["TN"], "unchanged"), (truth, COLORS[0], "changed")):
         part = scores[chosen & ~np.isnan(scores)]
         weights = np.full(len(part), 1 / max(len(part), 1))
-        axes.hist(part, bins, weights=weights, color=color, alpha=0.7, label=f"{label} ({len(part)} tiles)")
+        axes.hist(part, bins, weights=weights, color=color, alpha=0.7, label=f"{name} ({len(part)} tiles)")
     axes.set_yscale("log")
     _mark_thresholds(axes, result)
-    _labels(axes, "score", "share of tiles")
+    label(axes, "score", "share of tiles")
     return figure
 
 
 def confusion_matrices(result: PaperResult, names: tuple[str, ...], title: str) -> Figure | None:
-    """Figures 9 and 10; None where none of the experiments was run."""
-    counts = counts_of(result.detector, result.detector.threshold)
+    """Draw Figures 9 and 10; None where none of the experiments was run."""
+    counts = result.detector.counts(result.detector.threshold)
     rows = [
         (trial.experiment.name, one)
         for trial, one in zip(result.trials, counts, strict=True)
@@ -116,13 +206,13 @@ def confusion_matrices(result: PaperResult, names: tuple[str, ...], title: str) 
 
 
 def robustness(result: PaperResult) -> Figure:
-    """Figure 11."""
+    """Draw Figure 11."""
     figure = Figure(figsize=(10, 6), dpi=100, layout="constrained")
     for place, what in enumerate(LEVELS, start=1):
         axes = figure.add_subplot(2, 2, place)
         points = [point for point in result.robustness if point.disturbance == what]
         levels = [point.level for point in points]
-        for name, color in zip(("precision", "recall", "f1", "false_positive_rate"), LINES, strict=False):
+        for name, color in zip(("precision", "recall", "f1", "false_positive_rate"), COLORS, strict=False):
             values = [getattr(point.counts, name) for point in points]
             axes.plot(levels, values, "o-", markersize=3, color=color, label=name.replace("_", " "))
         if what == "dropout (%)":
@@ -135,57 +225,88 @@ def robustness(result: PaperResult) -> Figure:
                 label="paper, F1",
             )
         axes.set_ylim(-0.03, 1.03)
-        _labels(axes, what, "share")
+        label(axes, what, "share")
     return figure
 
 
-def embedding(found: Embedding, title: str = "Fused embeddings, first two principal directions") -> Figure:
-    """Figure 12."""
-    figure, axes = _one(title)
+def embedding(projected: Embedding) -> Figure:
+    """Draw Figure 12."""
+    figure, axes = single("Fused embeddings, first two principal directions")
     for outcome, color in OUTCOMES.items():
-        here = found.outcomes == outcome
-        label = f"{outcome} ({here.sum()})"
-        axes.scatter(
-            found.places[here, 0],
-            found.places[here, 1],
-            s=9,
-            color=color,
-            label=label,
-            alpha=0.8,
-            linewidths=0,
-        )
-    _labels(axes, f"{found.explained[0]:.0%} of the variance", f"{found.explained[1]:.0%} of the variance")
+        x, y = projected.places[projected.outcomes == outcome].T
+        axes.scatter(x, y, s=9, color=color, label=f"{outcome} ({len(x)})", alpha=0.8, linewidths=0)
+    label(axes, *(f"{share:.0%} of the variance" for share in projected.explained))
     return figure
 
 
 def _mark_thresholds(axes: Axes, result: PaperResult) -> None:
-    method: Method = result.detector
-    axes.axvline(
-        method.threshold,
-        color="#c62828",
-        linestyle="--",
-        linewidth=1,
-        label=f"{method.threshold:.2f}, chosen on another corridor",
+    method = result.detector
+    for threshold, color, style, name in (
+        (method.threshold, OUTCOMES["FP"], "--", "chosen on another corridor"),
+        (method.test_threshold, QUIET, ":", "best here"),
+    ):
+        axes.axvline(threshold, color=color, linestyle=style, linewidth=1, label=f"{threshold:.2f}, {name}")
+
+
+def tiles_from_above(result: PaperResult) -> Figure:
+    """Draw Figure 13: the tiles of one experiment, layer by layer."""
+    names = [trial.experiment.name for trial in result.trials]
+    place = names.index(PREFERRED) if PREFERRED in names else 0
+    trial, scores = result.trials[place], result.detector.test.scores[place]
+    outcomes = outcomes_of(scores, trial.truth, result.detector.threshold).tolist()
+    styles = {
+        name: TileStyle(color=color, alpha=0.15 if name == "TN" else 0.6) for name, color in OUTCOMES.items()
+    }
+    return tile_map(result.site.tiles, outcomes, styles, names[place])
+
+
+def failure_case(result: PaperResult) -> Figure | None:
+    """Draw Figure 14: the missed tile of the highest score, if possible a removed one; None where none was missed."""
+    missed = _missed(result)
+    if missed is None:
+        return None
+    place, tile, score = missed
+    trial = result.trials[place]
+    traces = [trace for trace in trial.traces if trace.tile == tile]
+    gone = np.concatenate([trace.vanished for trace in traces])
+    come = np.concatenate([trace.appeared for trace in traces])
+    figure = Figure(figsize=(10, 4.8), dpi=100, layout="constrained")
+    index, size = result.site.tiles.indices[tile], result.site.tiles.grid.size
+    corner, name = result.site.tiles.grid.lower(index), tile_id(index)
+    figure.suptitle(
+        f"{trial.experiment.name}, {name}: score {score:.3f}, threshold {result.detector.threshold:.2f}",
+        x=0.01,
+        ha="left",
+        fontsize=11,
+        weight="bold",
     )
-    axes.axvline(
-        method.test_threshold,
-        color=QUIET,
-        linestyle=":",
-        linewidth=1,
-        label=f"{method.test_threshold:.2f}, best here",
+    sides = (
+        ("reference; red: removed from a scan", trial.pairs.reference.points[tile], gone, "#c62828"),
+        ("current; green: added to a scan", trial.pairs.current[tile], come, "#2e7d32"),
     )
+    for number, (title, points, marked, color) in enumerate(sides, start=1):
+        axes: Any = figure.add_subplot(1, 2, number, projection="3d")
+        axes.scatter(*points.T, s=4, color="#1565c0", alpha=0.6, linewidths=0)
+        axes.scatter(*marked.T, s=3, color=color, alpha=0.5, linewidths=0)
+        for set_limits, low, edge in zip(
+            (axes.set_xlim, axes.set_ylim, axes.set_zlim), corner, size, strict=True
+        ):
+            set_limits(low, low + edge)
+        axes.set_title(title, fontsize=9)
+        axes.set_box_aspect(size)
+        axes.tick_params(labelsize=6)
+    return figure
 
 
-def _one(title: str) -> tuple[Figure, Axes]:
-    figure = Figure(figsize=(7, 4.2), dpi=100, layout="constrained")
-    axes = figure.add_subplot()
-    axes.set_title(title, loc="left", fontsize=11, color=INK, weight="bold")
-    return figure, axes
-
-
-def _labels(axes: Axes, x: str, y: str) -> None:
-    axes.set_xlabel(x, fontsize=9, color=QUIET)
-    axes.set_ylabel(y, fontsize=9, color=QUIET)
-    axes.tick_params(labelsize=8, colors=QUIET)
-    axes.grid(color="#eeeeee", zorder=0)
-    axes.legend(fontsize=8, frameon=False)
+def _missed(result: PaperResult) -> tuple[int, int, float] | None:
+    """Trial, tile and score."""
+    threshold = result.detector.threshold
+    cases = [
+        (trial.experiment.operation == "remove", float(scores[tile]), place, int(tile))
+        for place, (trial, scores) in enumerate(zip(result.trials, result.detector.test.scores, strict=True))
+        for tile in np.flatnonzero(trial.truth & (scores <= threshold))
+    ]
+    if not cases:
+        return None
+    _, score, place, tile = max(cases)
+    return place, tile, score

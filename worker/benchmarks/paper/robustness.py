@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from worker.benchmarks.paper.scoring import CachedDetector
+from worker.benchmarks.methods import CachedDetector
+from worker.benchmarks.paper.experiments import Trial
 from worker.benchmarks.paper.site import Site
-from worker.benchmarks.paper.trial import Trial
 from worker.cloud.tiling import TilePairs, pair_tiles
 from worker.cloud.types import Floats, Points
 from worker.metrics import Confusion, confusion, pooled
@@ -39,29 +39,28 @@ class RobustnessPoint:
 
 
 def sweep_disturbances(
-    site: Site, given: Sequence[Trial], cached: CachedDetector, threshold: float, progress: Progress
+    site: Site, trials: Sequence[Trial], cached: CachedDetector, threshold: float, progress: Progress
 ) -> tuple[RobustnessPoint, ...]:
-    """Every level on every trial, at the threshold of the undisturbed ones."""
+    """Score every trial at every level of every disturbance, at the threshold of the undisturbed ones."""
     wanted = [(what, level) for what, levels in LEVELS.items() for level in levels]
-    found = []
+    points = []
     for number, (what, level) in enumerate(wanted):
         progress(f"robustness: {what}", number / len(wanted))
         counts = pooled(
             confusion(cached.score(disturbed(site, trial, what, level)), trial.truth, threshold)
-            for trial in given
+            for trial in trials
         )
-        found.append(RobustnessPoint(disturbance=what, level=level, counts=counts))
-    return tuple(found)
+        points.append(RobustnessPoint(disturbance=what, level=level, counts=counts))
+    return tuple(points)
 
 
-def chosen_trials(given: Sequence[Trial]) -> tuple[Trial, ...]:
-    """Those of EXPERIMENTS; where none of them was run, all that were."""
-    found = tuple(trial for trial in given if trial.experiment.name in EXPERIMENTS)
-    return found or tuple(given)
+def chosen_trials(trials: Sequence[Trial]) -> tuple[Trial, ...]:
+    """Return those of EXPERIMENTS; where none of them was run, all that were."""
+    return tuple(trial for trial in trials if trial.experiment.name in EXPERIMENTS) or tuple(trials)
 
 
 def disturbed(site: Site, trial: Trial, what: str, level: float) -> TilePairs:
-    """The trial's pairs under one disturbance: of each tile's points, or of the whole current map.
+    """Disturb the trial's pairs: each tile's points, or the whole current map.
 
     A map is moved along the floor in a random direction, the same for all levels, or turned about its middle.
     Raises ValueError for a disturbance that LEVELS does not name.

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from worker.benchmarks.registration.alignment import WRONG, align
+from worker.benchmarks.documents import Document, pose_spread
+from worker.benchmarks.trajectory import WRONG, align
 from worker.cloud.poses import difference, inverse
 from worker.cloud.types import Matrix4
 from worker.pipeline.registration.results import RegistrationResult, ScanResult
 
-DEGREES = 180 / np.pi  #: in a radian
+Pair = tuple[float | None, float | None]  #: metres and radians
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -23,23 +23,17 @@ class PoseError:
     name: str
     metres: float
     radians: float
-    metres_from_reference: (
-        float | None
-    )  #: the same with the frame held at the map's reference scan, as sigma is
-    radians_from_reference: float | None  #: None where it has none, and for that scan itself
-    sigma_metres: float | None  #: None where the map states none, as for a scan that sets the frame
-    sigma_radians: float | None
+    from_reference: Pair  #: the same with the frame held at the map's reference scan
+    sigma: Pair  #: as the map states it against that scan; None where it states none
 
-    def document(self) -> dict[str, Any]:
-        """JSON-ready; centimetres and degrees."""
+    def document(self) -> Document:
+        """Return it as JSON; centimetres and degrees."""
         return {
             "name": self.name,
             "centimetres": 100 * self.metres,
             "degrees": float(np.degrees(self.radians)),
-            "from_reference_centimetres": _scaled(self.metres_from_reference, 100),
-            "from_reference_degrees": _scaled(self.radians_from_reference, DEGREES),
-            "sigma_centimetres": _scaled(self.sigma_metres, 100),
-            "sigma_degrees": _scaled(self.sigma_radians, DEGREES),
+            **_both_units("from_reference_", self.from_reference),
+            **_both_units("sigma_", self.sigma),
         }
 
 
@@ -54,25 +48,17 @@ class Assessment:
     foreign_accepted: tuple[str, ...]  #: names; each is a mistake
     true_from_map: Matrix4 | None  #: None where nothing of the building was accepted
 
-    def document(self) -> dict[str, Any]:
-        """JSON-ready; centimetres and degrees, as the tables show them."""
-        metres, radians = (
-            np.array([getattr(e, name) for e in self.errors]) for name in ("metres", "radians")
-        )
+    def document(self) -> Document:
+        """Return it as JSON; centimetres and degrees, as the tables show them."""
         return {
             "accepted": len(self.errors),
             "of": self.scans,
             "foreign_accepted": len(self.foreign_accepted),
             "foreign": self.foreign,
-            "wrong": int(np.sum(metres > WRONG)),
-            "centimetres": _spread(100 * metres),
-            "degrees": _spread(np.degrees(radians)),
-            "translation_sigma": _calibration(
-                [(error.metres_from_reference, error.sigma_metres) for error in self.errors]
-            ),
-            "rotation_sigma": _calibration(
-                [(error.radians_from_reference, error.sigma_radians) for error in self.errors]
-            ),
+            "wrong": sum(error.metres > WRONG for error in self.errors),
+            **pose_spread([(error.metres, error.radians) for error in self.errors], "median", "worst"),
+            "translation_sigma": _calibration([(e.from_reference[0], e.sigma[0]) for e in self.errors]),
+            "rotation_sigma": _calibration([(e.from_reference[1], e.sigma[1]) for e in self.errors]),
             "missing": list(self.missing),
             "scans": [error.document() for error in self.errors],
         }
@@ -86,21 +72,23 @@ def assess(
     Scans and truth are in the same order; a scan's frame is its sensor's. `reference` is the index of the scan
     against which the map states its uncertainties.
     """
-    home = {at: pose for at, pose in enumerate(true) if pose is not None}
-    out_of_place = [outcome for at, outcome in enumerate(outcomes) if at not in home]
-    placed = {at: found for at in home if (found := outcomes[at].registration) is not None}
-    frame, held = None, _held_at(reference, outcomes, true)
-    if placed:
-        frame = align([found.map_from_scan for found in placed.values()], [home[at] for at in placed])
+    home = {scan: pose for scan, pose in enumerate(true) if pose is not None}
+    out_of_place = [outcome for scan, outcome in enumerate(outcomes) if scan not in home]
+    accepted = {scan: placement for scan in home if (placement := outcomes[scan].registration) is not None}
+    frame: Matrix4 | None = None
+    errors: list[PoseError] = []
+    if accepted:
+        poses = [placement.map_from_scan for placement in accepted.values()]
+        frame = align(poses, [home[scan] for scan in accepted])
+        held = _held_at(reference, outcomes, true)
+        errors = [
+            _error(outcomes[scan].name, placement, home[scan], frame, None if scan == reference else held)
+            for scan, placement in accepted.items()
+        ]
     return Assessment(
         scans=len(home),
-        errors=()
-        if frame is None
-        else tuple(
-            _error(outcomes[at].name, found, home[at], frame, None if at == reference else held)
-            for at, found in placed.items()
-        ),
-        missing=tuple(outcomes[at].name for at in home if at not in placed),
+        errors=tuple(errors),
+        missing=tuple(outcomes[scan].name for scan in home if scan not in accepted),
         foreign=len(out_of_place),
         foreign_accepted=tuple(outcome.name for outcome in out_of_place if outcome.registration),
         true_from_map=frame,
@@ -110,7 +98,7 @@ def assess(
 def _held_at(
     reference: int | None, outcomes: Sequence[ScanResult], true: Sequence[Matrix4 | None]
 ) -> Matrix4 | None:
-    """true_from_map by the reference scan alone; None where there is none, or it is of another building."""
+    """Return true_from_map by the reference scan alone; None where there is none, or it is of another building."""
     if reference is None:
         return None
     placement, pose = outcomes[reference].registration, true[reference]
@@ -121,30 +109,22 @@ def _held_at(
 
 
 def _error(
-    name: str, found: RegistrationResult, true: Matrix4, true_from_map: Matrix4, held: Matrix4 | None
+    name: str, placement: RegistrationResult, true: Matrix4, true_from_map: Matrix4, held: Matrix4 | None
 ) -> PoseError:
-    metres, radians = difference(true, true_from_map @ found.map_from_scan)
-    from_reference = (None, None) if held is None else difference(true, held @ found.map_from_scan)
-    sigma = found.uncertainty
+    metres, radians = difference(true, true_from_map @ placement.map_from_scan)
+    from_reference = (None, None) if held is None else difference(true, held @ placement.map_from_scan)
+    sigma = placement.uncertainty
     return PoseError(
         name=name,
         metres=metres,
         radians=radians,
-        metres_from_reference=from_reference[0],
-        radians_from_reference=from_reference[1],
-        sigma_metres=None if sigma is None else sigma.translation,
-        sigma_radians=None if sigma is None else sigma.rotation,
+        from_reference=from_reference,
+        sigma=(None, None) if sigma is None else (sigma.translation, sigma.rotation),
     )
 
 
-def _spread(values: np.ndarray[Any, Any]) -> dict[str, float] | None:
-    if not len(values):
-        return None
-    return {"median": float(np.median(values)), "worst": float(values.max())}
-
-
 def _calibration(rows: Sequence[tuple[float | None, float | None]]) -> dict[str, float] | None:
-    """Of (error, sigma); a sigma in the worst direction that is right holds most errors within twice its length."""
+    """Compare errors with sigmas; a right sigma, of the worst direction, holds most errors within twice itself."""
     ratios = [error / sigma for error, sigma in rows if error is not None and sigma]
     if not ratios:
         return None
@@ -154,5 +134,10 @@ def _calibration(rows: Sequence[tuple[float | None, float | None]]) -> dict[str,
     }
 
 
-def _scaled(value: float | None, factor: float) -> float | None:
-    return None if value is None else factor * value
+def _both_units(prefix: str, error: Pair) -> Document:
+    """Name metres and radians `<prefix>centimetres` and `<prefix>degrees`."""
+    metres, radians = error
+    return {
+        f"{prefix}centimetres": None if metres is None else 100 * metres,
+        f"{prefix}degrees": None if radians is None else float(np.degrees(radians)),
+    }

@@ -10,11 +10,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from worker.benchmarks.registration.stage_clock import StageClock
+from worker.benchmarks.documents import Document
+from worker.benchmarks.timing import StageClock
 from worker.cloud.poses import difference, inverse
 from worker.cloud.types import Matrix4
 from worker.errors import PipelineError
@@ -23,44 +23,37 @@ from worker.pipeline.registration.results import ScanFile
 from worker.progress import Progress, no_progress
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Pair:
-    """Two files of one place, below the folder."""
+@dataclass(frozen=True, slots=True)
+class RealPair:
+    """Two files of one place, in a folder of their own."""
 
     name: str
+    folder: str
     first: str
     second: str
     transform: str  #: text file, (4, 4) first_from_second
 
 
 PAIRS = (
-    Pair(
-        name="room_scan",
-        first="room_scan/room_scan1.pcd",
-        second="room_scan/room_scan2.pcd",
-        transform="room_scan/T_scan2_to_scan1.txt",
+    RealPair("room_scan", "room_scan", "room_scan1.pcd", "room_scan2.pcd", "T_scan2_to_scan1.txt"),
+    RealPair("corridor_pair", "corridor_pair", "cloud_0.ply", "cloud_1.ply", "T_cloud1_to_cloud0.txt"),
+    RealPair(
+        "ipad 808",
+        "ipad_rooms",
+        "pix4d_database_808_db.ply",
+        "pix4d_user_808_user.ply",
+        "T_user_to_db_808.txt",
     ),
-    Pair(
-        name="corridor_pair",
-        first="corridor_pair/cloud_0.ply",
-        second="corridor_pair/cloud_1.ply",
-        transform="corridor_pair/T_cloud1_to_cloud0.txt",
-    ),
-    Pair(
-        name="ipad 808",
-        first="ipad_rooms/pix4d_database_808_db.ply",
-        second="ipad_rooms/pix4d_user_808_user.ply",
-        transform="ipad_rooms/T_user_to_db_808.txt",
-    ),
-    Pair(
-        name="ipad 560",
-        first="ipad_rooms/pix4d_database_560_db.ply",
-        second="ipad_rooms/pix4d_user_560_user.ply",
-        transform="ipad_rooms/T_user_to_db_560.txt",
+    RealPair(
+        "ipad 560",
+        "ipad_rooms",
+        "pix4d_database_560_db.ply",
+        "pix4d_user_560_user.ply",
+        "T_user_to_db_560.txt",
     ),
 )
 FRAMES = tuple(f"kinect_pairwise/capture000{number}.pcd" for number in range(1, 6))
-FOREIGN = (
+OUT_OF_PLACE = (
     ("room_scan/room_scan1.pcd", "corridor_pair/cloud_0.ply"),
     ("room_scan/room_scan1.pcd", "kinect_pairwise/capture0001.pcd"),
     ("ipad_rooms/pix4d_database_808_db.ply", "ipad_rooms/pix4d_database_560_db.ply"),
@@ -68,22 +61,22 @@ FOREIGN = (
 )
 
 
-def evaluate_real(folder: Path, progress: Progress = no_progress) -> dict[str, Any]:
+def evaluate_real(folder: Path, progress: Progress = no_progress) -> Document:
     """Build each map without any prior; JSON-ready. Raises OSError where a file is missing."""
     return {
         "pairs": [_pair(folder, pair, progress) for pair in PAIRS],
         "frames": _frames(folder, progress),
-        "foreign": [_foreign(folder, names, progress) for names in FOREIGN],
+        "foreign": [_out_of_place(folder, names, progress) for names in OUT_OF_PLACE],
     }
 
 
-def _pair(folder: Path, pair: Pair, progress: Progress) -> dict[str, Any]:
-    given = np.loadtxt(folder / pair.transform)
-    built, seconds = _built(folder, (pair.first, pair.second), progress)
-    found = None if built is None else _relative(built, 0, 1)
-    if found is None:
+def _pair(folder: Path, pair: RealPair, progress: Progress) -> Document:
+    given = np.loadtxt(folder / pair.folder / pair.transform)
+    built, seconds = _built(folder / pair.folder, (pair.first, pair.second), progress)
+    first_from_second = None if built is None else _relative(built, 0, 1)
+    if first_from_second is None:
         return {"name": pair.name, "joined": False, "seconds": seconds}
-    metres, radians = difference(given, found)
+    metres, radians = difference(given, first_from_second)
     return {
         "name": pair.name,
         "joined": True,
@@ -94,8 +87,8 @@ def _pair(folder: Path, pair: Pair, progress: Progress) -> dict[str, Any]:
     }
 
 
-def _frames(folder: Path, progress: Progress) -> dict[str, Any]:
-    """Five frames to one map, and each pair of neighbours alone: the same relative poses?"""
+def _frames(folder: Path, progress: Progress) -> Document:
+    """Build one map of five frames, and one of each pair of neighbours, to compare their relative poses."""
     built, seconds = _built(folder, FRAMES, progress)
     accepted = sum(outcome.registration is not None for outcome in built.outcomes) if built else 0
     off = []
@@ -117,14 +110,14 @@ def _frames(folder: Path, progress: Progress) -> dict[str, Any]:
     }
 
 
-def _foreign(folder: Path, names: tuple[str, str], progress: Progress) -> dict[str, Any]:
+def _out_of_place(folder: Path, names: tuple[str, str], progress: Progress) -> Document:
     built, seconds = _built(folder, names, progress)
     joined = built is not None and _relative(built, 0, 1) is not None
     return {"names": [Path(name).name for name in names], "joined": joined, "seconds": seconds}
 
 
 def _built(folder: Path, names: Sequence[str], progress: Progress) -> tuple[BuiltMap | None, float]:
-    """None where nothing of the files makes a map."""
+    """Build a map of the files, None where nothing of them makes one; and the seconds that it took."""
     clock = StageClock(progress, prefix=f"{Path(names[0]).stem}: ")
     files = [ScanFile(name=Path(name).name, path=folder / name) for name in names]
     try:
@@ -135,7 +128,7 @@ def _built(folder: Path, names: Sequence[str], progress: Progress) -> tuple[Buil
 
 
 def _relative(built: BuiltMap, first: int, second: int) -> Matrix4 | None:
-    """first_from_second, None where one of them was left out."""
+    """Return first_from_second, None where one of them was left out."""
     one, other = built.outcomes[first].registration, built.outcomes[second].registration
     if one is None or other is None:
         return None
@@ -143,8 +136,8 @@ def _relative(built: BuiltMap, first: int, second: int) -> Matrix4 | None:
     return relative
 
 
-def _fit(built: BuiltMap | None) -> dict[str, Any]:
-    """The mean over all that were fitted to something, which the scan that sets the frame was not."""
+def _fit(built: BuiltMap | None) -> Document:
+    """Average over all that were fitted to something, which the scan that sets the frame was not."""
     outcomes = [] if built is None else built.outcomes
     fitness = [outcome.fitness for outcome in outcomes if outcome.fitness is not None]
     rmse = [outcome.inlier_rmse for outcome in outcomes if outcome.inlier_rmse is not None]

@@ -5,14 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from worker.benchmarks.revisit.baselines import baseline_methods
-from worker.benchmarks.revisit.measures import measure, threshold_of
-from worker.benchmarks.revisit.methods import Method, from_checkpoint, opened, score_visits
-from worker.benchmarks.revisit.pictures import draw
+from worker.benchmarks.documents import Document, spread
+from worker.benchmarks.methods import baseline_methods, detector_methods
+from worker.benchmarks.revisit.measures import TileTable, measure, score_visits, threshold_of, tile_table
 from worker.benchmarks.revisit.plan import (
     TEST_SEED,
     VALIDATION_SEED,
@@ -20,20 +18,20 @@ from worker.benchmarks.revisit.plan import (
     VisitPlan,
     plan_visits,
 )
-from worker.benchmarks.revisit.record import Revisit, ScanErrors
-from worker.benchmarks.revisit.tile_table import TileTable, tile_table
-from worker.benchmarks.revisit.visits import load_visits, make_visits
+from worker.benchmarks.revisit.report import draw
+from worker.benchmarks.revisit.visits import Revisit, ScanErrors, load_visits, make_visits
+from worker.benchmarks.trajectory import WRONG
+from worker.cloud.types import Floats
 from worker.detectors.card import MODEL_STORE
 from worker.detectors.store import open_card
 from worker.pipeline.flow import PipelineSettings
 from worker.progress import Progress, no_progress
 
 VISITS = "visits"  #: folder of what is kept, within the benchmark's own
-WRONG = 0.1  #: metres; a pose that is off by this is wrong
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class BenchmarkSettings:
+class RevisitBenchmarkSettings:
     """What is run."""
 
     out: Path  #: folder of the visits, which are kept, and of the pictures
@@ -42,21 +40,23 @@ class BenchmarkSettings:
     model: str = "spicd-net/1"
     model_store: Path = MODEL_STORE
     weights: tuple[Path, ...] = ()  #: checkpoints, measured instead of the model's own weights
-    made: RevisitSettings = field(
-        default_factory=RevisitSettings
-    )  #: its pipeline gives way to the model's needs
+    #: its pipeline gives way to the model's needs
+    made: RevisitSettings = field(default_factory=RevisitSettings)
     pictures: bool = True
 
 
-def evaluate(settings: BenchmarkSettings, progress: Progress = no_progress) -> dict[str, Any]:
-    """Run all of it; JSON-ready.
+def evaluate(settings: RevisitBenchmarkSettings, progress: Progress = no_progress) -> Document:
+    """Run all of it, and draw what is to be drawn; JSON-ready.
 
     Raises DetectorUnavailable, MapFailed, OSError for the folder, and ValueError where too few visits are asked for to
     have a changed tile among them.
     """
     card = open_card(settings.model_store, settings.model)
     made = settings.made.model_copy(update={"pipeline": PipelineSettings().for_model(card.preprocessing)})
-    methods = _methods(settings)
+    methods = (
+        *detector_methods(settings.model_store, settings.model, settings.weights),
+        *baseline_methods(),
+    )
     test_plans, test, made_now = _visits(settings.visits, TEST_SEED, made, settings.out, progress)
     other_plans, other, made_more = _visits(
         settings.validation, VALIDATION_SEED, made, settings.out, progress
@@ -64,14 +64,14 @@ def evaluate(settings: BenchmarkSettings, progress: Progress = no_progress) -> d
     table, other_table = tile_table(test_plans, test), tile_table(other_plans, other)
     _check(table, "--visits")
     _check(other_table, "--validation")
-    found = []
+    measured = []
     for method in methods:
         threshold = threshold_of(score_visits(method, other, progress), other_table)
-        scored = score_visits(method, test, progress)
-        found.append(measure(method.name, scored, table, threshold=threshold, stated=method.stated))
+        scores = score_visits(method, test, progress)
+        measured.append(measure(method.name, scores, table, threshold=threshold, stated=method.stated))
     if settings.pictures:
         progress("drawing", 0.0)
-        draw(settings.out, found, table, test)
+        draw(settings.out, measured, table, test)
     return {
         "settings": made.model_dump(mode="json"),
         "seeds": {"test": TEST_SEED, "validation": VALIDATION_SEED},
@@ -79,14 +79,13 @@ def evaluate(settings: BenchmarkSettings, progress: Progress = no_progress) -> d
         "test": summary(table, test),
         "validation": summary(other_table, other),
         "methods": [
-            {**measured.document(), "sha256": method.sha256}
-            for method, measured in zip(methods, found, strict=True)
+            {**row.document(), "sha256": method.sha256} for method, row in zip(methods, measured, strict=True)
         ],
     }
 
 
-def summary(table: TileTable, visits: Sequence[Revisit]) -> dict[str, Any]:
-    """What there was to find, and what of it nobody looked at."""
+def summary(table: TileTable, visits: Sequence[Revisit]) -> Document:
+    """Say what there was to find, and what of it nobody looked at."""
     changed = table.changed
     return {
         "visits": len(visits),
@@ -99,20 +98,13 @@ def summary(table: TileTable, visits: Sequence[Revisit]) -> dict[str, Any]:
             "out_of_sight": int((changed & table.observed & ~table.counted).sum()),
             "outside_the_map": sum(visit.outside for visit in visits),
         },
-        "misfit_centimetres": _spread(100 * table.misfit),
+        "misfit_centimetres": _centimetres(table.misalignment),
         "scans": {
             "first": _scans([visit.first for visit in visits]),
             "second": _scans([visit.second for visit in visits]),
         },
         "by_visit": [_visit(visit) for visit in visits],
     }
-
-
-def _methods(settings: BenchmarkSettings) -> list[Method]:
-    learned = [from_checkpoint(path, settings.model_store, settings.model) for path in settings.weights] or [
-        opened(settings.model_store, settings.model)
-    ]
-    return [*learned, *baseline_methods()]
 
 
 def _visits(
@@ -128,7 +120,7 @@ def _check(table: TileTable, option: str) -> None:
         raise ValueError(f"no changed tile was seen in these visits; ask for more with {option}")
 
 
-def _visit(visit: Revisit) -> dict[str, Any]:
+def _visit(visit: Revisit) -> Document:
     return {
         "name": visit.name,
         "tiles": len(visit.cells),
@@ -137,30 +129,23 @@ def _visit(visit: Revisit) -> dict[str, Any]:
         "changed_counted": int((visit.changed & visit.counted).sum()),
         "accepted": visit.second.accepted,
         "scans": visit.second.scans,
-        "misfit_centimetres": _spread(100 * visit.misfit),
+        "misfit_centimetres": _centimetres(visit.misalignment),
     }
 
 
-def _scans(errors: Sequence[ScanErrors]) -> dict[str, Any]:
-    """Of all visits; a map counts once a visit to it."""
-    metres = np.concatenate([each.metres for each in errors])
-    sigmas = np.concatenate([each.sigmas for each in errors])
+def _scans(errors: Sequence[ScanErrors]) -> Document:
+    """Describe the scans of all visits; a map counts once a visit to it."""
+    metres = np.concatenate([visit.metres for visit in errors])
+    sigmas = np.concatenate([visit.sigmas for visit in errors])
     stated = sigmas > 0
     return {
         "accepted": len(metres),
-        "of": sum(each.scans for each in errors),
+        "of": sum(visit.scans for visit in errors),
         "wrong": int((metres > WRONG).sum()),
-        "centimetres": _spread(100 * metres),
+        "centimetres": _centimetres(metres),
         "within_2_sigma": float(np.mean(metres[stated] <= 2 * sigmas[stated])) if stated.any() else None,
     }
 
 
-def _spread(values: np.ndarray[Any, Any]) -> dict[str, float] | None:
-    known = values[~np.isnan(values)]
-    if not len(known):
-        return None
-    return {
-        "median": round(float(np.median(known)), 3),
-        "95%": round(float(np.percentile(known, 95)), 3),
-        "worst": round(float(known.max()), 3),
-    }
+def _centimetres(metres: Floats) -> Document | None:
+    return spread(100 * metres, "median", "95%", "worst", digits=3)

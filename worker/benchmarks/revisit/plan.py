@@ -3,33 +3,19 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Field
 
 from worker.pipeline.flow import PipelineSettings
-from worker.simulation.scenes import (
-    ChangeKind,
-    Scene,
-    corridor,
-    corridor_with_loop,
-    random_room,
-    small_office,
-)
+from worker.simulation.scenes import BUILDINGS, BuildingKind, Scene
+from worker.simulation.visits import DRIFT
 
-Kind = Literal["room", "office", "corridor", "loop"]
 Case = Literal["changed", "sparse", "unchanged"]
-KINDS: tuple[Kind, ...] = get_args(Kind)
+KINDS: tuple[BuildingKind, ...] = get_args(BuildingKind)
 CASES: tuple[Case, ...] = get_args(Case)
 
-MAKERS: Mapping[Kind, Callable[[int], Scene]] = {
-    "room": random_room,
-    "office": small_office,
-    "corridor": corridor,
-    "loop": corridor_with_loop,
-}
 TEST_SEED, VALIDATION_SEED = 700_000, 900_000  #: of the first building; training sets begin at 1000
 RECIPE = 1  #: raised when the same settings begin to give other visits: kept ones are then made anew
 
@@ -39,16 +25,16 @@ class RevisitSettings(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    kinds: tuple[Kind, ...] = Field(KINDS, min_length=1, description="of buildings, taken in turn")
-    stops: dict[Kind, int] = Field(
+    kinds: tuple[BuildingKind, ...] = Field(KINDS, min_length=1, description="of buildings, taken in turn")
+    stops: dict[BuildingKind, int] = Field(
         {"room": 6, "office": 14, "corridor": 16, "loop": 24}, description="scans of the first visit"
     )
-    edits: dict[Kind, int] = Field(
+    edits: dict[BuildingKind, int] = Field(
         {"room": 3, "office": 6, "corridor": 6, "loop": 6},
         description="pieces added, removed, moved, in turn",
     )
     sparse_share: float = Field(1 / 3, gt=0, le=1, description="of the stops, in the case of that name")
-    drift: tuple[float, float] = Field((0.25, 4.0), description="a prior is off by at most (metres, degrees)")
+    drift: tuple[float, float] = Field(DRIFT, description="a prior is off by at most (metres, degrees)")
     standing_s: float = Field(5.0, gt=0, description="seconds at each stop; about 20,000 points a second")
     pipeline: PipelineSettings = PipelineSettings()
 
@@ -63,7 +49,7 @@ class RevisitSettings(BaseModel):
 class SitePlan:
     """A building and its first visit."""
 
-    kind: Kind
+    kind: BuildingKind
     seed: int
 
     @property
@@ -71,8 +57,8 @@ class SitePlan:
         return f"{self.kind}-{self.seed}"
 
     def scene(self) -> Scene:
-        """As the first visit finds it."""
-        return MAKERS[self.kind](self.seed)
+        """Build it as the first visit finds it."""
+        return BUILDINGS[self.kind](self.seed)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -91,25 +77,28 @@ class VisitPlan:
         """Of poses, noise and edits; another one than the first visit's."""
         return 10 * self.site.seed + 1 + CASES.index(self.case)
 
+    def stops(self, settings: RevisitSettings) -> int:
+        """Return how many scans are taken."""
+        count = settings.stops[self.site.kind]
+        return max(1, round(count * settings.sparse_share)) if self.case == "sparse" else count
+
+    def edits(self, settings: RevisitSettings) -> int:
+        """Return how many things are added, removed and moved before it."""
+        return 0 if self.case == "unchanged" else settings.edits[self.site.kind]
+
 
 def plan_visits(count: int, settings: RevisitSettings, *, first_seed: int) -> tuple[VisitPlan, ...]:
-    """`count` visits, site after site: kinds of buildings in turn, in each one visit of every case."""
+    """Plan `count` visits, site after site: kinds of buildings in turn, in each one visit of every case."""
     plans = []
     for number in range(count):
-        at, case = divmod(number, len(CASES))
-        site = SitePlan(kind=settings.kinds[at % len(settings.kinds)], seed=first_seed + at)
+        place, case = divmod(number, len(CASES))
+        site = SitePlan(kind=settings.kinds[place % len(settings.kinds)], seed=first_seed + place)
         plans.append(VisitPlan(site=site, case=CASES[case]))
     return tuple(plans)
 
 
-def edit_kinds(count: int) -> tuple[ChangeKind, ...]:
-    """`count` kinds of edits in turn."""
-    kinds: tuple[ChangeKind, ...] = ("add", "remove", "move")
-    return tuple(kinds[number % len(kinds)] for number in range(count))
-
-
-def kinds_named(words: str) -> tuple[Kind, ...]:
-    """From a list with commas, in the order given. Raises ValueError for another name."""
+def kinds_named(words: str) -> tuple[BuildingKind, ...]:
+    """Read a list with commas, in the order given. Raises ValueError for another name."""
     known = {str(kind): kind for kind in KINDS}
     names = [word.strip() for word in words.split(",")]
     unknown = [name for name in names if name not in known]

@@ -1,24 +1,118 @@
-"""All visits of a benchmark, kept on disk: simulating and registering them is what takes the time."""
+"""The visits: a building is walked and mapped, edited and walked anew, and the pipeline lays that over the map.
+
+Simulating and registering is what takes the time, so every second visit is kept on disk as it is measured: its tile
+pairs from the pipeline, and the truth about each of them.
+"""
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from worker.benchmarks.revisit import record
+import numpy as np
+from numpy.typing import NDArray
+
+from worker.benchmarks.revisit.misalignment import residual_misalignments, stated_sigmas
 from worker.benchmarks.revisit.plan import RevisitSettings, SitePlan, VisitPlan
-from worker.benchmarks.revisit.record import Revisit
-from worker.benchmarks.revisit.second_visit import walk_again
-from worker.benchmarks.revisit.site import walk_site
+from worker.benchmarks.timing import StageClock
+from worker.benchmarks.trajectory import PlacedScan, map_frame, placed_scans, scan_files
+from worker.cloud.tiling import TileGrid, TilePairs, pair_tiles
+from worker.cloud.types import Arrays, Bools, Floats, Indices, Matrix4
+from worker.pipeline import archive
+from worker.pipeline.flow import BuiltMap, NoScanAccepted, build_map, locate_survey
+from worker.pipeline.registration.results import ScanFile, ScanResult
 from worker.progress import Progress, no_progress
+from worker.simulation.scenes import Scene, rigid
+from worker.simulation.truth import MIN_CELLS, true_changes
+from worker.simulation.visits import drifted_within, edited, visit
+
+NOTHING = -1  #: in place of an index into KINDS
+
+
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class ScanErrors:
+    """The scans of one visit against the truth."""
+
+    scans: int  #: taken
+    metres: Floats  #: (A,) of those accepted: how far off the sensor's place is
+    sigmas: Floats  #: (A,) metres, as stored with the map or survey; NaN where none is stated
+
+    @property
+    def accepted(self) -> int:
+        return len(self.metres)
+
+    @classmethod
+    def of(cls, accepted: Sequence[PlacedScan], taken: int) -> ScanErrors:
+        """Measure the accepted scans; `taken` are all."""
+        sigmas = [scan.placement.uncertainty for scan in accepted]
+        return cls(
+            scans=taken,
+            metres=np.array([scan.error[0] for scan in accepted]),
+            sigmas=np.array([np.nan if sigma is None else sigma.translation for sigma in sigmas]),
+        )
+
+
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class Revisit:
+    """One second visit on its map. T tiles, those of the map."""
+
+    name: str
+    pairs: TilePairs
+    #: (T, 3) cells of 5 cm whose surface exists in one visit only, by kind as in KINDS
+    cells: NDArray[np.int32]
+    #: (T, 3) of these, those that a sensor of the visit in which they exist could see
+    in_sight: NDArray[np.int32]
+    outside: int  #: changed tiles that the map does not keep: too few points before
+    misalignment: Floats  #: (T,) metres that the poses put the survey off the map
+    sigma: Floats  #: (T,) metres of that which the survey's stored sigmas allow for
+    first: ScanErrors
+    second: ScanErrors
+
+    @property
+    def exists(self) -> Bools:
+        """(T,) whether something truly changed in the tile, seen or not."""
+        enough: Bools = self.cells.sum(axis=1) >= MIN_CELLS
+        return enough
+
+    @property
+    def changed(self) -> Bools:
+        """(T,) whether something changed that could be seen."""
+        enough: Bools = self.in_sight.sum(axis=1) >= MIN_CELLS
+        return enough
+
+    @property
+    def counted(self) -> Bools:
+        """(T,) tiles that a method can be right or wrong about.
+
+        They were observed, and a change in them did not happen out of every sensor's sight.
+        """
+        return self.pairs.observed & (self.changed | ~self.exists)
+
+    @property
+    def kinds(self) -> NDArray[np.int64]:
+        """(T,) index into KINDS of what changed most in the tile, or NOTHING."""
+        return np.where(self.exists, self.cells.argmax(axis=1), NOTHING)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class MappedSite:
+    """A building with its map, and the truth about the map."""
+
+    plan: SitePlan
+    before: Scene
+    built: BuiltMap
+    map_from_world: Matrix4  #: (4, 4) by the best fit of all poses: a map has the frame of its priors
+    scans: tuple[PlacedScan, ...]  #: of the map
+    errors: ScanErrors
 
 
 def make_visits(
     plans: Sequence[VisitPlan], settings: RevisitSettings, folder: Path, progress: Progress = no_progress
 ) -> tuple[Path, int]:
-    """See to it that the folder has every visit; where it lies, and how many had to be made.
+    """See to it that the folder has every visit; return where it lies, and how many had to be made.
 
     Visits made with other settings lie beside them under another name. A map is built anew where a visit to it is
     missing. Raises MapFailed, and OSError for the folder.
@@ -26,22 +120,177 @@ def make_visits(
     place = folder / settings.fingerprint
     made = 0
     for site, group in itertools.groupby(plans, key=lambda plan: plan.site):
-        missing = [plan for plan in group if not record.kept(plan.name, place)]
-        if missing:
-            _make(site, missing, settings, place, progress)
-            made += len(missing)
+        missing = [plan for plan in group if not is_kept(plan.name, place)]
+        if not missing:
+            continue
+        with TemporaryDirectory(prefix="spicd-revisit-") as scratch:
+            mapped = map_site(site, settings, Path(scratch), progress)
+            for plan in missing:
+                save(walk_again(plan, mapped, settings, Path(scratch), progress), place)
+        made += len(missing)
     return place, made
 
 
 def load_visits(plans: Iterable[VisitPlan], place: Path) -> tuple[Revisit, ...]:
-    """From where `make_visits` put them."""
-    return tuple(record.load(plan.name, place) for plan in plans)
+    """Read the visits from where `make_visits` put them."""
+    return tuple(load(plan.name, place) for plan in plans)
 
 
-def _make(
-    site: SitePlan, plans: Sequence[VisitPlan], settings: RevisitSettings, place: Path, progress: Progress
-) -> None:
-    with TemporaryDirectory(prefix="spicd-revisit-") as scratch:
-        there = walk_site(site, settings, Path(scratch), progress)
-        for plan in plans:
-            record.save(walk_again(plan, there, settings, Path(scratch), progress), place)
+def map_site(
+    plan: SitePlan, settings: RevisitSettings, folder: Path, progress: Progress = no_progress
+) -> MappedSite:
+    """Simulate the first visit into the folder and build the map. Raises MapFailed, NothingToTile.
+
+    The robot's own frame is turned at random against the building: no wall runs along the tiles but by chance.
+    """
+    progress(f"{plan.name}: simulating the first visit", 0.0)
+    scene = plan.scene()
+    rng = np.random.default_rng([plan.seed, 5])
+    robot_from_world = rigid(*rng.uniform(-3, 3, 2), yaw=float(rng.uniform(0, 360)))
+    taken = visit(
+        scene,
+        settings.stops[plan.kind],
+        seed=10 * plan.seed,
+        prior_error=settings.drift,
+        drift=drifted_within,
+        duration_s=settings.standing_s,
+        folder=folder,
+        name="map-{:02d}",
+    )
+    files = scan_files(taken, robot_from_world)
+    titled = StageClock(progress, prefix=f"{plan.name}: ")
+    built = build_map(files, settings=settings.pipeline, progress=titled)
+    map_from_world = map_frame(built.outcomes, taken)
+    scans = placed_scans(built.outcomes, taken, map_from_world)
+    return MappedSite(
+        plan=plan,
+        before=scene,
+        built=built,
+        map_from_world=map_from_world,
+        scans=scans,
+        errors=ScanErrors.of(scans, len(taken)),
+    )
+
+
+def walk_again(
+    plan: VisitPlan,
+    site: MappedSite,
+    settings: RevisitSettings,
+    folder: Path,
+    progress: Progress = no_progress,
+) -> Revisit:
+    """Simulate the second visit into the folder and pair its tiles with the map's.
+
+    Its priors are off by as much as the first's, in the frame of the map. Where no scan finds its place, every tile
+    is unobserved. Raises ScanError where a file cannot be read, ValueError where no edits leave a way.
+    """
+    progress(f"{plan.name}: simulating the second visit", 0.0)
+    after, poses = edited(site.before, plan.edits(settings), seed=plan.seed, count=plan.stops(settings))
+    taken = visit(
+        after,
+        poses,
+        seed=plan.seed,
+        prior_error=settings.drift,
+        drift=drifted_within,
+        duration_s=settings.standing_s,
+        folder=folder,
+        name=f"{plan.case}-{{:02d}}",
+    )
+    titled = StageClock(progress, prefix=f"{plan.name}: ")
+    pairs, outcomes = _located(scan_files(taken, site.map_from_world), site, settings, titled)
+    scans = placed_scans(outcomes, taken, site.map_from_world)
+    grid, indices = site.built.tiles.grid, site.built.tiles.indices
+    exists, visible = true_changes(
+        site.before,
+        after,
+        grid,
+        map_from_world=site.map_from_world,
+        first=[scan.true for scan in site.scans],
+        second=[scan.true for scan in scans],
+    )
+    index = tuple((indices - grid.lowest).T)
+    return Revisit(
+        name=plan.name,
+        pairs=pairs,
+        cells=exists.cells[index],
+        in_sight=visible.cells[index],
+        outside=int((exists.changed & ~kept_tiles(grid, indices)).sum()),
+        misalignment=residual_misalignments(site.scans, scans, grid, indices),
+        sigma=stated_sigmas(scans, grid, indices),
+        first=site.errors,
+        second=ScanErrors.of(scans, len(taken)),
+    )
+
+
+def kept_tiles(grid: TileGrid, indices: Indices) -> Bools:
+    """Mark the tiles of the grid that the map has: (I, J, K)"""
+    marked = np.zeros(grid.shape, dtype=np.bool_)
+    marked[tuple((indices - grid.lowest).T)] = True
+    return marked
+
+
+def _located(
+    files: tuple[ScanFile, ...], site: MappedSite, settings: RevisitSettings, progress: Progress
+) -> tuple[TilePairs, tuple[ScanResult, ...]]:
+    reference, tiles = site.built.reference, site.built.tiles
+    try:
+        located = locate_survey(files, reference, tiles, settings=settings.pipeline, progress=progress)
+    except NoScanAccepted as nobody:
+        nothing = np.empty((0, 3), np.float32)
+        return pair_tiles(tiles, nothing, settings=settings.pipeline.tiling), nobody.outcomes
+    return located.pairs, located.outcomes
+
+
+def save(revisit: Revisit, folder: Path) -> None:
+    """Write two files of plain arrays; the second is written last and vouches for the first. Raises OSError."""
+    folder.mkdir(parents=True, exist_ok=True)
+    archive.save_pairs(folder / f"{revisit.name}.pairs.npz", revisit.pairs)
+    archive.save_arrays(
+        folder / f"{revisit.name}.truth.npz",
+        {
+            "cells": revisit.cells,
+            "in_sight": revisit.in_sight,
+            "outside": np.array([revisit.outside]),
+            "misfit": revisit.misalignment,
+            "sigma": revisit.sigma,
+            **_scan_arrays("first", revisit.first),
+            **_scan_arrays("second", revisit.second),
+        },
+    )
+
+
+def is_kept(name: str, folder: Path) -> bool:
+    """Tell whether there is a visit of this name."""
+    return (folder / f"{name}.truth.npz").exists()
+
+
+def load(name: str, folder: Path) -> Revisit:
+    """Read what `save` wrote. Raises OSError, and ValueError for other files."""
+    truth = archive.load_arrays(folder / f"{name}.truth.npz")
+    return Revisit(
+        name=name,
+        pairs=archive.load_pairs(folder / f"{name}.pairs.npz"),
+        cells=truth["cells"],
+        in_sight=truth["in_sight"],
+        outside=int(truth["outside"][0]),
+        misalignment=truth["misfit"],
+        sigma=truth["sigma"],
+        first=_scan_errors("first", truth),
+        second=_scan_errors("second", truth),
+    )
+
+
+def _scan_arrays(which: str, errors: ScanErrors) -> Arrays:
+    return {
+        f"{which}_scans": np.array([errors.scans]),
+        f"{which}_metres": errors.metres,
+        f"{which}_sigmas": errors.sigmas,
+    }
+
+
+def _scan_errors(which: str, arrays: Arrays) -> ScanErrors:
+    return ScanErrors(
+        scans=int(arrays[f"{which}_scans"][0]),
+        metres=arrays[f"{which}_metres"],
+        sigmas=arrays[f"{which}_sigmas"],
+    )

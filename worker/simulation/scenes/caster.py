@@ -38,14 +38,14 @@ class Caster:
         packed[:, :3], packed[:, 3:] = origins, rays
         answer = self._scene.cast_rays(o3d.core.Tensor.from_numpy(packed))
         ranges = answer["t_hit"].numpy().astype(np.float64)
-        found = np.isfinite(ranges)
+        hit = np.isfinite(ranges)
         # Open3D marks a miss with the largest uint32, which is no index.
-        triangle = np.where(found, answer["primitive_ids"].numpy(), 0).astype(np.int64)
+        triangle = np.where(hit, answer["primitive_ids"].numpy(), 0).astype(np.int64)
         cosines = np.abs(np.einsum("ij,ij->i", answer["primitive_normals"].numpy(), packed[:, 3:]))
         return Hits(
             ranges=ranges,
-            cosines=np.where(found, cosines, 0.0).astype(np.float64),
-            object_ids=np.where(found, self._owners[triangle], 0).astype(np.int32),
+            cosines=np.where(hit, cosines, 0.0).astype(np.float64),
+            object_ids=np.where(hit, self._owners[triangle], 0).astype(np.int32),
         )
 
     def distances(self, points: Floats) -> Floats:

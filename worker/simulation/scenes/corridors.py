@@ -104,9 +104,9 @@ def _furnish(draft: Draft, rooms: list[Room], walls: list[Wall]) -> None:
         fittings.niche_wall(draft, f"wall-{name}", start, end, inward=inward, height=height, doors=doors)
     for number, room in enumerate(rooms, start=1):
         fittings.hang_lamps(draft, room, f"lamps-{number}")
-        for at, (radius, z) in enumerate(((0.06, height - 0.3), (0.04, height - 0.5)), start=1):
+        for order, (radius, z) in enumerate(((0.06, height - 0.3), (0.04, height - 0.5)), start=1):
             pipe = fittings.pipe_along(room, radius=radius, inset=0.12, z=z)
-            draft.building(f"pipe-{number}-{at}", pipe)
+            draft.building(f"pipe-{number}-{order}", pipe)
         _line(draft, room)
 
 

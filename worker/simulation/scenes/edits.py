@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import get_args
 
 import numpy as np
 
@@ -38,6 +39,12 @@ def random_edits(
             scene, change = edited
             changes.append(change)
     return scene, tuple(changes)
+
+
+def edit_kinds(count: int) -> tuple[ChangeKind, ...]:
+    """Return `count` kinds of edits in turn: add, remove, move, add, ..."""
+    kinds: tuple[ChangeKind, ...] = get_args(ChangeKind)
+    return tuple(kinds[number % len(kinds)] for number in range(count))
 
 
 def _add(scene: Scene, prefix: str, rng: np.random.Generator) -> tuple[Scene, Change] | None:

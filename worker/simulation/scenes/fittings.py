@@ -101,7 +101,7 @@ def hang_lamps(draft: Draft, room: Room, name: str, *, every: float = 3.0) -> No
     count = max(1, int(span[along] / every))
     lamps = []
     for number in range(count):
-        at = room.low[along] + (number + 0.5) * span[along] / count
-        place = (at, y) if along == 0 else (x, at)
+        place_along = room.low[along] + (number + 0.5) * span[along] / count
+        place = (place_along, y) if along == 0 else (x, place_along)
         lamps.append(lamp().at(*place, room.height - 0.08, yaw=90.0 * along))
     draft.building(name, union(*lamps))

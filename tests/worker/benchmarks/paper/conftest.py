@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from worker.benchmarks.paper.site import Site, flat_cells, tiles_of
+from worker.benchmarks.paper.site import Site
+from worker.benchmarks.tiles import flat_cells, tiles_of
 from worker.cloud.tiling import cut, grid_over
 from worker.cloud.types import Points
 from worker.cloud.voxels import Voxels, merged_in_order
@@ -33,7 +34,7 @@ def site() -> Site:
     voxels = tuple(Voxels.of(points, size=0.05) for points in scans)
     whole = merged_in_order(voxels)
     tiles = cut(whole.points, grid, min_points=512)
-    flat = flat_cells(tiles.indices.astype(np.int64), grid)
+    flat = flat_cells(tiles.indices, grid)
     dense = tuple(np.flatnonzero(np.isin(flat, tiles_of(points, grid))) for points in scans)
     return Site(
         name="boxes",

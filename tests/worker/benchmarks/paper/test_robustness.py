@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tests.worker.benchmarks.paper.test_injection import ONE
-from worker.benchmarks.paper.embedding import outcomes_of, principal
+from tests.worker.benchmarks.paper.test_experiments import ONE
+from worker.benchmarks.paper.experiments import Trial, trials
 from worker.benchmarks.paper.robustness import LEVELS, disturbed
 from worker.benchmarks.paper.site import Site
-from worker.benchmarks.paper.trial import Trial, trials
 from worker.progress import no_progress
 
 
@@ -54,15 +53,3 @@ def test_a_yaw_about_the_middle_leaves_the_middle_and_moves_the_ends(site: Site,
 def test_a_disturbance_that_is_not_known_is_refused(site: Site, trial: Trial) -> None:
     with pytest.raises(ValueError, match="no disturbance fog"):
         disturbed(site, trial, "fog", 1)
-
-
-def test_outcomes_are_named_by_flag_and_truth() -> None:
-    scores, truth = np.array([0.9, 0.9, 0.1, 0.1, np.nan]), np.array([True, False, True, False, True])
-    assert outcomes_of(scores, truth, 0.5).tolist() == ["TP", "FP", "FN", "TN", "FN"]
-
-
-def test_points_on_a_line_are_explained_by_one_direction() -> None:
-    along = np.linspace(-1, 1, 21)
-    places, explained = principal(np.outer(along, [3.0, 4.0, 0.0]))
-    assert explained[0] == pytest.approx(1.0)
-    assert np.abs(places[:, 0]) == pytest.approx(5 * np.abs(along), abs=1e-12)

@@ -87,7 +87,7 @@ def test_what_sigma_speaks_of_is_seen_from_the_reference_scan() -> None:
     assert assess(outcomes, WALK).document()["translation_sigma"] is None
 
 
-def test_strangers_and_missing_scans_are_named_and_bend_nothing() -> None:
+def test_out_of_place_and_missing_scans_are_named_and_bend_nothing() -> None:
     poses: list[Matrix4 | None] = [MAP_FROM_WORLD @ pose for pose in WALK]
     poses[2] = None
     outcomes = [outcome(f"scan-{at}", pose) for at, pose in enumerate(poses)]
@@ -99,6 +99,6 @@ def test_strangers_and_missing_scans_are_named_and_bend_nothing() -> None:
     assert told["centimetres"]["worst"] == pytest.approx(0.0, abs=1e-6)
 
 
-def test_a_map_of_nothing_but_strangers_has_no_errors() -> None:
+def test_a_map_of_nothing_but_out_of_place_scans_has_no_errors() -> None:
     told = assess([outcome("scan-1", None), outcome("foreign-1", np.eye(4))], [np.eye(4), None]).document()
     assert (told["accepted"], told["centimetres"], told["translation_sigma"]) == (0, None, None)

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from worker.benchmarks.registration import real
-from worker.benchmarks.registration.benchmark import BenchmarkSettings, evaluate
+from worker.benchmarks.registration.benchmark import RegistrationBenchmarkSettings, evaluate
 from worker.cli import main
 
 WORDS = [
@@ -75,14 +75,14 @@ def test_what_cannot_be_run_is_told_in_a_sentence(
     assert sentence in capsys.readouterr().err
 
 
-def test_real_scans_are_joined_as_the_given_transforms_have_it_and_strangers_are_not(
+def test_real_scans_are_joined_as_the_given_transforms_have_it_and_out_of_place_scans_are_not(
     shared_data: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Some of them; the command's `--real` runs them all."""
     monkeypatch.setattr(real, "PAIRS", real.PAIRS[:2])
     monkeypatch.setattr(real, "FRAMES", real.FRAMES[:3])
-    monkeypatch.setattr(real, "FOREIGN", real.FOREIGN[:1])
-    found = evaluate(BenchmarkSettings(kinds=(), survey=False, real=shared_data))["real"]
+    monkeypatch.setattr(real, "OUT_OF_PLACE", real.OUT_OF_PLACE[:1])
+    found = evaluate(RegistrationBenchmarkSettings(kinds=(), survey=False, real=shared_data))["real"]
     assert [row["name"] for row in found["pairs"]] == ["room_scan", "corridor_pair"]
     assert all(row["joined"] for row in found["pairs"])
     assert all(row["centimetres"] < 3 and row["degrees"] < 0.5 for row in found["pairs"])

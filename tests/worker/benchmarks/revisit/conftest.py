@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from worker.benchmarks.revisit.plan import RevisitSettings, plan_visits
-from worker.benchmarks.revisit.record import Revisit, ScanErrors
-from worker.benchmarks.revisit.visits import load_visits, make_visits
+from worker.benchmarks.revisit.visits import Revisit, ScanErrors, load_visits, make_visits
 from worker.cloud.tiling import TileGrid, TilePairs, Tiles
 
 TINY = RevisitSettings(kinds=("room",), stops={"room": 3}, edits={"room": 3}, standing_s=2.0)
@@ -23,16 +22,16 @@ def hand_made(
     cells: list[list[int]],
     in_sight: list[list[int]] | None = None,
     observed: list[bool] | None = None,
-    misfit: list[float] | None = None,
+    misalignment: list[float] | None = None,
     outside: int = 0,
 ) -> Revisit:
     """Tiles in a row, all changed cells in sight and all tiles observed unless said otherwise."""
     count = len(cells)
     grid = TileGrid(origin=np.zeros(3), size=np.array([1.5, 1.5, 1.0]), shape=(count, 1, 1))
-    indices = np.array([[at, 0, 0] for at in range(count)], dtype=np.int32)
-    points = tuple(np.array([[1.5 * at + 0.5, 0.5, 0.5]], np.float32) for at in range(count))
+    indices = np.array([[tile, 0, 0] for tile in range(count)], dtype=np.int32)
+    points = tuple(np.array([[1.5 * tile + 0.5, 0.5, 0.5]], np.float32) for tile in range(count))
     nothing = ScanErrors(scans=0, metres=np.empty(0), sigmas=np.empty(0))
-    off = np.zeros(count) if misfit is None else np.array(misfit)
+    off = np.zeros(count) if misalignment is None else np.array(misalignment)
     return Revisit(
         name=name,
         pairs=TilePairs(
@@ -43,7 +42,7 @@ def hand_made(
         cells=np.array(cells, np.int32),
         in_sight=np.array(cells if in_sight is None else in_sight, np.int32),
         outside=outside,
-        misfit=off,
+        misalignment=off,
         sigma=off / 2,
         first=nothing,
         second=ScanErrors(scans=2, metres=np.array([0.02]), sigmas=np.array([0.015])),

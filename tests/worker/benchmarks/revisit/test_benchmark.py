@@ -9,12 +9,11 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from worker.benchmarks.methods import Method
 from worker.benchmarks.revisit import benchmark
-from worker.benchmarks.revisit.methods import Method
+from worker.benchmarks.revisit.measures import tile_table
 from worker.benchmarks.revisit.plan import RevisitSettings, plan_visits
-from worker.benchmarks.revisit.tables import tables
-from worker.benchmarks.revisit.tile_map import verdicts_of
-from worker.benchmarks.revisit.tile_table import tile_table
+from worker.benchmarks.revisit.report import tables, verdicts_of
 from worker.cli import main
 from worker.cloud.tiling import TilePairs
 
@@ -40,8 +39,8 @@ def result(out: Path) -> dict:
         for name in ("TEST_SEED", "VALIDATION_SEED"):
             patch.setattr(benchmark, name, 51)
         method = Method(name="heights", score=heights, stated=0.5, sha256="0123")
-        patch.setattr(benchmark, "opened", lambda *_: method)
-        settings = benchmark.BenchmarkSettings(out=out, visits=3, validation=3, made=TINY)
+        patch.setattr(benchmark, "detector_methods", lambda *_: (method,))
+        settings = benchmark.RevisitBenchmarkSettings(out=out, visits=3, validation=3, made=TINY)
         return benchmark.evaluate(settings)
 
 

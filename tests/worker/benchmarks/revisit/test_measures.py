@@ -1,4 +1,4 @@
-"""Figures of scores that are put in by hand."""
+"""Tiles of several visits side by side, and figures of scores that are put in by hand."""
 
 from __future__ import annotations
 
@@ -7,10 +7,16 @@ import json
 import numpy as np
 import pytest
 
-from worker.benchmarks.revisit.measures import measure, threshold_of
-from worker.benchmarks.revisit.methods import Method, Scored, score_visits
+from worker.benchmarks.methods import Method
+from worker.benchmarks.revisit.measures import (
+    VisitScores,
+    binned,
+    measure,
+    score_visits,
+    threshold_of,
+    tile_table,
+)
 from worker.benchmarks.revisit.plan import RevisitSettings, plan_visits
-from worker.benchmarks.revisit.tile_table import tile_table
 
 ADD, NONE = [50, 0, 0], [0, 0, 0]
 
@@ -25,7 +31,7 @@ def table(made_visit):
             plans[0].name,
             cells=[ADD, [0, 50, 0], ADD, ADD, [30, 0, 0]],
             observed=[True, True, True, False, True],
-            misfit=[0.001, 0.001, 0.03, 0.03, 0.001],
+            misalignment=[0.001, 0.001, 0.03, 0.03, 0.001],
         ),
         made_visit(plans[1].name, cells=[NONE, NONE]),
         made_visit(plans[2].name, cells=[NONE, NONE]),
@@ -34,7 +40,7 @@ def table(made_visit):
 
 
 def scored(*visits):
-    return Scored(scores=tuple(np.array(each) for each in visits), seconds=2.0)
+    return VisitScores(scores=tuple(np.array(scores) for scores in visits), seconds=2.0)
 
 
 SCORES = scored([0.9, 0.8, 0.2, np.nan, 0.7], [0.1, 0.3], [0.1, 0.6])
@@ -59,7 +65,7 @@ def test_false_alarms_are_told_apart(table):
     assert (found.unchanged_visits, found.unchanged_visits_with_alarm) == (2, 1)
 
 
-def test_recall_by_kind_of_change_and_by_misfit(table):
+def test_recall_by_kind_of_change_and_by_misalignment(table):
     groups = measure("m", SCORES, table, threshold=0.5).groups
     assert {kind: (c.true_positives, c.changed) for kind, c in groups["kind"].items()} == {
         "add": (1, 2),
@@ -100,3 +106,45 @@ def test_every_visit_is_scored_by_itself(made_visit):
     visits = [made_visit(cells=[ADD, NONE]), made_visit(cells=[NONE])]
     counted = Method(name="n", score=lambda pairs: np.full(len(pairs.current), len(pairs.current), float))
     assert score_visits(counted, visits).together.tolist() == [2, 2, 1]
+
+
+@pytest.fixture
+def office(made_visit):
+    plans = plan_visits(3, RevisitSettings(kinds=("office",)), first_seed=1)
+    visits = [
+        made_visit(
+            plans[0].name, cells=[[50, 0, 0], [0, 0, 60], [5, 0, 0]], misalignment=[0.0, 0.01, np.nan]
+        ),
+        made_visit(plans[1].name, cells=[[0, 80, 0]], observed=[False]),
+        made_visit(plans[2].name, cells=[[0, 0, 0]], misalignment=[0.3]),
+    ]
+    return tile_table(plans, visits)
+
+
+def test_tiles_stand_visit_after_visit(office):
+    assert office.visit.tolist() == [0, 0, 0, 1, 2]
+    assert office.case.tolist() == ["changed"] * 3 + ["sparse", "unchanged"]
+    assert office.changed.tolist() == [True, True, False, True, False]
+    assert office.counted.tolist() == [True, True, True, False, True]
+    assert office.slight.tolist() == [False, False, True, False, False]
+
+
+def test_groups_by_kind_hold_changed_tiles_only(office):
+    kinds = {name: np.flatnonzero(tiles).tolist() for name, tiles in office.groups()["kind"].items()}
+    assert kinds == {"add": [0], "remove": [3], "move": [1]}
+
+
+def test_groups_by_case_and_building_hold_every_tile_once(office):
+    for by in ("case", "building"):
+        assert sum(tiles.astype(int) for tiles in office.groups()[by].values()).tolist() == [1] * 5
+
+
+def test_a_bin_holds_its_lower_edge_and_what_is_not_known_lies_in_none():
+    bins = binned(np.array([0.0, 0.0025, 0.00499, 0.01, 0.5, np.nan]))
+    assert {name: np.flatnonzero(tiles).tolist() for name, tiles in bins.items()} == {
+        "0 to 0.25 cm": [0],
+        "0.25 to 0.5 cm": [1, 2],
+        "0.5 to 1 cm": [],
+        "1 to 2 cm": [3],
+        "over 2 cm": [4],
+    }

@@ -7,10 +7,12 @@ from collections import Counter
 import pytest
 
 from worker.benchmarks.revisit.plan import (
+    CASES,
     TEST_SEED,
     VALIDATION_SEED,
     RevisitSettings,
-    edit_kinds,
+    SitePlan,
+    VisitPlan,
     kinds_named,
     plan_visits,
 )
@@ -48,8 +50,19 @@ def test_visits_made_in_another_way_are_kept_apart_and_the_choice_of_buildings_i
     assert RevisitSettings(kinds=("room",)).fingerprint == SETTINGS.fingerprint
 
 
-def test_edits_take_turns():
-    assert edit_kinds(4) == ("add", "remove", "move", "add")
+def test_a_third_of_the_stops_and_no_edit_where_the_case_says_so():
+    plans = {case: VisitPlan(site=SitePlan(kind="office", seed=5), case=case) for case in CASES}
+    assert {case: plan.stops(SETTINGS) for case, plan in plans.items()} == {
+        "changed": 14,
+        "sparse": 5,
+        "unchanged": 14,
+    }
+    assert {case: plan.edits(SETTINGS) for case, plan in plans.items()} == {
+        "changed": 6,
+        "sparse": 6,
+        "unchanged": 0,
+    }
+    assert plans["changed"].seed != plans["sparse"].seed  # of the edits too
 
 
 def test_buildings_are_named_with_commas():

@@ -1,28 +1,22 @@
-"""One room that is really walked, mapped, edited and surveyed, by three stops a visit."""
+"""One room that is really walked, mapped, edited and surveyed; which tiles count; and that a visit comes back from disk."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 import numpy as np
-import pytest
 
-from worker.benchmarks.revisit import second_visit
-from worker.benchmarks.revisit.plan import RevisitSettings, SitePlan, VisitPlan, plan_visits
-from worker.benchmarks.revisit.second_visit import edited, kept_tiles, second_stops, true_changes
-from worker.benchmarks.revisit.visits import make_visits
+from worker.benchmarks.revisit import visits
+from worker.benchmarks.revisit.plan import RevisitSettings, plan_visits
+from worker.benchmarks.revisit.visits import kept_tiles, make_visits
 from worker.cloud.tiling import TileGrid
-from worker.simulation.scenes import rigid
-from worker.simulation.scenes.mesh import box
-
-OFFICE = SitePlan(kind="office", seed=5)
 
 
 def test_poses_come_from_registration_and_are_near_the_truth(walked):
     for visit in walked.values():
         assert visit.first.accepted == visit.first.scans == 3
         assert visit.second.accepted > 0
-        assert np.nanmedian(visit.misfit) < 0.03
+        assert np.nanmedian(visit.misalignment) < 0.03
         assert 0 < np.median(visit.second.metres) < 0.02  # one may well be wrong: so few stops
 
 
@@ -61,74 +55,42 @@ def test_visits_that_are_there_are_not_made_again(visits_folder: Path):
     assert made == 0
 
 
-def test_a_third_of_the_stops_and_no_edit_where_the_case_says_so():
-    settings = RevisitSettings()
-    stops = {
-        case: second_stops(VisitPlan(site=OFFICE, case=case), settings) for case in ("changed", "sparse")
-    }
-    assert stops == {"changed": 14, "sparse": 5}
-    before = OFFICE.scene()
-    assert edited(before, VisitPlan(site=OFFICE, case="unchanged"), settings)[0] is before
-    names = [
-        {item.name for item in edited(before, VisitPlan(site=OFFICE, case=case), settings)[0].objects}
-        for case in ("changed", "sparse")
-    ]
-    assert names[0] != names[1]
-
-
-def test_edits_that_leave_the_robot_no_way_are_drawn_again(monkeypatch: pytest.MonkeyPatch):
-    drawn = []
-
-    def walled_up_at_first(scene, *, seed, kinds):
-        drawn.append(seed)
-        block = box(9.0, 9.0, 2.0).at(5.0, 4.0)
-        return scene.with_added("block", block) if len(drawn) == 1 else (scene, ())
-
-    monkeypatch.setattr(second_visit, "random_edits", walled_up_at_first)
-    before = OFFICE.scene()
-    after, poses = edited(before, VisitPlan(site=OFFICE, case="changed"), RevisitSettings())
-    assert after is before
-    assert len(poses) == 14
-    assert len(set(drawn)) == 2
-
-
-def test_a_building_without_any_way_is_an_error(monkeypatch: pytest.MonkeyPatch):
-    block = box(9.0, 9.0, 2.0).at(5.0, 4.0)
-    monkeypatch.setattr(second_visit, "random_edits", lambda scene, **_: scene.with_added("block", block))
-    with pytest.raises(ValueError, match="no free place"):
-        edited(OFFICE.scene(), VisitPlan(site=OFFICE, case="sparse"), RevisitSettings())
-
-
-def test_the_truth_follows_the_scene_into_the_frame_of_the_map(bare_room):
-    after, _ = bare_room.with_added("carton", box(0.5, 0.5, 0.5).at(2.25, 3.75))
-    map_from_world = rigid(10.0, 20.0, 1.0, yaw=90)  # the carton's middle goes to (6.25, 22.25, 1.25)
-    grid = TileGrid(origin=np.array([5.5, 20.0, 1.0]), size=np.array([1.5, 1.5, 1.0]), shape=(3, 4, 3))
-    near = map_from_world @ rigid(2.25, 2.0, 0.35)
-    exists, visible = true_changes(bare_room, after, grid, map_from_world, [near], [near])
-    assert np.argwhere(exists.changed).tolist() == [[0, 1, 0]]
-    assert np.argwhere(visible.changed).tolist() == [[0, 1, 0]]
-    assert visible.cells.sum() < exists.cells.sum()  # not the side that is turned away
-
-
-def test_a_change_behind_a_screen_exists_and_is_in_nobodys_sight(bare_room):
-    screened, _ = bare_room.with_added("screen", box(0.1, 4.5, 3.0).at(3.05, 2.25))
-    after, _ = screened.with_added("carton", box(0.5, 0.5, 0.5).at(5.25, 0.75))
-    grid = TileGrid(origin=np.zeros(3), size=np.array([1.5, 1.5, 1.0]), shape=(4, 3, 3))
-    sensors = [rigid(1.0, 1.0, 0.35)]
-    exists, visible = true_changes(screened, after, grid, np.eye(4), sensors, sensors)
-    assert np.argwhere(exists.changed).tolist() == [[3, 0, 0]]
-    assert not visible.changed.any()
-
-
-def test_a_scene_in_another_frame_keeps_names_and_ids_of_its_things(bare_room):
-    moved = bare_room.placed(rigid(1.0))
-    assert [(item.name, item.object_id) for item in moved.objects] == [
-        (item.name, item.object_id) for item in bare_room.objects
-    ]
-    assert moved.bounds[0, 0] == bare_room.bounds[0, 0] + 1.0
-
-
 def test_tiles_that_the_map_keeps_are_marked():
     grid = TileGrid(origin=np.zeros(3), size=np.ones(3), shape=(2, 2, 1), lowest=(0, 0, 0))
     kept = kept_tiles(grid, np.array([[0, 1, 0]], np.int32))
     assert kept[..., 0].tolist() == [[False, True], [False, False]]
+
+
+def test_a_tile_is_changed_from_forty_cells_of_all_kinds_together(made_visit):
+    visit = made_visit(cells=[[39, 0, 0], [20, 0, 20], [0, 0, 0]])
+    assert visit.exists.tolist() == [False, True, False]
+    assert visit.kinds.tolist() == [visits.NOTHING, 0, visits.NOTHING]
+
+
+def test_the_kind_is_that_of_most_cells(made_visit):
+    assert made_visit(cells=[[30, 50, 40]]).kinds.tolist() == [1]
+
+
+def test_a_change_out_of_sight_counts_neither_way_and_neither_does_an_unobserved_tile(made_visit):
+    visit = made_visit(
+        cells=[[50, 0, 0], [50, 0, 0], [50, 0, 0], [0, 0, 0]],
+        in_sight=[[50, 0, 0], [10, 0, 0], [50, 0, 0], [0, 0, 0]],
+        observed=[True, True, False, True],
+    )
+    assert visit.changed.tolist() == [True, False, True, False]
+    assert visit.counted.tolist() == [True, False, False, True]
+
+
+def test_a_visit_comes_back_from_disk(made_visit, tmp_path: Path):
+    visit = made_visit(cells=[[50, 0, 0], [0, 7, 0]], misalignment=[0.01, np.nan], outside=3)
+    assert not visits.is_kept(visit.name, tmp_path)
+    visits.save(visit, tmp_path)
+    assert visits.is_kept(visit.name, tmp_path)
+    again = visits.load(visit.name, tmp_path)
+    assert again.name == visit.name
+    assert again.outside == 3
+    assert (again.second.scans, again.second.accepted) == (2, 1)
+    for name in ("cells", "in_sight", "misalignment", "sigma"):
+        assert np.array_equal(getattr(again, name), getattr(visit, name), equal_nan=True)
+    assert [part.tolist() for part in again.pairs.current] == [part.tolist() for part in visit.pairs.current]
+    assert again.pairs.reference.indices.tolist() == visit.pairs.reference.indices.tolist()

@@ -1,0 +1,46 @@
+"""A detector of a few lines, to see what others ask of one."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from worker.cloud.tiling import TilePairs, Tiles
+from worker.cloud.types import Arrays
+from worker.detectors.card import Card, Preprocessing
+from worker.detectors.detector import TileScores
+from worker.progress import Progress, no_progress
+
+
+class CountingDetector:
+    """Says how much the number of points changed, and keeps count of the tiles it was asked about."""
+
+    card = Card(
+        name="counting",
+        version="1",
+        detector="counting",
+        summary="",
+        threshold=0.0,
+        preprocessing=Preprocessing(
+            voxel_size=0.05, tile_size=(1.5, 1.5, 1.0), patch_points=4096, min_points=512, seed=1
+        ),
+    )
+
+    def __init__(self) -> None:
+        self.described = 0
+        self.asked: list[int] = []
+
+    def describe(self, tiles: Tiles, *, progress: Progress = no_progress) -> Arrays:
+        self.described += 1
+        return {"counts": np.array([len(points) for points in tiles.points])}
+
+    def score(
+        self, pairs: TilePairs, *, description: Arrays | None = None, progress: Progress = no_progress
+    ) -> TileScores:
+        known = self.describe(pairs.reference) if description is None else description
+        assert len(known["counts"]) == len(pairs.current)
+        self.asked.append(int(pairs.observed.sum()))
+        now = np.array([len(points) for points in pairs.current])
+        share = np.abs(now - known["counts"]) / known["counts"]
+        probabilities = np.stack([1 - share, share, 0 * share], axis=1).astype(np.float32)
+        probabilities[~pairs.observed] = np.nan
+        return TileScores(probabilities=probabilities)

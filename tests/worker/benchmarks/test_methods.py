@@ -1,0 +1,152 @@
+"""Methods: from the store, from a checkpoint, and the baselines; a map is encoded once, a tile scored once."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from tests.support.detectors import CountingDetector
+from worker.benchmarks.methods import (
+    CachedDetector,
+    baseline_methods,
+    detector_methods,
+    open_model,
+    training_log,
+)
+from worker.cloud.tiling import TileGrid, TilePairs, Tiles
+from worker.detectors.card import MODEL_STORE
+from worker.detectors.spicd_net.network import SpicdNetwork
+from worker.detectors.store import WEIGHTS, open_card, read_card, write_model
+from worker.errors import DetectorUnavailable
+from worker.training.log import LOG
+
+MODEL = "spicd-net/1"
+SOUND = {"seed": 7, "pairs": {"patch_points": 1024}}
+
+
+@pytest.fixture
+def pairs() -> TilePairs:
+    """Three tiles of 600 points, the second of which was not observed."""
+    rng = np.random.default_rng(3)
+    grid = TileGrid(origin=np.zeros(3), size=np.array([1.5, 1.5, 1.0]), shape=(3, 1, 1))
+    indices = np.array([[i, 0, 0] for i in range(3)], np.int32)
+
+    def clouds() -> tuple[np.ndarray, ...]:
+        corners = grid.lower(indices)
+        return tuple((corner + rng.random((600, 3)) * grid.size).astype(np.float32) for corner in corners)
+
+    return TilePairs(
+        reference=Tiles(grid=grid, indices=indices, points=clouds()),
+        current=clouds(),
+        observed=np.array([True, False, True]),
+    )
+
+
+def test_a_model_of_the_store_comes_with_the_threshold_and_the_weights_of_its_card() -> None:
+    (method,) = detector_methods(MODEL_STORE, MODEL, ())
+    card = open_card(MODEL_STORE, MODEL)
+    assert (method.name, method.stated, method.sha256) == (MODEL, card.threshold, card.sha256)
+
+
+def test_a_checkpoint_scores_with_its_own_weights_and_states_no_threshold(
+    tmp_path: Path, pairs: TilePairs
+) -> None:
+    path = tmp_path / "run" / "best.pt"
+    path.parent.mkdir()
+    torch.manual_seed(1)
+    torch.save({"network": SpicdNetwork().state_dict(), "settings": SOUND}, path)
+    (method,) = detector_methods(MODEL_STORE, MODEL, (path,))
+    assert (method.name, method.stated) == ("run/best.pt", None)
+    scores = method.score(pairs)
+    assert np.isnan(scores).tolist() == (~pairs.observed).tolist()
+    (shipped,) = detector_methods(MODEL_STORE, MODEL, ())
+    assert not np.allclose(scores, shipped.score(pairs), equal_nan=True)
+
+
+def test_a_checkpoint_brings_its_weights_patch_size_and_seed(tmp_path: Path) -> None:
+    torch.save({"settings": SOUND, "network": SpicdNetwork().state_dict()}, tmp_path / "fresh.pt")
+    card = open_model(MODEL_STORE, MODEL, tmp_path / "fresh.pt").card
+    shipped = open_card(MODEL_STORE, MODEL)
+    assert (card.preprocessing.patch_points, card.preprocessing.seed) == (1024, 7)
+    assert (card.name, card.version) == ("spicd-net", "fresh")
+    assert card.preprocessing.tile_size == shipped.preprocessing.tile_size
+    assert card.threshold == shipped.threshold
+    assert card.sha256 != shipped.sha256
+
+
+def test_a_checkpoint_has_the_sha256_of_the_model_that_is_made_of_it(tmp_path: Path) -> None:
+    weights = SpicdNetwork().state_dict()
+    torch.save({"settings": SOUND, "network": weights}, tmp_path / "fresh.pt")
+    measured = open_model(MODEL_STORE, MODEL, tmp_path / "fresh.pt").card
+    made = write_model(tmp_path / "model", measured, weights)
+    assert measured.sha256 == hashlib.sha256((made / WEIGHTS).read_bytes()).hexdigest()
+    assert read_card(made) == measured
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"no archive at all",
+        {"network": {}},
+        {"network": {"layer": 1}, "settings": SOUND},
+        {"network": {"weight": torch.zeros(1)}, "settings": SOUND},  # of another network
+    ],
+)
+def test_what_is_no_checkpoint_is_refused(tmp_path: Path, content: bytes | dict[str, Any]) -> None:
+    path = tmp_path / "odd.pt"
+    if isinstance(content, bytes):
+        path.write_bytes(content)
+    else:
+        torch.save(content, path)
+    with pytest.raises(DetectorUnavailable, match=r"odd\.pt is no checkpoint of spicd-worker train"):
+        open_model(MODEL_STORE, MODEL, path)
+
+
+def test_a_missing_checkpoint_is_named(tmp_path: Path) -> None:
+    with pytest.raises(DetectorUnavailable, match=r"no checkpoint at .*none\.pt"):
+        open_model(MODEL_STORE, MODEL, tmp_path / "none.pt")
+
+
+def test_the_log_is_that_beside_the_model_or_beside_the_checkpoint(tmp_path: Path) -> None:
+    model, run = tmp_path / "spicd-net" / "7", tmp_path / "run"
+    for folder, loss in ((model, 0.5), (run, 0.25)):
+        folder.mkdir(parents=True)
+        (folder / LOG).write_text(f"epoch,train_loss\n1,{loss}\n")
+    assert training_log(tmp_path, "spicd-net/7", None) == [{"epoch": 1, "train_loss": 0.5}]
+    assert training_log(tmp_path, "spicd-net/7", run / "best.pt") == [{"epoch": 1, "train_loss": 0.25}]
+
+
+@pytest.mark.parametrize("text", [None, "epoch,train_loss\n"])
+def test_without_a_log_or_an_epoch_in_it_there_is_none(tmp_path: Path, text: str | None) -> None:
+    if text is not None:
+        (tmp_path / LOG).write_text(text)
+    assert training_log(tmp_path, "spicd-net/7", tmp_path / "best.pt") is None
+
+
+def test_a_map_is_encoded_once_and_another_map_anew(pairs: TilePairs) -> None:
+    same = Tiles(
+        grid=pairs.reference.grid,
+        indices=pairs.reference.indices.copy(),
+        points=tuple(points.copy() for points in pairs.reference.points),
+    )
+    moved = replace(same, points=tuple(points + np.float32(0.01) for points in same.points))
+    detector = CountingDetector()
+    cached = CachedDetector(detector=detector)
+    for reference in (pairs.reference, same, moved):
+        assert np.isnan(cached.score(replace(pairs, reference=reference))).tolist() == [False, True, False]
+    assert detector.described == 2
+    assert detector.asked == [2, 2]  # the second time every tile was known
+
+
+def test_every_baseline_scores_observed_tiles_and_no_others(pairs: TilePairs) -> None:
+    methods = baseline_methods()
+    assert {"C2C (mean)", "M3C2-approx"} <= {method.name for method in methods}
+    for method in methods:
+        assert np.isnan(method.score(pairs)).tolist() == (~pairs.observed).tolist()
