@@ -6,7 +6,7 @@ import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-from worker.cloud.tiling import TileGrid, inside_tiles
+from worker.cloud.tiling import TileGrid
 from worker.cloud.types import Indices
 from worker.pipeline.flow import (
     BuiltMap,
@@ -75,6 +75,6 @@ def renew_map(
 
 def without(scan: RegisteredScan, grid: TileGrid, tiles: Indices) -> RegisteredScan:
     """The scan less its points in these tiles (T, 3)."""
-    stays = ~inside_tiles(scan.points, grid, tiles)
+    stays = grid.locate_among(scan.points, tiles) < 0
     colors = None if scan.colors is None else scan.colors[stays]
     return replace(scan, points=scan.points[stays], colors=colors)

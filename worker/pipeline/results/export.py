@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from worker.cloud.formats.ply import write_ply
 from worker.cloud.tiling import tile_id
-from worker.cloud.types import Colors, Points
+from worker.cloud.types import Colors
 from worker.pipeline.mapping.fusion import CurrentMap
 from worker.pipeline.results.changes import ChangeSet, TileState
 
@@ -82,7 +82,8 @@ def write_coloured_cloud(path: Path, current: CurrentMap, changes: ChangeSet) ->
     Scalar fields: `change_score` (float; NaN where not scored) and `tile_state` (uchar; TileState, or 255
     outside every reference tile).
     """
-    tile = _tile_of_points(current.points, changes)
+    tiles = changes.pairs.reference
+    tile = tiles.grid.locate_among(current.points, tiles.indices)
     inside = tile >= 0
     state = np.full(len(tile), NOT_IN_A_TILE, np.uint8)
     state[inside] = changes.states[tile[inside]]
@@ -94,18 +95,6 @@ def write_coloured_cloud(path: Path, current: CurrentMap, changes: ChangeSet) ->
         colors=_colors(state),
         scalars={"change_score": score, "tile_state": state},
     )
-
-
-def _tile_of_points(points: Points, changes: ChangeSet) -> NDArray[np.int64]:
-    """(N,) row of the tile that holds each point, -1 where none does."""
-    tiles = changes.pairs.reference
-    table = np.full(tiles.grid.shape, -1, np.int64)
-    table[tuple((tiles.indices - tiles.grid.lowest).T)] = np.arange(len(tiles.indices))
-    index = np.floor((points - tiles.grid.origin) / tiles.grid.size).astype(np.int64) - tiles.grid.lowest
-    inside = np.all((index >= 0) & (index < tiles.grid.shape), axis=1)
-    found = np.full(len(points), -1, np.int64)
-    found[inside] = table[tuple(index[inside].T)]
-    return found
 
 
 def _colors(state: NDArray[np.uint8]) -> Colors:

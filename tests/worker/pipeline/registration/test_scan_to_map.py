@@ -118,7 +118,12 @@ def test_a_scan_that_shares_only_a_floor_with_the_map_is_refused(room: Room) -> 
     floor = points[inner & (np.abs(points[:, 2]) < 0.04)]
     target = surface_of(Voxels.of(floor, size=0.05), SETTINGS)
     start = room.after[0].world_from_sensor
-    lenient = {"min_overlap_near_prior": 0.05, "min_inlier_ratio": 0.5, "prior_distance": 99.0, "prior_angle": 3.2}
+    lenient = {
+        "min_overlap_near_prior": 0.05,
+        "min_inlier_ratio": 0.5,
+        "prior_distance": 99.0,
+        "prior_angle": 3.2,
+    }
     settings = SETTINGS.model_copy(update=lenient)
     with pytest.raises(ScanRejected, match="shares with the map leaves a motion free"):
         register(_ready(room.scan()), target, start=start, settings=settings)

@@ -111,7 +111,9 @@ def test_what_stands_in_seen_space_is_not_accepted_though_the_surfaces_agree(
     pair: tuple[PreparedScan, PreparedScan, Matrix4],
 ) -> None:
     source, target, truth = pair
-    strict = SETTINGS.model_copy(update={"max_free_space_violation_near_prior": 0.0, "max_free_space_violation": 0.0})
+    strict = SETTINGS.model_copy(
+        update={"max_free_space_violation_near_prior": 0.0, "max_free_space_violation": 0.0}
+    )
     assert target.image is not None
     farther = replace(target, image=replace(target.image, ranges=target.image.ranges * 1.5))
     found = register_pair((0, 1), source, farther, prior=truth, settings=strict)
