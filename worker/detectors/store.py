@@ -17,6 +17,7 @@ from worker.detectors.card import Card
 from worker.detectors.detector import Detector
 from worker.detectors.spicd_net.detector import SpicdNet
 from worker.errors import DetectorUnavailable
+from worker.files import write_text
 
 Device = Literal["auto", "cpu", "cuda"]
 Weights = dict[str, torch.Tensor]
@@ -120,9 +121,7 @@ def write_model(folder: Path, card: Card, weights: Weights) -> Path:
 def write_card(folder: Path, card: Card) -> None:
     """`card.json`, aside and renamed. Raises ValueError for a figure that JSON has not, such as NaN."""
     text = json.dumps(card.model_dump(mode="json"), indent=2, allow_nan=False)
-    aside = folder / "card.json.tmp"
-    aside.write_text(text + "\n", encoding="utf-8")
-    aside.replace(folder / "card.json")
+    write_text(folder / "card.json", text + "\n")
 
 
 def weights_content(weights: Weights) -> bytes:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from torch import Tensor
 from worker.detectors.spicd_net.chamfer import chamfer_statistics
 from worker.detectors.spicd_net.layers import PooledLinear
 from worker.detectors.spicd_net.network import PairOutput, SpicdNetwork
+from worker.files import write_atomically
 from worker.progress import Progress, no_progress
 from worker.training.dataset import TileSet, load_tiles, split_tiles
 from worker.training.head import train_head
@@ -138,7 +140,7 @@ class Run:
             "head": asdict(found),
             "settings": asdict(self._settings),
         }
-        write_aside(path, {**state, **more})
+        write_atomically(path, partial(torch.save, {**state, **more}))
 
     def resume(self) -> None:
         """Take up the last checkpoint, if the folder has one."""
@@ -247,7 +249,7 @@ class Run:
             "best_epoch": self._best_epoch,
             **more,
         }
-        write_aside(self._out / name, state)
+        write_atomically(self._out / name, partial(torch.save, state))
 
     def _log(self, trained: _Trained, found: Measured) -> EpochRow:
         row = EpochRow(
@@ -268,13 +270,6 @@ class Run:
 def _of_epochs(settings: dict[str, Any]) -> dict[str, Any]:
     """Without what only comes after the last epoch, and may be asked for then."""
     return {name: value for name, value in settings.items() if not name.startswith("head_")}
-
-
-def write_aside(path: Path, state: Mapping[str, Any]) -> None:
-    """Written beside and moved, so that a stop in between leaves the old file whole."""
-    partial = path.with_name(f"{path.name}.partial")
-    torch.save(dict(state), partial)
-    partial.replace(path)
 
 
 def _encoder(network: Mapping[str, Tensor]) -> dict[str, Tensor]:

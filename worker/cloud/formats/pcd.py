@@ -28,6 +28,7 @@ from worker.cloud.formats.fields import (
 )
 from worker.cloud.types import Colors, Matrix4, Points
 from worker.errors import ScanError, ScanTooLarge
+from worker.files import write_bytes
 
 _KEYWORDS = (
     "VERSION",
@@ -272,11 +273,7 @@ def write_pcd(
         f"WIDTH {len(rows)}\nHEIGHT 1\nVIEWPOINT {_viewpoint_words(np.eye(4) if sensor_pose is None else sensor_pose)}\n"
         f"POINTS {len(rows)}\nDATA binary\n"
     )
-    aside = path.with_name(path.name + ".tmp")
-    with aside.open("wb") as file:
-        file.write(header.encode("ascii"))
-        file.write(rows.tobytes())
-    aside.replace(path)
+    write_bytes(path, header.encode("ascii"), rows.tobytes())
 
 
 def _viewpoint_words(pose: Matrix4) -> str:

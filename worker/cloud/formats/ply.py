@@ -29,6 +29,7 @@ from worker.cloud.formats.fields import (
 )
 from worker.cloud.types import Colors, Points
 from worker.errors import ScanError, ScanTooLarge
+from worker.files import write_bytes
 
 SHORT_NAMES = {
     "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4", "double": "f8",
@@ -273,11 +274,7 @@ def write_ply(
     rows = np.empty(len(points), np.dtype([(name, column.dtype) for name, column in columns.items()]))
     for name, column in columns.items():
         rows[name] = column
-    aside = path.with_name(path.name + ".tmp")
-    with aside.open("wb") as file:
-        file.write("\n".join([*header, "end_header", ""]).encode("ascii"))
-        file.write(rows.tobytes())
-    aside.replace(path)
+    write_bytes(path, "\n".join([*header, "end_header", ""]).encode("ascii"), rows.tobytes())
 
 
 def _scalar(name: str, values: NDArray[Any]) -> NDArray[Any]:

@@ -16,6 +16,7 @@ from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
 from worker.cloud.types import Points
+from worker.files import write_atomically
 from worker.pipeline.mapping.fusion import CurrentMap
 from worker.pipeline.results.changes import ChangeSet, TileState
 from worker.pipeline.results.export import STATE_COLORS
@@ -124,10 +125,8 @@ def draw_picture(
     _draw_tiles(axes, changes, tile_inches=float(changes.pairs.reference.grid.size[0]) * scale)
     draw_scale_bar(figure, extent, scale)
     dress(figure, axes, extent, changes, title)
-    aside = path.with_name(path.name + ".tmp")
     with rc_context({"hatch.linewidth": HATCH_WIDTH}):
-        figure.savefig(aside, format="png")
-    aside.replace(path)
+        write_atomically(path, lambda aside: figure.savefig(aside, format="png"))
 
 
 def _extent(changes: ChangeSet) -> Extent:
