@@ -45,7 +45,13 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "worker.reporting": ("worker.errors",),
     "worker.cloud": ("worker.errors", "worker.files", "worker.threads"),
     "worker.metrics": ("worker.cloud",),
-    "worker.detectors": ("worker.cloud", "worker.errors", "worker.files", "worker.progress"),
+    "worker.detectors": (
+        "worker.cloud",
+        "worker.errors",
+        "worker.files",
+        "worker.progress",
+        "worker.threads",
+    ),
     "worker.pipeline.registration": (
         "worker.cloud",
         "worker.errors",

@@ -1,4 +1,4 @@
-"""Counts of tiles right and wrong, and the ratios made of them (paper, Section 4.3).
+"""Counts of tiles or pairs right and wrong, and the ratios made of them (paper, Section 4.3).
 
 A tile is flagged where its score is above the threshold (Section 3.9.4). A tile without a score (NaN) is never
 flagged: nobody was told of it.
@@ -71,6 +71,11 @@ class Confusion:
         """NaN where everything changed."""
         return _ratio(self.false_positives, self.false_positives + self.true_negatives)
 
+    def precision_at(self, prevalence: float) -> float:
+        """Return the precision where such a share of the tiles (0..1) is changed, at the same recall and rate of alarms."""
+        hits, alarms = prevalence * self.recall, (1 - prevalence) * self.false_positive_rate
+        return hits / (hits + alarms) if hits + alarms > 0 else 0.0
+
     def figures(self) -> dict[str, float | int | None]:
         """All of the above, JSON-ready: None where a ratio has no meaning."""
         ratios = {
@@ -113,23 +118,6 @@ def pooled(counts: Iterable[Confusion]) -> Confusion:
 def _ratio(part: int, whole: int) -> float:
     return part / whole if whole else float("nan")
 
-
-__all__ = [
-    "PAPER_SWEEP",
-    "Confusion",
-    "Operating",
-    "PrecisionRecall",
-    "Roc",
-    "Scores",
-    "Sweep",
-    "all_thresholds",
-    "best_f1",
-    "confusion",
-    "pooled",
-    "precision_recall",
-    "roc",
-    "sweep",
-]
 
 #: Thresholds that the paper sweeps (Section 3.9.3).
 PAPER_SWEEP: Floats = np.round(np.arange(0.10, 0.905, 0.01), 2)
@@ -258,3 +246,33 @@ def _ratios(part: NDArray[np.int64], whole: NDArray[np.int64] | int) -> Floats:
     total = np.broadcast_to(np.asarray(whole, np.float64), part.shape)
     ratios: Floats = np.divide(part, total, out=np.full(part.shape, np.nan), where=total > 0)
     return ratios
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ClassFigures:
+    """How a classifier of pairs does on three classes."""
+
+    loss: float
+    accuracy: float
+    precision: tuple[float, float, float]  #: of each class; 0 for a class never answered
+    recall: tuple[float, float, float]
+
+    @property
+    def rank(self) -> tuple[float, float]:
+        """Which checkpoint is better: accuracy, then the worst class's precision (paper, Section 3.8)."""
+        return self.accuracy, min(self.precision)
+
+
+def class_figures(probabilities: NDArray[np.float32], labels: NDArray[np.int64], loss: float) -> ClassFigures:
+    """Count the answers (n, 3) beside the labels (n,)."""
+    answers = np.zeros((3, 3), dtype=np.int64)  # true class, answered class
+    np.add.at(answers, (labels, probabilities.argmax(axis=1)), 1)
+    hits = np.diag(answers)
+    precision = (hits / np.maximum(answers.sum(axis=0), 1)).tolist()
+    recall = (hits / np.maximum(answers.sum(axis=1), 1)).tolist()
+    return ClassFigures(
+        loss=loss,
+        accuracy=float(hits.sum() / max(len(labels), 1)),
+        precision=(precision[0], precision[1], precision[2]),
+        recall=(recall[0], recall[1], recall[2]),
+    )

@@ -9,7 +9,7 @@ import numpy as np
 from worker.cloud.formats.scan import Scan
 from worker.cloud.types import Matrix4, Points
 from worker.cloud.voxels import Voxels
-from worker.detectors.detector import TileScores
+from worker.detectors.detector import Detection
 from worker.pipeline.registration.icp import Surface
 from worker.pipeline.registration.preprocessing import surface_of
 from worker.pipeline.registration.settings import RegistrationSettings
@@ -49,5 +49,5 @@ def simulated_room() -> Room:
     return Room(before=before, after=after, target=surface_of(fused, RegistrationSettings()))
 
 
-def scores_of(*rows: tuple[float, float, float]) -> TileScores:
-    return TileScores(probabilities=np.array(rows, np.float32))
+def scores_of(*rows: tuple[float, float, float]) -> Detection:
+    return Detection(probabilities=np.array(rows, np.float32))

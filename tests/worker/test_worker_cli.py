@@ -237,7 +237,7 @@ def _save_small_set(path: Path) -> None:
     tiles = TileSet(
         points_a=clouds,
         points_b=clouds,
-        looks=(),
+        observations=(),
         centres=np.array([[4.0 * number, 0, 0] for number in range(20)]),
         buildings=np.zeros(20, np.int32),
         tile_size=(1.5, 1.5, 1.0),

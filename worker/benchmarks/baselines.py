@@ -7,7 +7,6 @@ tile that was not observed gets NaN. Scores are in metres or shares; each has a 
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from typing import Any, Literal, Protocol
@@ -19,9 +18,11 @@ from scipy.spatial import cKDTree
 from worker.cloud.normals import estimate_normals
 from worker.cloud.tiling import TilePairs, Tiles
 from worker.cloud.types import Floats, Normals, Points
+from worker.detectors.c2c.detector import tile_distances
+from worker.detectors.c2c.distances import FARTHEST, distances_both_ways, split_by_tile, tile_means
+from worker.detectors.comparison import Comparison
 from worker.threads import query_threads
 
-FARTHEST = 1.0  #: metres; no nearest distance counts as more, and none is searched beyond
 FAR = 0.10  #: metres; two voxels of the fused maps
 NORMAL_RADIUS, NORMAL_NEIGHBORS = 0.15, 30  #: metres; of the plane that M3C2-approx puts through a point
 
@@ -54,14 +55,12 @@ class CloudToCloud:
         return {"mean": "C2C (mean)", "far": "C2C (share over 10 cm)"}[self.statistic]
 
     def score(self, pairs: TilePairs) -> Floats:
-        reference, current = pairs.reference.points, pairs.current
-        ways = (_nearest(current, reference), _nearest(reference, current))
-        return _where_observed(np.fmax(*(self._by_tile(distances) for distances in ways)), pairs)
-
-    def _by_tile(self, distances: Sequence[Floats]) -> Floats:
+        comparison = Comparison.of_tiles(pairs)
         if self.statistic == "mean":
-            return _means(distances)
-        return _means([(part > FAR).astype(np.float64) for part in distances])
+            return _where_observed(tile_distances(comparison), pairs)
+        ways = distances_both_ways(comparison)
+        shares = (tile_means([(part > FAR).astype(np.float64) for part in way]) for way in ways)
+        return _where_observed(np.fmax(*shares), pairs)
 
 
 @dataclass(kw_only=True, slots=True)
@@ -88,32 +87,13 @@ class M3c2Approximation:
         off = np.full(len(moved), FARTHEST)
         normals = self._normals(pairs.reference, planes)[nearest[met]]
         off[met] = np.abs(np.einsum("ij,ij->i", moved[met] - planes[nearest[met]], normals))
-        return _where_observed(_means(_parts(off, pairs.current)), pairs)
+        return _where_observed(tile_means(split_by_tile(off, pairs.current)), pairs)
 
     def _normals(self, reference: Tiles, points: Points) -> Normals:
         if self._known is None or self._known[0] is not reference:
             found = estimate_normals(points, radius=NORMAL_RADIUS, max_neighbors=NORMAL_NEIGHBORS)
             self._known = (reference, found)
         return self._known[1]
-
-
-def _nearest(points: Sequence[Points], others: Sequence[Points]) -> list[Floats]:
-    """For each tile, (n,) metres from its points to the nearest of all the others' points, at most FARTHEST."""
-    sought, cloud = np.concatenate(points), np.concatenate(others)
-    if not len(cloud):
-        return [np.full(len(part), FARTHEST) for part in points]
-    distance, _ = cKDTree(cloud).query(sought, distance_upper_bound=FARTHEST, workers=query_threads())
-    return _parts(np.minimum(distance, FARTHEST), points)
-
-
-def _parts(values: Floats, tiles: Sequence[Points]) -> list[Floats]:
-    """(N,) -> one array a tile, as its points."""
-    return list(np.split(values, np.cumsum([len(part) for part in tiles])[:-1]))
-
-
-def _means(parts: Sequence[Floats]) -> Floats:
-    """(T,) NaN for a tile without points."""
-    return np.array([part.mean() if len(part) else np.nan for part in parts])
 
 
 def _where_observed(scores: Floats, pairs: TilePairs) -> Floats:

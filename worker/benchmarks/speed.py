@@ -20,17 +20,18 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from worker.benchmarks.plain_inference import plain_scores
+from worker.cloud import npz
 from worker.cloud.formats.pcd import write_pcd
 from worker.cloud.poses import difference
-from worker.cloud.tiling import TilePairs, Tiles, cut, grid_over, pair_tiles
+from worker.cloud.tiling import TilePairs, Tiles, grid_over, pair_tiles
 from worker.cloud.types import Arrays, Matrix4
 from worker.cloud.voxels import Voxels
 from worker.detectors.card import MODEL_STORE
-from worker.detectors.spicd_net.detector import SpicdNet
+from worker.detectors.comparison import Comparison, side_of
+from worker.detectors.detector import Detector
 from worker.detectors.store import open_detector
 from worker.pipeline import archive
-from worker.pipeline.flow import PipelineSettings
+from worker.pipeline.flow import compare
 from worker.pipeline.mapping.frame import fitted
 from worker.pipeline.mapping.fusion import ReferenceMap, current_map, fuse, reference_map
 from worker.pipeline.mapping.map_registration import register_map_scans
@@ -39,6 +40,7 @@ from worker.pipeline.registration.results import ScanFile, ScanResult, placed
 from worker.pipeline.results.changes import decide
 from worker.pipeline.results.export import tile_results, write_coloured_cloud
 from worker.pipeline.results.picture import draw_picture
+from worker.pipeline.settings import PipelineSettings
 from worker.progress import Progress, no_progress
 from worker.simulation.scenes import corridor
 from worker.simulation.sensor import SimulatedScan
@@ -77,8 +79,6 @@ class Stopwatch:
 def bench(settings: BenchSettings, progress: Progress = no_progress) -> dict[str, Any]:
     """Run everything once and return the figures, JSON-ready; seconds unless the name says otherwise."""
     detector = open_detector(settings.model_store, settings.model)
-    if not isinstance(detector, SpicdNet):
-        raise ValueError(f"bench compares ways of running SPICD-Net; {settings.model} is another detector")
     pipeline = PipelineSettings().for_model(detector.card.preprocessing)
     with TemporaryDirectory(prefix="spicd-bench-") as folder:
         scratch = Path(folder)
@@ -115,7 +115,7 @@ def bench(settings: BenchSettings, progress: Progress = no_progress) -> dict[str
 class _Built:
     reference: ReferenceMap
     tiles: Tiles
-    description: Arrays
+    embedding: Arrays
     outcomes: tuple[ScanResult, ...]
     seconds: dict[str, float]
 
@@ -134,10 +134,10 @@ def _written(path: Path, scan: SimulatedScan) -> ScanFile:
     return ScanFile(name=path.name, path=path, pose=scan.prior)
 
 
-def _map(files: list[ScanFile], detector: SpicdNet, settings: PipelineSettings, progress: Progress) -> _Built:
+def _map(files: list[ScanFile], detector: Detector, settings: PipelineSettings, progress: Progress) -> _Built:
     watch = Stopwatch()
     with watch.stage("read and register"):
-        outcomes = register_map_scans(files, settings=settings.placing, progress=progress).outcomes
+        outcomes = register_map_scans(files, settings=settings.multi_scan, progress=progress).outcomes
     with watch.stage("read and fuse"):
         accepted = (
             placed(file, outcome.placement, max_points=settings.max_scan_points)
@@ -146,48 +146,48 @@ def _map(files: list[ScanFile], detector: SpicdNet, settings: PipelineSettings, 
         )
         fused = fuse(accepted, voxel_size=settings.registration.voxel_size)
     with watch.stage("normals"):
-        reference = reference_map(fused, settings=settings.registration)
+        grid = grid_over(fused.points, tile_size=settings.tiling.tile_size, voxel_size=fused.size)
+        reference = reference_map(fused, grid=grid, settings=settings.registration)
     with watch.stage("tile"):
-        grid = grid_over(reference.points, tile_size=settings.tiling.tile_size, voxel_size=fused.size)
-        tiles = cut(reference.points, grid, min_points=settings.tiling.min_points)
-    with watch.stage("describe"):
-        description = detector.describe(tiles, progress=progress)
+        tiles = reference.tiles(min_points=settings.tiling.min_points)
+    with watch.stage("encode"):
+        embedding = detector.encode_reference(side_of(tiles), tiles, progress=progress)
     return _Built(
         reference=reference,
         tiles=tiles,
-        description=description,
+        embedding=embedding,
         outcomes=outcomes,
         seconds=watch.seconds,
     )
 
 
 def _survey(
-    file: ScanFile, built: _Built, detector: SpicdNet, settings: PipelineSettings, scratch: Path
+    file: ScanFile, built: _Built, detector: Detector, settings: PipelineSettings, scratch: Path
 ) -> dict[str, Any]:
     """A survey of one scan from file to files, as the jobs run it."""
     watch = Stopwatch()
-    archive.save_reference(scratch / "reference.npz", built.reference)
+    npz.save(scratch / "reference.npz", built.reference)
     with watch.stage("load map"):
         reference = archive.load_reference(scratch / "reference.npz")
         surface = reference.surface()
     with watch.stage("read and register"):
-        (outcome,) = register_survey_scans([file], surface, settings=settings.placing)
+        (outcome,) = register_survey_scans([file], surface, settings=settings.multi_scan)
     if outcome.placement is None:
         return {"rejected": outcome.reason, **watch.seconds}
     with watch.stage("fuse and tile"):
         scan = placed(file, outcome.placement, max_points=settings.max_scan_points)
         current = current_map([scan], voxel_size=reference.voxel_size)
-        pairs = pair_tiles(built.tiles, current.points, settings=settings.tiling)
+        comparison = compare(reference, current, settings=settings)
     with watch.stage("score"):
-        scores = detector.score(pairs, description=built.description)
+        detection = detector.detect(comparison, embedding=built.embedding)
     with watch.stage("decide and export"):
-        changes = decide(pairs, scores, threshold=detector.card.threshold)
+        changes = decide(comparison.tile_pairs, detection, threshold=detector.card.threshold)
         write_coloured_cloud(scratch / "cloud.ply", current, changes)
         tile_results(changes)
     with watch.stage("picture"):
         draw_picture(scratch / "picture.png", reference.points, current, changes, title="bench")
     total = sum(watch.seconds.values())
-    return {"observed_tiles": int(pairs.observed.sum()), **watch.seconds, "total": total}
+    return {"observed_tiles": int(comparison.observed.sum()), **watch.seconds, "total": total}
 
 
 def _full_visit(
@@ -239,13 +239,13 @@ def save(figures: dict[str, Any], path: Path) -> None:
     aside.replace(path)
 
 
-PLAIN = "plain"  #: what the others are held against
+PLAIN = "uncached"  #: what the others are held against
 
 Way = Callable[[], NDArray[np.float32]]  #: to (T, 3) probabilities
 
 
 def network_bench(
-    pairs: TilePairs, detector: SpicdNet, *, repeats: int, progress: Progress = no_progress
+    pairs: TilePairs, detector: Detector, *, repeats: int, progress: Progress = no_progress
 ) -> dict[str, Any]:
     """Run each way `repeats` times, in turn; JSON-ready, seconds for all pairs.
 
@@ -265,7 +265,7 @@ def network_bench(
         "tiles": len(pairs.observed),
         "distinct_points_per_tile": round(float(np.mean([len(points) for points in pairs.current]))),
         "seconds": {name: _spread(values) for name, values in seconds.items()},
-        "times_faster_than_plain": {
+        "times_faster_than_uncached": {
             name: round(plain / float(np.median(values)), 1) for name, values in seconds.items()
         },
         "largest_score_difference": max(
@@ -274,14 +274,13 @@ def network_bench(
     }
 
 
-def ways(pairs: TilePairs, detector: SpicdNet) -> dict[str, Way]:
+def ways(pairs: TilePairs, detector: Detector) -> dict[str, Way]:
     """The slowest first; each spares something that the one before does not."""
-    description = detector.describe(pairs.reference)
+    comparison = Comparison.of_tiles(pairs)
+    embedding = detector.encode_reference(comparison.reference, pairs.reference)
     return {
-        PLAIN: lambda: plain_scores(detector, pairs),
-        "uncached_padded": lambda: detector.score(pairs, padded=True).probabilities,
-        "uncached_distinct": lambda: detector.score(pairs).probabilities,
-        "cached_distinct": lambda: detector.score(pairs, description=description).probabilities,
+        PLAIN: lambda: detector.detect(comparison).probabilities,
+        "cached": lambda: detector.detect(comparison, embedding=embedding).probabilities,
     }
 
 

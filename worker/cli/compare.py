@@ -9,15 +9,16 @@ from pathlib import Path
 from typing import Any
 
 from worker.detectors.detector import Detector
-from worker.pipeline.flow import (
+from worker.pipeline import (
     BuiltMap,
     LocatedSurvey,
     PipelineSettings,
+    ScanFile,
     build_map,
     detect,
     locate_survey,
 )
-from worker.pipeline.registration.results import ScanFile, ScanResult
+from worker.pipeline.registration.results import ScanResult
 from worker.pipeline.results.changes import ChangeSet
 from worker.pipeline.results.export import feature_collection, tile_results, write_coloured_cloud
 from worker.pipeline.results.picture import draw_picture
@@ -25,7 +26,7 @@ from worker.progress import Progress, no_progress
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Comparison:
+class TwoVisits:
     """Two visits, and what is different."""
 
     built: BuiltMap
@@ -40,7 +41,7 @@ def compare(
     *,
     threshold: float | None = None,
     progress: Progress = no_progress,
-) -> Comparison:
+) -> TwoVisits:
     """The whole method on files. Raises PipelineError, and OSError for a file that is not there."""
     settings = PipelineSettings.model_validate({}).for_model(detector.card.preprocessing)
     earlier, later = (
@@ -48,14 +49,12 @@ def compare(
     )
     on_map, on_survey = _titled("map", progress), _titled("survey", progress)
     built = build_map(earlier, settings=settings, progress=on_map)
-    located = locate_survey(later, built.reference, built.tiles, settings=settings, progress=on_survey)
-    changes = detect(located.pairs, detector, threshold=threshold, progress=on_survey)
-    return Comparison(built=built, located=located, changes=changes)
+    located = locate_survey(later, built.reference, settings=settings, progress=on_survey)
+    changes = detect(located.comparison, detector, threshold=threshold, progress=on_survey)
+    return TwoVisits(built=built, located=located, changes=changes)
 
 
-def write_results(
-    found: Comparison, out: Path, *, map_id: str, survey_id: str, model: str
-) -> dict[str, Path]:
+def write_results(found: TwoVisits, out: Path, *, map_id: str, survey_id: str, model: str) -> dict[str, Path]:
     """`tiles.geojson`, `cloud.ply` and `picture.png` in the folder `out`, by what they are. Raises OSError."""
     out.mkdir(parents=True, exist_ok=True)
     files = {"tiles": out / "tiles.geojson", "cloud": out / "cloud.ply", "picture": out / "picture.png"}
@@ -72,7 +71,7 @@ def write_results(
     return files
 
 
-def document(found: Comparison, files: dict[str, Path], *, model: str) -> dict[str, Any]:
+def document(found: TwoVisits, files: dict[str, Path], *, model: str) -> dict[str, Any]:
     """The comparison, JSON-ready; changed tiles most certain first, metres, frame of the first reference."""
     changed = [tile for tile in tile_results(found.changes) if tile.state == "changed"]
     return {

@@ -14,7 +14,7 @@ The type of a field says how it is kept:
 from __future__ import annotations
 
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import fields, is_dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -66,11 +66,11 @@ def save_arrays(path: Path, arrays: Arrays) -> None:
     write_atomically(path, write)
 
 
-def load_arrays(path: Path) -> Arrays:
-    """Read what `save_arrays` kept. Raises OSError, and ValueError, which names the file, for any other file."""
+def load_arrays(path: Path, names: Collection[str] | None = None) -> Arrays:
+    """Read what `save_arrays` kept, or of it the arrays of these names. Raises OSError, and ValueError, which names the file, for any other file."""
     try:
         with np.load(path, allow_pickle=False) as archive:
-            return dict(archive)
+            return {name: archive[name] for name in archive if names is None or name in names}
     except (ValueError, TypeError, EOFError, zipfile.BadZipFile) as unsound:
         raise ValueError(f"{path} is no archive of arrays: {unsound}") from unsound
 

@@ -4,26 +4,50 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import pydantic
 import torch
+from pydantic import BaseModel
 from safetensors import SafetensorError
 from safetensors.torch import load, save
 
+from worker.detectors.c2c.detector import CloudToCloud
 from worker.detectors.card import Card
 from worker.detectors.detector import Detector
 from worker.detectors.spicd_net.detector import SpicdNet
-from worker.errors import DetectorUnavailable
+from worker.errors import DetectorUnavailable, TrainingFailed
 from worker.files import write_text
 
 Device = Literal["auto", "cpu", "cuda"]
 Weights = dict[str, torch.Tensor]
 
-#: A new detector is one class and one entry here: card, weights and device to Detector.
-DETECTORS: dict[str, Callable[[Card, Weights, torch.device], Detector]] = {"spicd-net": SpicdNet.load}
+
+class DetectorClass(Protocol):
+    """How a detector is opened."""
+
+    @property
+    def settings_class(self) -> type[BaseModel]:
+        """Of the card's `detector_settings`."""
+        ...
+
+    def load(self, card: Card, weights: Weights, device: torch.device) -> Detector:
+        """Open a model. Raises RuntimeError for weights of another network, ValueError for unsound settings."""
+        ...
+
+
+@runtime_checkable
+class TrainedDetector(Detector, Protocol):
+    """A detector that has weights."""
+
+    def weights(self) -> Weights:
+        """Return what `load` takes."""
+        ...
+
+
+#: A new detector is one folder and one entry here; `worker.detectors.networks` has another where it can be trained.
+DETECTORS: dict[str, DetectorClass] = {"c2c": CloudToCloud, "spicd-net": SpicdNet}
 
 
 def open_detector(model_store: Path, name: str = "spicd-net/1", device: Device = "auto") -> Detector:
@@ -38,16 +62,21 @@ def open_detector(model_store: Path, name: str = "spicd-net/1", device: Device =
 
 def make_detector(card: Card, content: bytes | None, device: Device = "auto") -> Detector:
     """The detector of a card and of the bytes of its weights file, None where it has none. Raises DetectorUnavailable."""
-    name = f"{card.name}/{card.version}"
+    name = card.model
     if card.detector not in DETECTORS:
         raise DetectorUnavailable(
             f"model {name}: no detector {card.detector!r}; there are {sorted(DETECTORS)}"
         )
     weights = {} if content is None else _checked_weights(name, card, content)
     try:
-        return DETECTORS[card.detector](card, weights, resolve_device(device))
+        return DETECTORS[card.detector].load(card, weights, resolve_device(device))
     except (RuntimeError, ValueError) as unsound:
         raise DetectorUnavailable(f"model {name}: {unsound}") from unsound
+
+
+def settings_of(card: Card) -> dict[str, Any]:
+    """Return the detector's own settings with every default. Raises ValueError, which names each unsound field."""
+    return card.settings_as(DETECTORS[card.detector].settings_class).model_dump()
 
 
 def open_card(model_store: Path, name: str) -> Card:
@@ -128,6 +157,15 @@ def weights_content(weights: Weights) -> bytes:
     """As safetensors; the same weights, the same bytes."""
     content: bytes = save({name: tensor.contiguous() for name, tensor in weights.items()})
     return content
+
+
+def weights_of(detector: Detector) -> Weights:
+    """Return the weights of a detector, to train further from. Raises TrainingFailed where it has none."""
+    if not isinstance(detector, TrainedDetector):
+        raise TrainingFailed(
+            f"model {detector.card.model} cannot be trained further: a detector {detector.card.detector!r} has no weights"
+        )
+    return detector.weights()
 
 
 def sha256_of(weights: Weights) -> str:

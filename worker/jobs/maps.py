@@ -5,16 +5,18 @@ from __future__ import annotations
 import json
 
 from service.catalog import blob_keys
-from service.catalog.records import Bounds
+from service.catalog.records import Bounds, VersionRecord
+from worker.cloud import npz
 from worker.cloud.formats.ply import write_ply
 from worker.cloud.types import Points
-from worker.detectors.card import Preprocessing
+from worker.detectors.card import Card
+from worker.detectors.comparison import Side
+from worker.detectors.detector import Detector
 from worker.jobs.models import card_of, kept_detector, pipeline_settings
 from worker.jobs.step import Context, put, step
-from worker.jobs.versions import make_version
-from worker.pipeline import archive
+from worker.jobs.versions import kept_reference, make_version
 from worker.pipeline.flow import BuiltMap
-from worker.pipeline.results.manifest import manifest, padded_patches
+from worker.pipeline.results.manifest import manifest
 
 
 @step
@@ -23,7 +25,7 @@ def register_map(at: Context) -> None:
     version = at.catalog.versions.of_job(at.job.job_id)
     card = card_of(at, version.model)
     made = make_version(at, version, pipeline_settings(at, version, card))
-    _put_map(at, made.built, card.preprocessing)
+    _put_map(at, made.built, card)
     at.catalog.versions.save_result(
         at.job.job_id,
         outcomes=made.outcomes,
@@ -43,21 +45,26 @@ def register_map(at: Context) -> None:
 def describe_map(at: Context) -> None:
     """What the model can know of the reference alone; then the map is ready."""
     version = at.catalog.versions.of_job(at.job.job_id)
-    detector = kept_detector(at, version.model)
-    with at.catalog.blobs.local(blob_keys.map_tiles(at.job.job_id)) as path:
-        tiles = archive.load_tiles(path)
-    description = detector.describe(tiles, progress=lambda _, share: at.report("describing", share))
-    key = blob_keys.map_embedding(at.job.job_id, version.model, detector.card.sha256)
-    put(at, key, lambda path: archive.save_arrays(path, description))
+    encode_reference(at, version, kept_detector(at, version.model), version.model)
     at.catalog.jobs.succeed(at.job.job_id)
 
 
-def _put_map(at: Context, built: BuiltMap, needs: Preprocessing) -> None:
-    """The map's files: cloud, reference, tiles with their patches, manifest."""
-    job_id, reference, tiles = at.job.job_id, built.reference, built.tiles
-    patches = padded_patches(tiles, size=needs.patch_points, seed=needs.seed)
-    put(at, blob_keys.map_reference(job_id), lambda path: archive.save_reference(path, reference))
-    put(at, blob_keys.map_tiles(job_id), lambda path: archive.save_tiles(path, tiles, patches=patches))
+def encode_reference(at: Context, version: VersionRecord, detector: Detector, model: str) -> None:
+    """Keep what the model can compute of the map alone, so that its first survey has half of the work."""
+    reference = kept_reference(at, version)
+    embedding = detector.encode_reference(
+        Side(points=reference.points, normals=reference.normals),
+        reference.tiles(min_points=detector.card.preprocessing.min_points),
+        progress=lambda _, share: at.report("describing", share),
+    )
+    key = blob_keys.map_embedding(version.job_id, model, detector.card.sha256)
+    put(at, key, lambda path: npz.save_arrays(path, embedding))
+
+
+def _put_map(at: Context, built: BuiltMap, card: Card) -> None:
+    """Keep the map's files: cloud, reference, manifest."""
+    job_id, reference, needs = at.job.job_id, built.reference, card.preprocessing
+    put(at, blob_keys.map_reference(job_id), lambda path: npz.save(path, reference))
     put(
         at,
         blob_keys.map_cloud(job_id),
@@ -65,8 +72,8 @@ def _put_map(at: Context, built: BuiltMap, needs: Preprocessing) -> None:
     )
     listing = manifest(
         reference.points,
-        tiles,
-        patch_size=needs.patch_points,
+        built.tiles,
+        patch_size=card.detector_settings.get("patch_points"),  # of detectors that have patches
         min_points=needs.min_points,
         voxel_size=needs.voxel_size,
     )

@@ -13,7 +13,7 @@ from worker.detectors.detector import Detector
 from worker.detectors.store import Device, make_detector, open_card, open_detector
 from worker.errors import DetectorUnavailable
 from worker.jobs.step import Context
-from worker.pipeline.flow import PipelineSettings
+from worker.pipeline.settings import PipelineSettings
 
 
 def kept_detector(at: Context, model: str) -> Detector:
@@ -35,12 +35,7 @@ def card_that_fits(at: Context, model: str, map_model: str) -> Card:
     """A model that scores a map must cut the world as the map was cut. Raises DetectorUnavailable."""
     card, built_with = (card_of(at, name) for name in (model, map_model))
     ours, theirs = card.preprocessing, built_with.preprocessing
-    same = (ours.voxel_size, ours.tile_size, ours.min_points) == (
-        theirs.voxel_size,
-        theirs.tile_size,
-        theirs.min_points,
-    )
-    if not same:
+    if ours != theirs:
         raise DetectorUnavailable(
             f"model {model} needs voxels of {ours.voxel_size:g} m and tiles of {ours.tile_size}, the map was "
             f"built for {map_model} with {theirs.voxel_size:g} m and {theirs.tile_size}; build a map for it"
@@ -53,8 +48,8 @@ def _own(at: Context, model: str) -> ModelRecord | None:
     name, _, version = model.partition("/")
     if (at.settings.model_store / name / version / "card.json").exists() or not version.isdecimal():
         return None
-    found = at.catalog.models.find(name, int(version))
-    return found if found is not None and found.status == "ready" else None
+    own = at.catalog.models.find(name, int(version))
+    return own if own is not None and own.status == "ready" else None
 
 
 @functools.lru_cache(maxsize=4)
@@ -73,6 +68,7 @@ def _opened_own(blob_url: str, job_id: str, card: str, device: Device) -> Detect
 
 
 def pipeline_settings(at: Context, record: VersionRecord, card: Card) -> PipelineSettings:
+    """Return the settings that a version of a map was asked for with, and what the model needs put in its place."""
     asked = PipelineSettings.model_validate(
         {**record.settings, "max_scan_points": at.settings.max_scan_points}
     )

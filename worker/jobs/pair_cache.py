@@ -18,8 +18,8 @@ _INTERVAL_S = 2.0  #: between two writes, and so about the most work that is los
 log = logging.getLogger(__name__)
 
 
-class KeptPairs:
-    """A `worker.pipeline.mapping.pair_registration.PairMemory` among the files of a map, which go when it is saved.
+class StoredPairCache:
+    """A `worker.pipeline.mapping.pair_registration.PairCache` among the files of a map, which go when it is saved.
 
     Each write is a blob of its own, under a name that nobody else takes: it is seen whole or not at all, and a worker that
     was thought dead and still writes does no harm.

@@ -9,6 +9,7 @@ from contextlib import ExitStack
 import numpy as np
 
 from service.catalog.records import ScanOutcome
+from worker.cloud import npz
 from worker.jobs.step import Context, put
 from worker.pipeline import archive
 from worker.pipeline.registration.results import RegisteredScan, ScanFile, ScanResult, placed
@@ -43,18 +44,25 @@ def save_scans(
         at.report("saving", done / len(scans))
         if outcome.placement is not None:
             scan = placed(file, outcome.placement, max_points=at.settings.max_scan_points)
-            put(at, key_of(each.scan_id), functools.partial(archive.save_scan, scan=scan))
+            put(at, key_of(each.scan_id), functools.partial(npz.save, value=scan))
 
 
 def kept_scan(at: Context, key: str) -> RegisteredScan:
-    """An accepted scan as `save_scans` kept it."""
+    """Return an accepted scan as `save_scans` kept it."""
     with at.catalog.blobs.local(key) as path:
         return archive.load_scan(path)
 
 
+def kept_scans(
+    at: Context, scans: Sequence[ScanOutcome], key_of: Callable[[str], str]
+) -> list[Callable[[], RegisteredScan]]:
+    """Return what loads each accepted scan."""
+    return [functools.partial(kept_scan, at, key_of(scan.scan_id)) for scan in scans if scan.accepted]
+
+
 def _recorded(scan_id: str, outcome: ScanResult, ids: Sequence[str]) -> ScanOutcome:
-    found = outcome.placement
-    if found is None:
+    placement = outcome.placement
+    if placement is None:
         return ScanOutcome(
             scan_id=scan_id,
             accepted=False,
@@ -62,14 +70,15 @@ def _recorded(scan_id: str, outcome: ScanResult, ids: Sequence[str]) -> ScanOutc
             rmse=outcome.inlier_rmse,
             reason=outcome.reason,
         )
+    sigma = placement.uncertainty
     return ScanOutcome(
         scan_id=scan_id,
         accepted=True,
         fitness=outcome.fitness,
         rmse=outcome.inlier_rmse,
-        map_from_scan=found.map_from_scan.tolist(),
-        translation_sigma=None if found.uncertainty is None else found.uncertainty.translation,
-        rotation_sigma=None if found.uncertainty is None else found.uncertainty.rotation,
-        path=tuple(ids[at] for at in found.path) or None,
+        map_from_scan=placement.map_from_scan.tolist(),
+        translation_sigma=None if sigma is None else sigma.translation,
+        rotation_sigma=None if sigma is None else sigma.rotation,
+        path=tuple(ids[index] for index in placement.path) or None,
         reason=outcome.reason,
     )

@@ -12,13 +12,16 @@ import numpy as np
 
 from service.catalog import blob_keys
 from service.catalog.records import ScanOutcome, VersionRecord
+from worker.cloud import npz
 from worker.cloud.types import Indices
-from worker.jobs.pair_cache import KeptPairs
-from worker.jobs.scans import kept_scan, save_scans, scan_files, scan_outcomes
+from worker.jobs.pair_cache import StoredPairCache
+from worker.jobs.scans import kept_scans, save_scans, scan_files, scan_outcomes
 from worker.jobs.step import Context, put
 from worker.pipeline import archive
-from worker.pipeline.flow import BuiltMap, NoScanAccepted, NothingToTile, PipelineSettings, build_map
+from worker.pipeline.flow import BuiltMap, NoScanAccepted, NothingToTile, build_map
 from worker.pipeline.map_update import KeptMap, extend_map, renew_map, without
+from worker.pipeline.mapping.fusion import ReferenceMap
+from worker.pipeline.settings import PipelineSettings
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -32,9 +35,18 @@ class Made:
         """The totals of the registration, with the reference scan by its id; None where there was none."""
         if self.built.report is None:
             return None
-        found = self.built.report.document()
-        reference = found["reference"]
-        return {**found, "reference": None if reference is None else self.outcomes[reference].scan_id}
+        totals = self.built.report.document()
+        reference = totals["reference"]
+        return {**totals, "reference": None if reference is None else self.outcomes[reference].scan_id}
+
+
+def kept_reference(at: Context, version: VersionRecord) -> ReferenceMap:
+    """Return the map of a version, also one that release 0.1 built."""
+    blobs, tiles_of_0_1 = at.catalog.blobs, blob_keys.map_tiles(version.job_id)
+    with ExitStack() as stack:
+        path = stack.enter_context(blobs.local(blob_keys.map_reference(version.job_id)))
+        grid = stack.enter_context(blobs.local(tiles_of_0_1)) if blobs.exists(tiles_of_0_1) else None
+        return archive.load_reference(path, tiles_of_0_1=grid)
 
 
 def make_version(at: Context, version: VersionRecord, settings: PipelineSettings) -> Made:
@@ -51,7 +63,7 @@ def _first(at: Context, version: VersionRecord, settings: PipelineSettings) -> M
     with ExitStack() as stack:
         files = scan_files(at, version.scans, stack)
         with _recorded_anyway(at, version.scans):
-            pairs = KeptPairs(at.catalog.blobs, at.job.job_id)
+            pairs = StoredPairCache(at.catalog.blobs, at.job.job_id)
             built = build_map(files, settings=settings, pairs=pairs, progress=at.report)
         save_scans(at, version.scans, files, built.outcomes, _key_of(at))
     return Made(built=built, outcomes=scan_outcomes(version.scans, built.outcomes))
@@ -74,29 +86,21 @@ def _renewed(
 ) -> Made:
     older, seen = _kept(base), _further(version, base)
     kept, replaced = _kept_map(at, base), _changed(at, survey_id)
-    survey_keys = [blob_keys.survey_scan(survey_id, scan.scan_id) for scan in seen]
-    loads = [functools.partial(kept_scan, at, key) for key in survey_keys]
+    survey_key = functools.partial(blob_keys.survey_scan, survey_id)
+    loads = kept_scans(at, seen, survey_key)
     built = renew_map(kept, loads, replaced=replaced, settings=settings, progress=at.report)
     for done, (scan, load) in enumerate(zip(older, kept.scans, strict=True)):
         at.report("saving", done / len(older))
-        rest = without(load(), kept.grid, replaced)
-        put(at, _key_of(at)(scan.scan_id), functools.partial(archive.save_scan, scan=rest))
-    for scan, key in zip(seen, survey_keys, strict=True):
-        at.catalog.blobs.copy(key, _key_of(at)(scan.scan_id))
+        rest = without(load(), kept.reference.grid, replaced)
+        put(at, _key_of(at)(scan.scan_id), functools.partial(npz.save, value=rest))
+    for scan in seen:
+        at.catalog.blobs.copy(survey_key(scan.scan_id), _key_of(at)(scan.scan_id))
     return Made(built=built, outcomes=(*older, *seen))
 
 
 def _kept_map(at: Context, base: VersionRecord) -> KeptMap:
-    blobs = at.catalog.blobs
-    with blobs.local(blob_keys.map_reference(base.job_id)) as path:
-        reference = archive.load_reference(path)
-    with blobs.local(blob_keys.map_tiles(base.job_id)) as path:
-        grid = archive.load_tiles(path).grid
-    scans = [
-        functools.partial(kept_scan, at, blob_keys.map_scan(base.job_id, scan.scan_id))
-        for scan in _kept(base)
-    ]
-    return KeptMap(reference=reference, grid=grid, scans=scans)
+    key_of = functools.partial(blob_keys.map_scan, base.job_id)
+    return KeptMap(reference=kept_reference(at, base), scans=kept_scans(at, base.scans, key_of))
 
 
 def _kept(base: VersionRecord) -> list[ScanOutcome]:
@@ -111,8 +115,8 @@ def _further(version: VersionRecord, base: VersionRecord) -> list[ScanOutcome]:
 
 def _changed(at: Context, survey_id: str) -> Indices:
     """(T, 3) the tiles that the survey found changed."""
-    found = at.catalog.changes.of_survey(survey_id)
-    changed = [each.tile.tile_index for each in found if each.tile.state == "changed"]
+    changes = at.catalog.changes.of_survey(survey_id)
+    changed = [change.tile.tile_index for change in changes if change.tile.state == "changed"]
     return np.array(changed, np.int32).reshape(-1, 3)
 
 

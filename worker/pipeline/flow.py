@@ -2,66 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
-from pydantic import BaseModel, ConfigDict, Field
-
-from worker.cloud.tiling import (
-    TileGrid,
-    TilePairs,
-    Tiles,
-    TilingSettings,
-    cut,
-    grid_over,
-    grown,
-    pair_tiles,
-)
+from worker.cloud.tiling import TileGrid, Tiles, grid_over, grown, pair_tiles
 from worker.cloud.types import Arrays
 from worker.cloud.voxels import Voxels
-from worker.detectors.card import Preprocessing
+from worker.detectors.comparison import Comparison, SeenScan, Side
 from worker.detectors.detector import Detector
 from worker.errors import MapFailed, RegistrationFailed
 from worker.pipeline.mapping.fusion import CurrentMap, ReferenceMap, current_map, fuse, reference_map
 from worker.pipeline.mapping.map_registration import register_map_scans
 from worker.pipeline.mapping.pair_registration import PairCache
 from worker.pipeline.mapping.report import MapReport
-from worker.pipeline.mapping.settings import MapSettings, MultiScanSettings
 from worker.pipeline.mapping.survey_registration import register_survey_scans
 from worker.pipeline.registration.results import RegisteredScan, ScanFile, ScanResult, placed
 from worker.pipeline.registration.scan_to_scan import PairResult
-from worker.pipeline.registration.settings import RegistrationSettings
 from worker.pipeline.results.changes import ChangeSet, decide
+from worker.pipeline.settings import PipelineSettings
 from worker.progress import Progress, no_progress
 
-
-class PipelineSettings(BaseModel):
-    """One settings class a stage."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    registration: RegistrationSettings = Field(default_factory=RegistrationSettings)
-    mapping: MapSettings = Field(default_factory=MapSettings)
-    tiling: TilingSettings = Field(default_factory=TilingSettings)
-    max_scan_points: int = Field(50_000_000, gt=0)
-
-    def for_model(self, needs: Preprocessing) -> PipelineSettings:
-        """The same settings with what is tied to a model's weights put in its place."""
-        voxels = {"voxel_size": needs.voxel_size}
-        tiles = {"tile_size": needs.tile_size, "min_points": needs.min_points}
-        return self.model_copy(
-            update={
-                "registration": self.registration.model_copy(update=voxels),
-                "tiling": self.tiling.model_copy(update=tiles),
-            }
-        )
-
-    @property
-    def placing(self) -> MultiScanSettings:
-        """What placing scans needs of these."""
-        return MultiScanSettings(
-            registration=self.registration, mapping=self.mapping, max_points=self.max_scan_points
-        )
+Scans = Sequence[Callable[[], SeenScan]]  #: each call loads one
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -78,10 +39,10 @@ class BuiltMap:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class LocatedSurvey:
-    """A survey in the map's frame, cut along the map's tiles."""
+    """A survey in the map's frame, beside the map."""
 
     current: CurrentMap
-    pairs: TilePairs
+    comparison: Comparison
     outcomes: tuple[ScanResult, ...]
 
 
@@ -112,66 +73,85 @@ def build_map(
     processes: int | None = None,
     progress: Progress = no_progress,
 ) -> BuiltMap:
-    """Stage 1: place the scans in one frame, fuse them, cut the map into tiles.
+    """Stage 1: register the scans in one frame, fuse them, cut the map into tiles.
 
     `pairs` keeps registered pairs, so that a build that was killed goes on; `processes` is one a core if None.
     Raises ScanError where no file can be read, MapFailed where no scan holds a pose, and NothingToTile.
     """
-    placing = register_map_scans(
-        files, settings=settings.placing, memory=pairs, processes=processes, progress=progress
+    registered = register_map_scans(
+        files, settings=settings.multi_scan, memory=pairs, processes=processes, progress=progress
     )
-    fused = fused_scans(accepted_scans(files, placing.outcomes, settings), len(files), settings, progress)
-    reference, tiles = tiled_map(fused, None, placing.outcomes, settings, progress)
+    fused = fused_scans(accepted_scans(files, registered.outcomes, settings), len(files), settings, progress)
+    reference, tiles = tiled_map(fused, None, registered.outcomes, settings, progress)
     return BuiltMap(
         reference=reference,
         tiles=tiles,
-        outcomes=placing.outcomes,
-        report=placing.report,
-        kept=placing.kept,
-        contradicted=placing.contradicted,
+        outcomes=registered.outcomes,
+        report=registered.report,
+        kept=registered.kept,
+        contradicted=registered.contradicted,
     )
 
 
 def locate_survey(
     files: Sequence[ScanFile],
     reference: ReferenceMap,
-    tiles: Tiles,
     *,
     settings: PipelineSettings,
     progress: Progress = no_progress,
 ) -> LocatedSurvey:
-    """Stage 3, first half: place the scans on the map, fuse those accepted, pair the tiles.
+    """Stage 3, first half: register the scans to the map, fuse those accepted, set both side by side.
 
     Raises ScanError where no file can be read, NoScanAccepted where none is left to compare.
     """
-    outcomes = register_survey_scans(files, reference.surface(), settings=settings.placing, progress=progress)
+    outcomes = register_survey_scans(
+        files, reference.surface(), settings=settings.multi_scan, progress=progress
+    )
     if not any(outcome.placement for outcome in outcomes):
         raise NoScanAccepted(outcomes)
     progress("tiling", 0.0)
     accepted = accepted_scans(files, outcomes, settings)
     current = current_map(accepted, voxel_size=reference.voxel_size)
-    pairs = pair_tiles(tiles, current.points, settings=settings.tiling)
+    comparison = compare(reference, current, settings=settings)
     progress("tiling", 1.0)
-    return LocatedSurvey(current=current, pairs=pairs, outcomes=outcomes)
+    return LocatedSurvey(current=current, comparison=comparison, outcomes=outcomes)
+
+
+def compare(
+    reference: ReferenceMap,
+    current: CurrentMap,
+    *,
+    settings: PipelineSettings,
+    reference_scans: Scans = (),
+    current_scans: Scans = (),
+) -> Comparison:
+    """Set the map and a survey side by side for a detector, cut along the map's tiles (about 50 ms)."""
+    tiles = reference.tiles(min_points=settings.tiling.min_points)
+    return Comparison(
+        reference=Side(points=reference.points, normals=reference.normals, scans=reference_scans),
+        current=Side(points=current.points, scans=current_scans),
+        tile_pairs=pair_tiles(tiles, current.points, settings=settings.tiling),
+    )
 
 
 def detect(
-    pairs: TilePairs,
+    comparison: Comparison,
     detector: Detector,
     *,
-    description: Arrays | None = None,
+    embedding: Arrays | None = None,
     threshold: float | None = None,
     progress: Progress = no_progress,
 ) -> ChangeSet:
     """Stage 3, second half: score the tiles, then decide; the threshold is the card's if None is given."""
-    scores = detector.score(pairs, description=description, progress=progress)
-    return decide(pairs, scores, threshold=detector.card.threshold if threshold is None else threshold)
+    detection = detector.detect(comparison, embedding=embedding, progress=progress)
+    threshold = detector.card.threshold if threshold is None else threshold
+    return decide(comparison.tile_pairs, detection, threshold=threshold)
 
 
 def accepted_scans(
     files: Sequence[ScanFile], outcomes: Sequence[ScanResult], settings: PipelineSettings
 ) -> Iterator[RegisteredScan]:
-    """The points of each accepted scan, read again: no two scans are held at once."""
+    """Read the points of each accepted scan again: no two scans are held at once."""
     for file, outcome in zip(files, outcomes, strict=True):
         if outcome.placement is not None:
             yield placed(file, outcome.placement, max_points=settings.max_scan_points)
@@ -180,13 +160,15 @@ def accepted_scans(
 def fused_scans(
     scans: Iterable[RegisteredScan], count: int, settings: PipelineSettings, progress: Progress
 ) -> Voxels:
-    def told() -> Iterator[RegisteredScan]:
+    """Fuse the scans, of which there are about `count`."""
+
+    def reported() -> Iterator[RegisteredScan]:
         for done, scan in enumerate(scans):
             progress("fusing", done / max(count, 1))
             yield scan
         progress("fusing", 1.0)
 
-    return fuse(told(), voxel_size=settings.registration.voxel_size)
+    return fuse(reported(), voxel_size=settings.registration.voxel_size)
 
 
 def tiled_map(
@@ -196,12 +178,13 @@ def tiled_map(
     settings: PipelineSettings,
     progress: Progress,
 ) -> tuple[ReferenceMap, Tiles]:
-    """The map with its normals, cut along a grid of its own or along one that there was."""
+    """Return the map with its normals, cut along a grid of its own or along one that there was."""
     progress("tiling", 0.0)
-    reference = reference_map(fused, settings=settings.registration)
     if grid is None:
-        grid = grid_over(reference.points, tile_size=settings.tiling.tile_size, voxel_size=fused.size)
-    tiles = cut(reference.points, grown(grid, reference.points), min_points=settings.tiling.min_points)
+        grid = grid_over(fused.points, tile_size=settings.tiling.tile_size, voxel_size=fused.size)
+    grid = grown(grid, fused.points)
+    reference = reference_map(fused, grid=grid, settings=settings.registration)
+    tiles = reference.tiles(min_points=settings.tiling.min_points)
     if not tiles.points:
         raise NothingToTile(outcomes, points=len(reference.points), min_points=settings.tiling.min_points)
     progress("tiling", 1.0)

@@ -8,18 +8,12 @@ from dataclasses import dataclass, replace
 
 from worker.cloud.tiling import TileGrid
 from worker.cloud.types import Indices
-from worker.pipeline.flow import (
-    BuiltMap,
-    NoScanAccepted,
-    PipelineSettings,
-    accepted_scans,
-    fused_scans,
-    tiled_map,
-)
+from worker.pipeline.flow import BuiltMap, NoScanAccepted, accepted_scans, fused_scans, tiled_map
 from worker.pipeline.mapping.fusion import ReferenceMap
 from worker.pipeline.mapping.report import MapReport
 from worker.pipeline.mapping.survey_registration import register_survey_scans
 from worker.pipeline.registration.results import RegisteredScan, ScanFile
+from worker.pipeline.settings import PipelineSettings
 from worker.progress import Progress, no_progress
 
 
@@ -28,7 +22,6 @@ class KeptMap:
     """A map as an earlier build left it; its scans are loaded one at a time."""
 
     reference: ReferenceMap
-    grid: TileGrid
     scans: Sequence[Callable[[], RegisteredScan]]
 
 
@@ -41,13 +34,13 @@ def extend_map(
     finds a place, and NothingToTile.
     """
     outcomes = register_survey_scans(
-        files, base.reference.surface(), settings=settings.placing, growing=True, progress=progress
+        files, base.reference.surface(), settings=settings.multi_scan, growing=True, progress=progress
     )
     if not any(outcome.placement for outcome in outcomes):
         raise NoScanAccepted(outcomes)
     scans = itertools.chain((load() for load in base.scans), accepted_scans(files, outcomes, settings))
     fused = fused_scans(scans, len(base.scans) + len(files), settings, progress)
-    reference, tiles = tiled_map(fused, base.grid, outcomes, settings, progress)
+    reference, tiles = tiled_map(fused, base.reference.grid, outcomes, settings, progress)
     return BuiltMap(
         reference=reference, tiles=tiles, outcomes=outcomes, report=MapReport.of_outcomes(outcomes)
     )
@@ -66,10 +59,10 @@ def renew_map(
     In the tiles `replaced` (T, 3) the survey's points take the place of the older ones, elsewhere they join them.
     Raises NothingToTile.
     """
-    older = (without(load(), base.grid, replaced) for load in base.scans)
+    older = (without(load(), base.reference.grid, replaced) for load in base.scans)
     scans = itertools.chain(older, (load() for load in seen))
     fused = fused_scans(scans, len(base.scans) + len(seen), settings, progress)
-    reference, tiles = tiled_map(fused, base.grid, (), settings, progress)
+    reference, tiles = tiled_map(fused, base.reference.grid, (), settings, progress)
     return BuiltMap(reference=reference, tiles=tiles, outcomes=(), report=None)
 
 

@@ -22,7 +22,7 @@ from worker.simulation.sensor import SimulatedScan
 from worker.simulation.truth import KINDS, TileTruth, changed_tiles
 from worker.simulation.visits import stops, visit
 from worker.training.anomalies import OPERATIONS, Change
-from worker.training.dataset import Look, TileSet, joined
+from worker.training.dataset import Observation, TileSet, joined
 
 Kind = Literal["office", "corridor", "room"]
 MAKERS: Mapping[Kind, Callable[[int], Scene]] = {
@@ -69,7 +69,7 @@ class WalkSettings(BaseModel):
 
 
 def walked(kind: Kind, seed: int, settings: WalkSettings) -> TileSet:
-    """The tiles of one building that two honest visits saw well, with further looks at them.
+    """The tiles of one building that two honest visits saw well, with further observations of them.
 
     It stands at a random yaw in its map, as it does when the first scan sets the frame.
     """
@@ -84,11 +84,11 @@ def walked(kind: Kind, seed: int, settings: WalkSettings) -> TileSet:
     again = pair_tiles(
         tiles, merged_in_order(_voxels(second, map_from_world, settings)).points, settings=settings.tiling
     )
-    looks = [
-        *_edited_looks(scene, scans, tiles, map_from_world, settings, (kind, seed), rng),
-        *_rebuilt_looks(scans, parts, tiles, map_from_world, settings, rng),
+    observations = [
+        *_edited_observations(scene, scans, tiles, map_from_world, settings, (kind, seed), rng),
+        *_rebuilt_observations(scans, parts, tiles, map_from_world, settings, rng),
     ]
-    return _set(again, looks, settings)
+    return _set(again, observations, settings)
 
 
 def _fewer(kind: Kind, settings: WalkSettings, rng: np.random.Generator) -> int:
@@ -106,7 +106,7 @@ def _voxels(scans: Sequence[SimulatedScan], map_from_world: Matrix4, settings: W
     return [Voxels.of(points, size=settings.voxel_size) for points in placed]
 
 
-def _edited_looks(
+def _edited_observations(
     scene: Scene,
     before: Sequence[SimulatedScan],
     tiles: Tiles,
@@ -114,7 +114,7 @@ def _edited_looks(
     settings: WalkSettings,
     building: tuple[Kind, int],
     rng: np.random.Generator,
-) -> Iterator[Look]:
+) -> Iterator[Observation]:
     """Visits after whole things were added, removed and moved: tiles that changed in sight, and those around them.
 
     A tile in which something changed out of sight, or too little to count, is neither changed nor unchanged.
@@ -128,7 +128,9 @@ def _edited_looks(
         pairs = pair_tiles(tiles, current, settings=settings.tiling)
         changed, still = _truth((scene, after), (before, scans), tiles, map_from_world)
         for tile in np.flatnonzero(pairs.observed & (changed | still)).tolist():
-            yield Look(tile=tile, points=pairs.current[tile], changed=bool(changed[tile]), rebuilt=False)
+            yield Observation(
+                tile=tile, points=pairs.current[tile], changed=bool(changed[tile]), rebuilt=False
+            )
 
 
 def _edited(scene: Scene, edits: int, seed: int) -> Scene:
@@ -159,14 +161,14 @@ def _truth(
     return seen.of(tiles.indices), beside
 
 
-def _rebuilt_looks(
+def _rebuilt_observations(
     scans: Sequence[SimulatedScan],
     parts: Sequence[Voxels],
     tiles: Tiles,
     map_from_world: Matrix4,
     settings: WalkSettings,
     rng: np.random.Generator,
-) -> Iterator[Look]:
+) -> Iterator[Observation]:
     """The same visit fused anew, a few scans registered again and changed at a few tiles (paper, Section 4.2).
 
     Tiles that come out as they were are left out: that pair every tile makes with itself.
@@ -183,7 +185,9 @@ def _rebuilt_looks(
         pairs = pair_tiles(tiles, merged_in_order(rebuilt).points, settings=settings.tiling)
         for tile in np.flatnonzero(pairs.observed).tolist():
             if not np.array_equal(pairs.current[tile], tiles.points[tile]):
-                yield Look(tile=tile, points=pairs.current[tile], changed=bool(injected[tile]), rebuilt=True)
+                yield Observation(
+                    tile=tile, points=pairs.current[tile], changed=bool(injected[tile]), rebuilt=True
+                )
 
 
 def _again(
@@ -224,7 +228,7 @@ def _injected(
     return np.concatenate([points[~inside], (after + centre).astype(np.float32)])
 
 
-def _set(again: TilePairs, looks: Sequence[Look], settings: WalkSettings) -> TileSet:
+def _set(again: TilePairs, observations: Sequence[Observation], settings: WalkSettings) -> TileSet:
     """Of the tiles that the second visit saw well, each about its centre."""
     tiles = again.reference
     middle = tiles.grid.centers(tiles.indices)
@@ -237,14 +241,14 @@ def _set(again: TilePairs, looks: Sequence[Look], settings: WalkSettings) -> Til
     return TileSet(
         points_a=tuple(about(tiles.points[tile], tile) for tile in every),
         points_b=tuple(about(again.current[tile], tile) for tile in every),
-        looks=tuple(
-            Look(
-                tile=look.tile,
-                points=about(look.points, look.tile),
-                changed=look.changed,
-                rebuilt=look.rebuilt,
+        observations=tuple(
+            Observation(
+                tile=observation.tile,
+                points=about(observation.points, observation.tile),
+                changed=observation.changed,
+                rebuilt=observation.rebuilt,
             )
-            for look in looks
+            for observation in observations
         ),
         centres=middle,
         buildings=np.zeros(len(middle), np.int32),

@@ -24,14 +24,14 @@ class Augmentation:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Nuisance:
-    """Differences of a second look (paper, Section 3.5.3), at full intensity.
+    """Differences of a second observation (paper, Section 3.5.3), at full intensity.
 
     The paper names no range for the yaw and the translation that both patches share; these are ours.
     """
 
     yaw: float = math.radians(15.0)  #: radians, either way, of both patches together
     shift: float = 0.05  #: metres, either way along each axis, of both patches together
-    dropout: tuple[float, float] = (0.10, 0.50)  #: share of the second look's points that are lost
+    dropout: tuple[float, float] = (0.10, 0.50)  #: share of the second observation's points that are lost
     magnitude: tuple[float, float] = (0.10, 0.50)  #: metres, m in the residual shift's sigma 0.001 + 0.05 m
 
 
@@ -56,7 +56,7 @@ def replenished(patch: Points, settings: Augmentation, rng: np.random.Generator)
     return filled
 
 
-def second_look(
+def second_observation(
     reference: Points, current: Points, settings: Nuisance, intensity: float, rng: np.random.Generator
 ) -> tuple[Points, Points]:
     """Both dense tiles turned and shifted alike; the current one thinned and a little off.

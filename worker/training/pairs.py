@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from worker.cloud.patches import patch
 from worker.cloud.types import Points
+from worker.detectors.trainable import CHANGED, DIFFERENT, UNCHANGED, Pair
 from worker.training.anomalies import OPERATIONS, Change, Half, Operation, shown
-from worker.training.augmentation import Augmentation, Nuisance, augmented, second_look, turned_alike
-from worker.training.dataset import Look, TileSet
+from worker.training.augmentation import Augmentation, Nuisance, augmented, second_observation, turned_alike
+from worker.training.dataset import Observation, TileSet
 
-UNCHANGED, CHANGED, DIFFERENT = 0, 1, 2
 SAMPLE_POINTS = 128  #: of the Chamfer branch in the paper (Section 3.6.3)
 STORED_JITTER = 0.0001  #: metres, where the stored reference patch itself comes back
 
@@ -52,7 +52,9 @@ class PairSettings:
     shown_distance: float = 0.075  #: metres; with `min_shown` what the simulator's truth calls a change
     min_separation: float = 3.0  #: metres between different tiles of one building
     symmetries: bool = True  #: ours: both patches under one of the square's eight symmetries
-    twins: bool = True  #: ours: a changed pair comes with an unchanged one of the same tile and looks
+    matched_pairs: bool = (
+        True  #: ours: a changed pair comes with an unchanged one of the same tile and observations
+    )
     augmentation: Augmentation = field(default_factory=Augmentation)
     nuisance: Nuisance = field(default_factory=Nuisance)
 
@@ -67,33 +69,13 @@ PAPER_PAIRS = PairSettings(
     revisit_share=0.0,
     min_shown=0,
     symmetries=False,
-    twins=False,
+    matched_pairs=False,
 )
 
 
-@dataclass(frozen=True, slots=True)
-class Pair:
-    """One example."""
-
-    reference: Points  #: (n, 3) float32, metres, tile-centre frame: a patch's distinct points
-    current: Points  #: (m, 3)
-    label: int  #: 0 unchanged, 1 changed, 2 different place
-
-
-@dataclass(frozen=True, slots=True)
-class Batch:
-    """B examples as the network takes them."""
-
-    points: Points  #: (P, 3) float32: 2 B clouds end to end, references first, each with its centroid at 0
-    sizes: list[int]  #: of the clouds
-    chamfer_points: Points  #: (Q, 3) in the same order, tile-centre frame: what the Chamfer branch compares
-    chamfer_sizes: list[int]
-    labels: NDArray[np.int64]  #: (B,)
-
-
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Looks:
-    """Two dense looks at one tile, (n, 3) each, between which nothing changed, and two between which something did."""
+class Observations:
+    """Two dense observations of one tile, (n, 3) each, between which nothing changed, and two between which something did."""
 
     unchanged: tuple[Points, Points]
     changed: tuple[Points, Points] | None = None  #: None: a synthetic change is due
@@ -113,59 +95,63 @@ class PairMaker:
         self._settings = settings
         self._half = (np.asarray(tiles.tile_size) / 2).astype(np.float32)
         self._edited, self._rebuilt, self._beside, self._untouched = (
-            [look for look in tiles.looks if (look.changed, look.rebuilt) == kind]
+            [
+                observation
+                for observation in tiles.observations
+                if (observation.changed, observation.rebuilt) == kind
+            ]
             for kind in ((True, False), (True, True), (False, False), (False, True))
         )
 
-    def batches(self, count: int, size: int, rng: np.random.Generator) -> Iterator[Batch]:
-        """`count` pairs in the classes' exact shares, `size` at a time; a last few are left out.
+    def batches(self, count: int, size: int, rng: np.random.Generator) -> Iterator[list[Pair]]:
+        """Draw `count` pairs in the classes' exact shares, `size` at a time; a last few are left out.
 
-        With `twins` each changed pair comes with an unchanged one of the same tile and looks, so that nothing but
+        With `twins` each changed pair comes with an unchanged one of the same tile and observations, so that nothing but
         the change tells them apart.
         """
         ready: list[Pair] = []
-        groups = composition(count, self._settings.shares, twins=self._settings.twins)
+        groups = composition(count, self._settings.shares, matched_pairs=self._settings.matched_pairs)
         for place in rng.permutation(len(groups)):
-            looks = self._looks(groups[place], rng)
-            ready += [self.pair(label, rng, looks) for label in groups[place]]
+            observations = self._observations(groups[place], rng)
+            ready += [self.pair(label, rng, observations) for label in groups[place]]
             if len(ready) >= size:
-                yield self._batched(ready[:size], rng)
+                yield ready[:size]
                 ready = ready[size:]
 
-    def pair(self, label: int, rng: np.random.Generator, looks: Looks | None = None) -> Pair:
-        """One example of a class, of the given looks where the class is of one tile."""
-        looks = looks or self._looks((label,), rng)
+    def pair(self, label: int, rng: np.random.Generator, observations: Observations | None = None) -> Pair:
+        """One example of a class, of the given observations where the class is of one tile."""
+        observations = observations or self._observations((label,), rng)
         settings = self._settings
         if label == DIFFERENT:
             reference, current = self._different(rng)
         elif label == CHANGED:
-            reference, current = self._changed(looks, rng)
+            reference, current = self._changed(observations, rng)
         else:
-            reference, current = self._unchanged(looks, rng)
+            reference, current = self._unchanged(observations, rng)
         if settings.symmetries:
             reference, current = turned_alike(reference, current, rng)
-        if label == DIFFERENT or not (looks.still and settings.stored_still):
+        if label == DIFFERENT or not (observations.still and settings.stored_still):
             reference = augmented(reference, settings.augmentation, rng)
             current = augmented(current, settings.augmentation, rng)
         return Pair(reference, current, label)
 
-    def _unchanged(self, looks: Looks, rng: np.random.Generator) -> tuple[Points, Points]:
-        if looks.still and self._settings.stored_still:
-            return self._sampled(*looks.unchanged, 0.0, rng)
-        if looks.still:
-            stored = self._patch(looks.unchanged[0], rng)
+    def _unchanged(self, observations: Observations, rng: np.random.Generator) -> tuple[Points, Points]:
+        if observations.still and self._settings.stored_still:
+            return self._sampled(*observations.unchanged, 0.0, rng)
+        if observations.still:
+            stored = self._patch(observations.unchanged[0], rng)
             return stored, _stored_again(stored, rng)
-        intensity = self._settings.revisit_intensity if looks.revisit else 1.0
-        return self._sampled(*looks.unchanged, intensity, rng)
+        intensity = self._settings.revisit_intensity if observations.revisit else 1.0
+        return self._sampled(*observations.unchanged, intensity, rng)
 
-    def _changed(self, looks: Looks, rng: np.random.Generator) -> tuple[Points, Points]:
+    def _changed(self, observations: Observations, rng: np.random.Generator) -> tuple[Points, Points]:
         settings = self._settings
-        intensity = settings.revisit_intensity if looks.revisit else settings.changed_intensity
-        if looks.still and settings.stored_still:
+        intensity = settings.revisit_intensity if observations.revisit else settings.changed_intensity
+        if observations.still and settings.stored_still:
             intensity = 0.0
-        if looks.changed is not None:
-            return self._sampled(*looks.changed, intensity, rng)
-        first, second = looks.unchanged
+        if observations.changed is not None:
+            return self._sampled(*observations.changed, intensity, rng)
+        first, second = observations.unchanged
         return self._sampled(first, changed(second, settings, self._half, rng), intensity, rng)
 
     def _different(self, rng: np.random.Generator) -> tuple[Points, Points]:
@@ -187,7 +173,7 @@ class PairMaker:
         away = np.linalg.norm(tiles.centres - tiles.centres[i], axis=1) >= self._settings.min_separation
         return np.flatnonzero(away | (tiles.buildings != tiles.buildings[i]))
 
-    def _looks(self, labels: tuple[int, ...], rng: np.random.Generator) -> Looks:
+    def _observations(self, labels: tuple[int, ...], rng: np.random.Generator) -> Observations:
         """At a random tile, for pairs of these labels; visits in either order."""
         settings, draw = self._settings, rng.random()
         if CHANGED in labels:
@@ -197,66 +183,49 @@ class PairMaker:
                 settings.edited_share <= draw < settings.edited_share + settings.rebuilt_share
                 and self._rebuilt
             ):
-                return self._rebuilt_looks(rng)
+                return self._rebuilt_observations(rng)
         elif UNCHANGED in labels and draw < settings.beside_share and self._beside:
             return self._revisited(self._beside[int(rng.integers(len(self._beside)))], rng)
-        return self._two_looks(rng)
+        return self._two_observations(rng)
 
-    def _two_looks(self, rng: np.random.Generator) -> Looks:
+    def _two_observations(self, rng: np.random.Generator) -> Observations:
         tiles, settings = self._tiles, self._settings
         i = int(rng.integers(len(tiles)))
         a, b = tiles.points_a[i], tiles.points_b[i]
         if len(b) == 0 or rng.random() >= settings.revisit_share:
             still = rng.random() >= settings.rerun_share
-            return Looks(unchanged=(a, _stored_again(a, rng) if still else a), still=still)
-        return Looks(unchanged=(a, b) if rng.random() < 0.5 else (b, a), revisit=True)
+            return Observations(unchanged=(a, _stored_again(a, rng) if still else a), still=still)
+        return Observations(unchanged=(a, b) if rng.random() < 0.5 else (b, a), revisit=True)
 
-    def _revisited(self, look: Look, rng: np.random.Generator) -> Looks:
-        """The look beside the first visit's, and in a changed pair's twin the second visit's."""
-        a, b = self._tiles.points_a[look.tile], self._tiles.points_b[look.tile]
+    def _revisited(self, observation: Observation, rng: np.random.Generator) -> Observations:
+        """The observation beside the first visit's, and in the unchanged pair that matches a changed one the second visit's."""
+        a, b = self._tiles.points_a[observation.tile], self._tiles.points_b[observation.tile]
         forth = rng.random() < 0.5
-        found = (a, look.points) if forth else (look.points, a)
-        if not look.changed:
-            return Looks(unchanged=found, revisit=True)
-        return Looks(unchanged=(a, b) if forth else (b, a), changed=found, revisit=True)
+        found = (a, observation.points) if forth else (observation.points, a)
+        if not observation.changed:
+            return Observations(unchanged=found, revisit=True)
+        return Observations(unchanged=(a, b) if forth else (b, a), changed=found, revisit=True)
 
-    def _rebuilt_looks(self, rng: np.random.Generator) -> Looks:
+    def _rebuilt_observations(self, rng: np.random.Generator) -> Observations:
         """A rebuilt map against the map: a tile that a synthetic change was made in, and one that none was."""
         changed = self._rebuilt[int(rng.integers(len(self._rebuilt)))]
         pair = (self._tiles.points_a[changed.tile], changed.points)
         if not self._untouched:
-            return Looks(unchanged=(pair[0], pair[0]), changed=pair, still=True)
+            return Observations(unchanged=(pair[0], pair[0]), changed=pair, still=True)
         other = self._untouched[int(rng.integers(len(self._untouched)))]
-        return Looks(unchanged=(self._tiles.points_a[other.tile], other.points), changed=pair, still=True)
+        return Observations(
+            unchanged=(self._tiles.points_a[other.tile], other.points), changed=pair, still=True
+        )
 
     def _sampled(
         self, first: Points, second: Points, intensity: float, rng: np.random.Generator
     ) -> tuple[Points, Points]:
-        reference, current = second_look(first, second, self._settings.nuisance, intensity, rng)
+        reference, current = second_observation(first, second, self._settings.nuisance, intensity, rng)
         return self._patch(reference, rng), self._patch(current, rng)
 
     def _patch(self, points: Points, rng: np.random.Generator) -> Points:
         """The distinct points of a patch: what repeats would add, a max-pool does not see."""
         return patch(points, size=self._settings.patch_points, seed=int(rng.integers(2**31))).distinct
-
-    def _batched(self, pairs: list[Pair], rng: np.random.Generator) -> Batch:
-        """References before currents, every cloud about its centroid."""
-        clouds = [pair.reference for pair in pairs] + [pair.current for pair in pairs]
-        compared = [self._compared(cloud, rng) for cloud in clouds]
-        return Batch(
-            np.concatenate([cloud - cloud.mean(axis=0) for cloud in clouds]),
-            [len(cloud) for cloud in clouds],
-            np.concatenate(compared),
-            [len(cloud) for cloud in compared],
-            np.array([pair.label for pair in pairs], dtype=np.int64),
-        )
-
-    def _compared(self, distinct: Points, rng: np.random.Generator) -> Points:
-        """All points, or so many of the padded patch without replacement, drawn anew each time (paper, Section 3.6.3)."""
-        count = self._settings.chamfer_points
-        if count is None:
-            return distinct
-        return distinct[rng.choice(self._settings.patch_points, count, replace=False) % len(distinct)]
 
 
 def _stored_again(points: Points, rng: np.random.Generator) -> Points:
@@ -286,12 +255,12 @@ def altered(
 
 
 def composition(
-    count: int, shares: tuple[float, float, float], *, twins: bool = True
+    count: int, shares: tuple[float, float, float], *, matched_pairs: bool = True
 ) -> list[tuple[int, ...]]:
     """`count` labels in exact shares, as groups of one tile each; what rounding leaves is unchanged."""
     changed_count, different = (round(count * share) for share in shares[1:])
     unchanged = count - changed_count - different
-    both = min(unchanged, changed_count) if twins else 0
+    both = min(unchanged, changed_count) if matched_pairs else 0
     return [
         *[(UNCHANGED, CHANGED)] * both,
         *[(UNCHANGED,)] * (unchanged - both),

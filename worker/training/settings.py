@@ -5,7 +5,9 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from worker.training.pairs import PAPER_PAIRS, PairSettings
+from worker.detectors.networks import NETWORKS
+from worker.detectors.trainable import TrainableNetwork
+from worker.training.pairs import PAPER_PAIRS, SAMPLE_POINTS, PairSettings
 from worker.training.schedule import Schedule
 
 
@@ -13,6 +15,7 @@ from worker.training.schedule import Schedule
 class TrainSettings:
     """The paper's values, but for `minutes`."""
 
+    detector: str = "spicd-net"  #: key in worker.detectors.networks.NETWORKS
     epochs: int = 1000
     minutes: float | None = None  #: wall clock of the whole run, resumed parts included; None: epochs alone
     patience: int = 100  #: epochs without a better checkpoint
@@ -28,7 +31,7 @@ class TrainSettings:
         None  #: what network is trained on, with a fresh optimiser: a checkpoint, or as said with `start`
     )
     fresh_head: bool = False  #: ours: of that network the encoder alone is taken, and the head starts anew
-    settle_head: bool = True  #: ours: the head's first layers start as if their inputs were standardised
+    initialize_head: bool = True  #: ours: the head's first layers start as if their inputs were standardised
     head_epochs: int = 0  #: ours: after the last epoch the head goes on alone, on descriptors computed once
     head_batch: int = 64  #: pairs
     head_learning_rate: float = 1e-3  #: to begin with
@@ -38,6 +41,11 @@ class TrainSettings:
         True  #: bfloat16 where max-pooling looks for its winners; a third less time on the CPU
     )
     pairs: PairSettings = field(default_factory=PairSettings)
+
+    @property
+    def network(self) -> TrainableNetwork[Any]:
+        """What is trained. Raises KeyError for a detector that has no network."""
+        return NETWORKS[self.detector](**detector_settings(asdict(self)))
 
     @property
     def schedule(self) -> Schedule:
@@ -50,10 +58,29 @@ class TrainSettings:
 
 
 #: Sections 3.5 to 3.8 to the letter.
-PAPER = TrainSettings(pairs=PAPER_PAIRS, settle_head=False)
+PAPER = TrainSettings(pairs=PAPER_PAIRS, initialize_head=False)
+
+
+#: What checkpoints of release 0.1 call settings that have other names today.
+_NAMES_OF_0_1 = {"settle_head": "initialize_head", "twins": "matched_pairs"}
 
 
 def whole(settings: dict[str, Any]) -> dict[str, Any]:
-    """The settings of a checkpoint; what they do not know yet has its default."""
+    """Return the settings of a checkpoint under their names of today; what they do not know yet has its default."""
     default = asdict(TrainSettings())
-    return {**default, **settings, "pairs": {**default["pairs"], **settings["pairs"]}}
+    pairs = {**default["pairs"], **_renamed(settings["pairs"])}
+    return {**default, **_renamed(settings), "pairs": pairs}
+
+
+def detector_settings(settings: dict[str, Any]) -> dict[str, Any]:
+    """Return what of a checkpoint's settings the model's card says as its detector's own."""
+    pairs = settings["pairs"]
+    return {
+        "patch_points": pairs["patch_points"],
+        "chamfer_points": pairs.get("chamfer_points", SAMPLE_POINTS),
+        "seed": settings["seed"],
+    }
+
+
+def _renamed(settings: dict[str, Any]) -> dict[str, Any]:
+    return {_NAMES_OF_0_1.get(name, name): value for name, value in settings.items()}

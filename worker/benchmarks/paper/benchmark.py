@@ -27,7 +27,7 @@ from worker.benchmarks.plots import Log
 from worker.detectors.card import MODEL_STORE, Card
 from worker.detectors.detector import Detector
 from worker.metrics import PAPER_SWEEP, best_f1
-from worker.pipeline.flow import PipelineSettings
+from worker.pipeline.settings import PipelineSettings
 from worker.progress import Progress, no_progress
 
 QUICK = ("magnitude_15cm", "type_remove", "baseline_no_change")

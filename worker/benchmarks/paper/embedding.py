@@ -12,6 +12,7 @@ from worker.benchmarks.paper.scoring import CachedDetector, MethodScores, select
 from worker.benchmarks.paper.trial import Trial
 from worker.cloud.tiling import Tiles
 from worker.cloud.types import Floats
+from worker.detectors.comparison import side_of
 
 UNCHANGED_A_TRIAL = 15  #: of the many that are rightly left alone; the others are drawn all
 SEED = 42
@@ -32,7 +33,7 @@ def embed(
     cached: CachedDetector, given: Sequence[Trial], found: MethodScores, threshold: float
 ) -> Embedding | None:
     """Of all pairs that are changed or flagged, and some others; None for a detector without descriptors."""
-    known = cached.description.get("descriptors")
+    known = cached.embedding.get("descriptors")
     if known is None:
         return None
     rng = np.random.default_rng(SEED)
@@ -44,7 +45,10 @@ def embed(
             continue
         pair = selected(trial.pairs, chosen)
         current = Tiles(grid=pair.reference.grid, indices=pair.reference.indices, points=pair.current)
-        reference, now = known[chosen], cached.detector.describe(current)["descriptors"]
+        reference, now = (
+            known[chosen],
+            cached.detector.encode_reference(side_of(current), current)["descriptors"],
+        )
         vectors.append(np.hstack([np.abs(reference - now), reference * now]))
         distances.append(np.linalg.norm(reference - now, axis=1))
         outcomes.append(outcome[chosen])

@@ -9,10 +9,10 @@ import torch
 
 from worker.benchmarks.plots import Log, read_log
 from worker.detectors.detector import Detector
-from worker.detectors.spicd_net.detector import SpicdNet
-from worker.detectors.store import open_card, open_detector, resolve_device, sha256_of
+from worker.detectors.store import DETECTORS, open_card, open_detector, resolve_device, sha256_of
 from worker.errors import DetectorUnavailable
 from worker.training.log import LOG
+from worker.training.settings import detector_settings
 
 
 def open_measured(model_store: Path, model: str, weights: Path | None) -> Detector:
@@ -25,18 +25,13 @@ def open_measured(model_store: Path, model: str, weights: Path | None) -> Detect
     card = open_card(model_store, model)
     try:
         state = torch.load(weights, map_location="cpu", weights_only=True)
-        own = {
-            "patch_points": state["settings"]["pairs"]["patch_points"],
-            "chamfer_points": state["settings"]["pairs"].get("chamfer_points", 128),
-            "seed": state["settings"]["seed"],
-        }
         update = {
             "version": weights.stem,
-            "preprocessing": card.preprocessing.model_copy(update=own),
+            "detector_settings": detector_settings(state["settings"]),
             "sha256": sha256_of(state["network"]),
         }
         card = card.model_copy(update=update)
-        return SpicdNet.load(card, state["network"], resolve_device("auto"))
+        return DETECTORS[card.detector].load(card, state["network"], resolve_device("auto"))
     except OSError as missing:
         raise DetectorUnavailable(f"no checkpoint at {weights}: {missing.strerror}") from missing
     except (AttributeError, KeyError, TypeError, EOFError, RuntimeError, pickle.UnpicklingError) as unsound:

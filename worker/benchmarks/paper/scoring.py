@@ -14,6 +14,7 @@ from worker.benchmarks.baselines import Baseline
 from worker.benchmarks.paper.trial import Trial
 from worker.cloud.tiling import TilePairs, Tiles
 from worker.cloud.types import Arrays, Bools, Floats
+from worker.detectors.comparison import Comparison, side_of
 from worker.detectors.detector import Detector
 
 
@@ -26,15 +27,15 @@ class CachedDetector:
 
     detector: Detector
     tiles: Tiles
-    _description: Arrays | None = field(default=None, init=False)
+    _embedding: Arrays | None = field(default=None, init=False)
     _known: dict[bytes, NDArray[np.float32]] = field(default_factory=dict, init=False)
 
     @property
-    def description(self) -> Arrays:
+    def embedding(self) -> Arrays:
         """Of the reference."""
-        if self._description is None:
-            self._description = self.detector.describe(self.tiles)
-        return self._description
+        if self._embedding is None:
+            self._embedding = self.detector.encode_reference(side_of(self.tiles), self.tiles)
+        return self._embedding
 
     def score(self, pairs: TilePairs) -> NDArray[np.float32]:
         """(T,) probability of change; NaN where not observed. The pairs must be of this map."""
@@ -44,8 +45,8 @@ class CachedDetector:
         )
         if len(new):
             part = selected(pairs, new)
-            known = {name: values[new] for name, values in self.description.items()}
-            found = self.detector.score(part, description=known)
+            known = {name: values[new] for name, values in self.embedding.items()}
+            found = self.detector.detect(Comparison.of_tiles(part), embedding=known)
             self._known |= {keys[tile]: row for tile, row in zip(new, found.change, strict=True)}
         nothing = np.float32(np.nan)
         return np.array(
@@ -88,9 +89,9 @@ def scored(
 
 def scored_by_detector(name: str, cached: CachedDetector, given: Sequence[Trial]) -> MethodScores:
     """Every trial by the detector, and the seconds of one map scored as a survey does it, nothing kept but the reference."""
-    known = cached.description
+    known = cached.embedding
     begun = time.perf_counter()
-    cached.detector.score(given[0].pairs, description=known)
+    cached.detector.detect(Comparison.of_tiles(given[0].pairs), embedding=known)
     seconds = time.perf_counter() - begun
     return scored(name, lambda pairs: cached.score(pairs).astype(np.float64), given, seconds)
 

@@ -14,11 +14,11 @@ from worker.cloud.poses import transformed
 from worker.cloud.tiling import TileGrid, Tiles, cut, grid_over
 from worker.cloud.types import Matrix4, Points
 from worker.cloud.voxels import Voxels, merged_in_order
-from worker.pipeline.flow import PipelineSettings
 from worker.pipeline.mapping.fusion import reference_map
 from worker.pipeline.mapping.map_registration import register_map_scans
 from worker.pipeline.registration.icp import Surface
 from worker.pipeline.registration.results import ScanFile
+from worker.pipeline.settings import PipelineSettings
 from worker.progress import Progress
 from worker.simulation.scenes import corridor
 from worker.simulation.sensor import SimulatedScan
@@ -98,7 +98,7 @@ def _registered(
         ]
         for file, scan in zip(files, seen, strict=True):
             write_pcd(file.path, scan.points)
-        outcomes = register_map_scans(files, settings=pipeline.placing, progress=progress).outcomes
+        outcomes = register_map_scans(files, settings=pipeline.multi_scan, progress=progress).outcomes
     return [
         (scan.points, outcome.placement.map_from_scan)
         for scan, outcome in zip(seen, outcomes, strict=True)
@@ -116,7 +116,7 @@ def _mapped(
     grid = grid_over(whole.points, tile_size=pipeline.tiling.tile_size, voxel_size=size)
     known = None
     if not settings.true_poses:
-        known = reference_map(whole, settings=pipeline.registration).surface()
+        known = reference_map(whole, grid=grid, settings=pipeline.registration).surface()
     tiles = cut(whole.points, grid, min_points=pipeline.tiling.min_points)
     return Site(
         name=name,

@@ -25,7 +25,8 @@ from worker.benchmarks.registration.scenario import (
 from worker.benchmarks.registration.stage_clock import StageClock, processor_seconds
 from worker.benchmarks.registration.survey import time_survey
 from worker.cloud.types import Matrix4
-from worker.pipeline.flow import BuiltMap, PipelineSettings, build_map
+from worker.pipeline.flow import BuiltMap, build_map
+from worker.pipeline.settings import PipelineSettings
 from worker.progress import Progress, no_progress
 
 #: Table 2 of the paper; Section 3.3.2 for the share of ICP calls that are saved ("over 80%")

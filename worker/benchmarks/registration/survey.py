@@ -13,10 +13,10 @@ from worker.cloud.formats.pcd import write_pcd
 from worker.cloud.formats.scan import read_scan
 from worker.cloud.poses import difference, inverse
 from worker.cloud.types import Matrix4
-from worker.pipeline.flow import PipelineSettings
 from worker.pipeline.mapping.fusion import ReferenceMap
 from worker.pipeline.registration.preprocessing import prepare
 from worker.pipeline.registration.scan_to_map import register
+from worker.pipeline.settings import PipelineSettings
 from worker.simulation.visits import drifted_within, stops, visit
 
 REPEATS = 7  #: after one that warms up

@@ -25,7 +25,7 @@ from worker.benchmarks.revisit.tile_table import TileTable, tile_table
 from worker.benchmarks.revisit.visits import load_visits, make_visits
 from worker.detectors.card import MODEL_STORE
 from worker.detectors.store import open_card
-from worker.pipeline.flow import PipelineSettings
+from worker.pipeline.settings import PipelineSettings
 from worker.progress import Progress, no_progress
 
 VISITS = "visits"  #: folder of what is kept, within the benchmark's own

@@ -15,6 +15,7 @@ from worker.benchmarks.paper.measured import open_measured
 from worker.benchmarks.revisit.record import Revisit
 from worker.cloud.tiling import TilePairs, Tiles
 from worker.cloud.types import Arrays
+from worker.detectors.comparison import Comparison
 from worker.detectors.detector import Detector
 from worker.detectors.store import open_detector
 from worker.progress import Progress, no_progress
@@ -60,12 +61,16 @@ class DetectorScore:
 
     detector: Detector
     _tiles: Tiles | None = None
-    _description: Arrays = field(default_factory=dict)
+    _embedding: Arrays = field(default_factory=dict)
 
     def __call__(self, pairs: TilePairs) -> TileScore:
+        comparison = Comparison.of_tiles(pairs)
         if self._tiles is None or not _equal(self._tiles, pairs.reference):
-            self._tiles, self._description = pairs.reference, self.detector.describe(pairs.reference)
-        return self.detector.score(pairs, description=self._description).change
+            self._tiles, self._embedding = (
+                pairs.reference,
+                self.detector.encode_reference(comparison.reference, pairs.reference),
+            )
+        return self.detector.detect(comparison, embedding=self._embedding).change
 
 
 def opened(model_store: Path, model: str) -> Method:

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from worker.cloud import npz
 from worker.cloud.tiling import TilePairs
-from worker.cloud.types import Arrays, Bools, Floats
-from worker.pipeline import archive
+from worker.cloud.types import Bools, Floats
 from worker.simulation.truth import MIN_CELLS
 
 NOTHING = -1  #: in place of an index into KINDS
@@ -74,55 +74,20 @@ class Revisit:
 
 
 def save(revisit: Revisit, folder: Path) -> None:
-    """Two files of plain arrays; the second is written last and vouches for the first. Raises OSError."""
+    """Keep the visit in one file of plain arrays. Raises OSError."""
     folder.mkdir(parents=True, exist_ok=True)
-    archive.save_pairs(folder / f"{revisit.name}.pairs.npz", revisit.pairs)
-    archive.save_arrays(
-        folder / f"{revisit.name}.truth.npz",
-        {
-            "cells": revisit.cells,
-            "in_sight": revisit.in_sight,
-            "outside": np.array([revisit.outside]),
-            "misfit": revisit.misfit,
-            "sigma": revisit.sigma,
-            **_scan_arrays("first", revisit.first),
-            **_scan_arrays("second", revisit.second),
-        },
-    )
+    npz.save(_path(revisit.name, folder), revisit)
 
 
 def kept(name: str, folder: Path) -> bool:
-    """Whether there is a visit of this name."""
-    return (folder / f"{name}.truth.npz").exists()
+    """Return whether there is a visit of this name."""
+    return _path(name, folder).exists()
 
 
 def load(name: str, folder: Path) -> Revisit:
-    """Read what `save` wrote. Raises OSError, and ValueError for other files."""
-    truth = archive.load_arrays(folder / f"{name}.truth.npz")
-    return Revisit(
-        name=name,
-        pairs=archive.load_pairs(folder / f"{name}.pairs.npz"),
-        cells=truth["cells"],
-        in_sight=truth["in_sight"],
-        outside=int(truth["outside"][0]),
-        misfit=truth["misfit"],
-        sigma=truth["sigma"],
-        first=_scan_errors("first", truth),
-        second=_scan_errors("second", truth),
-    )
+    """Read what `save` kept. Raises OSError, and ValueError for other files."""
+    return npz.load(_path(name, folder), Revisit)
 
 
-def _scan_arrays(which: str, errors: ScanErrors) -> Arrays:
-    return {
-        f"{which}_scans": np.array([errors.scans]),
-        f"{which}_metres": errors.metres,
-        f"{which}_sigmas": errors.sigmas,
-    }
-
-
-def _scan_errors(which: str, arrays: Arrays) -> ScanErrors:
-    return ScanErrors(
-        scans=int(arrays[f"{which}_scans"][0]),
-        metres=arrays[f"{which}_metres"],
-        sigmas=arrays[f"{which}_sigmas"],
-    )
+def _path(name: str, folder: Path) -> Path:
+    return folder / f"{name}.npz"

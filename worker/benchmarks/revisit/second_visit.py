@@ -122,12 +122,10 @@ def _located(
 ) -> tuple[TilePairs, tuple[ScanResult, ...]]:
     built = site.built
     try:
-        located = locate_survey(
-            files, built.reference, built.tiles, settings=settings.pipeline, progress=progress
-        )
+        located = locate_survey(files, built.reference, settings=settings.pipeline, progress=progress)
     except NoScanAccepted as nobody:
         return _unobserved(built.tiles, settings), nobody.outcomes
-    return located.pairs, located.outcomes
+    return located.comparison.tile_pairs, located.outcomes
 
 
 def _unobserved(tiles: Tiles, settings: RevisitSettings) -> TilePairs:

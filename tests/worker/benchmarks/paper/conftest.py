@@ -9,7 +9,7 @@ from worker.benchmarks.paper.site import Site, flat_cells, tiles_of
 from worker.cloud.tiling import cut, grid_over
 from worker.cloud.types import Points
 from worker.cloud.voxels import Voxels, merged_in_order
-from worker.pipeline.flow import PipelineSettings
+from worker.pipeline.settings import PipelineSettings
 
 TILES = 4
 POINTS = 2000  #: of a scan in a tile

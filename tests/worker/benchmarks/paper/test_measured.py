@@ -22,7 +22,7 @@ def test_a_checkpoint_brings_its_weights_patch_size_and_seed(tmp_path: Path) -> 
     torch.save({"settings": settings, "network": SpicdNetwork().state_dict()}, tmp_path / "fresh.pt")
     card = open_measured(MODEL_STORE, "spicd-net/1", tmp_path / "fresh.pt").card
     shipped = open_card(MODEL_STORE, "spicd-net/1")
-    assert (card.preprocessing.patch_points, card.preprocessing.seed) == (1024, 7)
+    assert card.detector_settings == {"patch_points": 1024, "chamfer_points": 128, "seed": 7}
     assert (card.name, card.version) == ("spicd-net", "fresh")
     assert card.preprocessing.tile_size == shipped.preprocessing.tile_size
     assert card.threshold == shipped.threshold

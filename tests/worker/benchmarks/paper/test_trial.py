@@ -14,7 +14,8 @@ from worker.benchmarks.paper.trial import trials
 from worker.cloud.tiling import TilePairs, Tiles
 from worker.cloud.types import Arrays
 from worker.detectors.card import Card, Preprocessing
-from worker.detectors.detector import TileScores
+from worker.detectors.comparison import Comparison, Side
+from worker.detectors.detector import Detection
 from worker.progress import Progress, no_progress
 
 
@@ -27,27 +28,26 @@ class CountingDetector:
         detector="counting",
         summary="",
         threshold=0.0,
-        preprocessing=Preprocessing(
-            voxel_size=0.05, tile_size=(1.5, 1.5, 1.0), patch_points=4096, min_points=512, seed=1
-        ),
+        preprocessing=Preprocessing(voxel_size=0.05, tile_size=(1.5, 1.5, 1.0), min_points=512),
     )
 
     def __init__(self) -> None:
         self.described = 0
         self.asked: list[int] = []
 
-    def describe(self, tiles: Tiles, *, progress: Progress = no_progress) -> Arrays:
+    def encode_reference(self, reference: Side, tiles: Tiles, *, progress: Progress = no_progress) -> Arrays:
         self.described += 1
         return {"counts": np.array([len(points) for points in tiles.points])}
 
-    def score(
-        self, pairs: TilePairs, *, description: Arrays | None = None, progress: Progress = no_progress
-    ) -> TileScores:
-        assert description is not None
+    def detect(
+        self, comparison: Comparison, *, embedding: Arrays | None = None, progress: Progress = no_progress
+    ) -> Detection:
+        assert embedding is not None
+        pairs = comparison.tile_pairs
         self.asked.append(len(pairs.current))
         now = np.array([len(points) for points in pairs.current])
-        share = np.abs(now - description["counts"]) / description["counts"]
-        return TileScores(probabilities=np.stack([1 - share, share, 0 * share], axis=1).astype(np.float32))
+        share = np.abs(now - embedding["counts"]) / embedding["counts"]
+        return Detection.of_scores(share)
 
 
 NOTHING = replace(ONE, name="nothing", operation=None)

@@ -11,7 +11,7 @@ import torch
 from worker.benchmarks.revisit.baselines import baseline_methods
 from worker.benchmarks.revisit.methods import DetectorScore, from_checkpoint, opened
 from worker.detectors.card import MODEL_STORE
-from worker.detectors.detector import TileScores
+from worker.detectors.detector import Detection
 from worker.detectors.spicd_net.network import SpicdNetwork
 from worker.detectors.store import open_card
 from worker.errors import DetectorUnavailable
@@ -42,13 +42,13 @@ def test_what_a_detector_says_of_a_map_is_asked_once_and_anew_for_another_map(wa
     class Counting:
         described = 0
 
-        def describe(self, tiles):
+        def encode_reference(self, reference, tiles):
             self.described += 1
             return {"of": np.array([len(tiles.points)])}
 
-        def score(self, pairs, *, description):
-            assert description["of"] == len(pairs.current)
-            return TileScores(probabilities=np.zeros((len(pairs.current), 3), np.float32))
+        def detect(self, comparison, *, embedding):
+            assert embedding["of"] == len(comparison.tiles)
+            return Detection.of_scores(np.zeros(len(comparison.tiles)))
 
     score = DetectorScore(detector=Counting())
     for pairs in (walked["changed"].pairs, walked["sparse"].pairs, made_visit(cells=[[0, 0, 0]]).pairs):

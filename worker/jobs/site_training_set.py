@@ -33,7 +33,7 @@ def halves(scans: Iterable[RegisteredScan], *, voxel_size: float) -> tuple[Point
 def training_set(
     tiles: Tiles, visits: tuple[Points, Points], *, settings: TilingSettings, source: str
 ) -> TileSet:
-    """Where both visits saw a tile well, it is of these two; any other tile of the map has one look alone."""
+    """Where both visits saw a tile well, it is of these two; any other tile of the map has one observation alone."""
     first, second = visits
     seen = _seen_twice(first, second, tiles, settings)
     middle = tiles.grid.centers(tiles.indices)
@@ -44,7 +44,7 @@ def training_set(
     return TileSet(
         points_a=tuple(_about(a, centre) for (a, _), centre in zip(pairs, middle, strict=True)),
         points_b=tuple(_about(b, centre) for (_, b), centre in zip(pairs, middle, strict=True)),
-        looks=(),
+        observations=(),
         centres=middle,
         buildings=np.zeros(len(pairs), np.int32),
         tile_size=settings.tile_size,
