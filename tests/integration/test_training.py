@@ -49,8 +49,9 @@ def test_the_training_set_is_the_map_seen_by_the_halves_of_its_scans(house: Hous
     job = asked(house)
     run(job, "pack")
     tiles = packed(house, job)
-    with house.catalog.blobs.local(blob_keys.map_tiles(house.catalog.versions.ready(MAP, 1).job_id)) as path:
-        of_map = archive.load_tiles(path)
+    key = blob_keys.map_reference(house.catalog.versions.ready(MAP, 1).job_id)
+    with house.catalog.blobs.local(key) as path:
+        of_map = archive.load_reference(path).tiles(min_points=512)
     assert tiles.centres == pytest.approx(of_map.grid.centers(of_map.indices))
     twice = [at for at, points in enumerate(tiles.points_b) if len(points)]
     assert 5 < len(twice) < len(tiles)
@@ -118,9 +119,10 @@ def test_a_model_is_trained_further_calibrated_and_named_by_a_survey(house: Hous
     assert house.catalog.jobs.get(job.job_id).status == "successful"
     assert (model.model, model.status, model.map_version) == ("lobby-net/1", "ready", 1)
     card = Card.model_validate(model.card)
-    assert (card.name, card.version, card.preprocessing.patch_points) == ("lobby-net", "1", 512)
+    assert (card.name, card.version) == ("lobby-net", "1")
+    assert card.detector_settings["patch_points"] == 512
     trained_on = card.training["settings"]["pairs"]["chamfer_points"]
-    assert card.preprocessing.chamfer_points == trained_on == 128  # as the base, whose card names none
+    assert card.detector_settings["chamfer_points"] == trained_on == 128  # as the base, whose card names none
     assert (card.training["map_id"], card.training["base"]) == (MAP, MODEL)
     assert set(card.evaluation) == {"validation", MODEL, "pairs"}  # beside what it started from
     assert card.evaluation["validation"]["threshold"] == card.threshold

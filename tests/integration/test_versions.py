@@ -55,8 +55,8 @@ def counted(house: House, number: int) -> dict[str, int]:
 
 
 def tiles_of(house: House, job_id: str) -> Tiles:
-    with house.catalog.blobs.local(blob_keys.map_tiles(job_id)) as path:
-        return archive.load_tiles(path)
+    with house.catalog.blobs.local(blob_keys.map_reference(job_id)) as path:
+        return archive.load_reference(path).tiles(min_points=512)
 
 
 def scan_of(house: House, job_id: str, scan: ScanOutcome) -> RegisteredScan:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.support.release_0_1 import current_of_0_1, reference_of_0_1, scan_of_0_1, tiles_of_0_1
 from tests.support.rooms import scores_of
 from tests.support.tilings import grid_of, in_tile, row_of
 from tests.worker.cloud.test_npz import assert_same
@@ -95,20 +96,9 @@ def test_a_map_of_release_0_1_has_its_grid_from_the_file_of_its_tiles(
     tmp_path: Path, colors: np.ndarray | None, lowest: tuple[int, int, int] | None
 ) -> None:
     """The grid of a map that never grew says nothing of a lowest index."""
-    now, more = reference_of(colors), {} if colors is None else {"colors": colors}
-    np.savez(
-        tmp_path / "reference.npz",
-        points=now.points,
-        normals=now.normals,
-        oriented=now.oriented,
-        voxel_size=np.array([now.voxel_size]),
-        **more,
-    )
-    grid = {"origin": now.grid.origin, "size": now.grid.size, "shape": np.array(now.grid.shape, np.int64)}
-    if lowest is not None:
-        grid["lowest"] = np.array(lowest, np.int64)
-    tiles = {"indices": np.zeros((1, 3), np.int32), "dense/tile_000_000_000": POINTS}
-    np.savez(tmp_path / "tiles.npz", **grid, **tiles, **{"patch/tile_000_000_000": POINTS})
+    now = reference_of(colors)
+    reference_of_0_1(tmp_path / "reference.npz", now)
+    tiles_of_0_1(tmp_path / "tiles.npz", now.tiles(min_points=1), lowest=lowest is not None)
     found = archive.load_reference(tmp_path / "reference.npz", tiles_of_0_1=tmp_path / "tiles.npz")
     if lowest is not None:
         assert_same(now, found)
@@ -121,19 +111,11 @@ def test_a_map_of_release_0_1_has_its_grid_from_the_file_of_its_tiles(
 
 @pytest.mark.parametrize("colors", [COLORS, None])
 def test_a_survey_and_a_scan_of_release_0_1_come_back(tmp_path: Path, colors: np.ndarray | None) -> None:
-    more = {} if colors is None else {"colors": colors}
-    np.savez(tmp_path / "current.npz", points=POINTS, **more)
-    assert_same(CurrentMap(points=POINTS, colors=colors), npz.load(tmp_path / "current.npz", CurrentMap))
+    current, scan = CurrentMap(points=POINTS, colors=colors), scan_of(colors, np.ones(3))
+    current_of_0_1(tmp_path / "current.npz", current)
+    assert_same(current, npz.load(tmp_path / "current.npz", CurrentMap))
+    scan_of_0_1(tmp_path / "now.pcd", scan)
+    assert_same(scan, archive.load_scan(tmp_path / "now.pcd"))
     probabilities = scores_of((0.1, 0.2, 0.7), NAN).probabilities
     np.savez(tmp_path / "scores.npz", probabilities=probabilities)
     assert_same(Detection(probabilities=probabilities), npz.load(tmp_path / "scores.npz", Detection))
-    scan = scan_of(colors, np.ones(3))
-    np.savez(
-        tmp_path / "now.pcd",
-        points=scan.points,
-        map_from_scan=scan.map_from_scan,
-        sensor_origin=scan.sensor_origin,
-        **more,
-    )
-    (tmp_path / "now.pcd.npz").rename(tmp_path / "now.pcd")
-    assert_same(scan, archive.load_scan(tmp_path / "now.pcd"))
