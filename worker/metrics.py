@@ -72,12 +72,12 @@ class Confusion:
         return _ratio(self.false_positives, self.false_positives + self.true_negatives)
 
     def precision_at(self, prevalence: float) -> float:
-        """Return the precision where such a share of the tiles (0..1) is changed, at the same recall and rate of alarms."""
+        """Return the precision where such a share (0..1) of the tiles changed, at the same recall and false alarms."""
         hits, alarms = prevalence * self.recall, (1 - prevalence) * self.false_positive_rate
         return hits / (hits + alarms) if hits + alarms > 0 else 0.0
 
     def figures(self) -> dict[str, float | int | None]:
-        """All of the above, JSON-ready: None where a ratio has no meaning."""
+        """Return all of the above, JSON-ready: None where a ratio has no meaning."""
         ratios = {
             "precision": self.precision,
             "recall": self.recall,
@@ -111,7 +111,7 @@ def confusion(scores: Scores, truth: Bools, threshold: float, observed: Bools | 
 
 
 def pooled(counts: Iterable[Confusion]) -> Confusion:
-    """All counts added up, so that figures are micro-aggregated (paper, Table 5, last row)."""
+    """Return all counts added up, so that figures are micro-aggregated (paper, Table 5, last row)."""
     return sum(counts, Confusion())
 
 
@@ -183,7 +183,7 @@ class PrecisionRecall:
 
 
 def sweep(scores: Scores, truth: Bools, thresholds: Floats = PAPER_SWEEP) -> Sweep:
-    """Counts of tiles (T,) at each threshold."""
+    """Count tiles (T,) at each threshold."""
     changed, unchanged = (np.sort(scores[chosen & ~np.isnan(scores)]) for chosen in (truth, ~truth))
     above = [len(part) - np.searchsorted(part, thresholds, side="right") for part in (changed, unchanged)]
     return Sweep(
@@ -196,7 +196,7 @@ def sweep(scores: Scores, truth: Bools, thresholds: Floats = PAPER_SWEEP) -> Swe
 
 
 def all_thresholds(scores: Scores) -> Floats:
-    """(K,) ascending: one below every score, then one in each gap, then the highest score; every cut there is."""
+    """Return every cut there is, (K,) ascending: below every score, in each gap, at the highest score."""
     values = np.unique(scores[~np.isnan(scores)]).astype(np.float64)
     if not len(values):
         return np.zeros(1)
@@ -205,39 +205,39 @@ def all_thresholds(scores: Scores) -> Floats:
 
 
 def best_f1(scores: Scores, truth: Bools, thresholds: Floats | None = PAPER_SWEEP) -> Operating:
-    """The threshold with the highest F1 over tiles (T,), the middle one of equals; of every cut if None is given.
+    """Return the threshold with the highest F1 over tiles (T,), the middle of equals; of every cut if None is given.
 
     Raises ValueError where nothing changed: every threshold is then as good.
     """
     if not truth.any():
         raise ValueError("a threshold cannot be chosen by F1 where no tile changed")
-    found = sweep(scores, truth, all_thresholds(scores) if thresholds is None else thresholds)
-    equals = np.flatnonzero(found.f1 >= found.f1.max() - 1e-12)
-    threshold = float(found.thresholds[equals[len(equals) // 2]])
+    swept = sweep(scores, truth, all_thresholds(scores) if thresholds is None else thresholds)
+    equals = np.flatnonzero(swept.f1 >= swept.f1.max() - 1e-12)
+    threshold = float(swept.thresholds[equals[len(equals) // 2]])
     return Operating(threshold=threshold, counts=confusion(scores, truth, threshold))
 
 
 def roc(scores: Scores, truth: Bools) -> Roc:
-    """Over every cut of the tiles (T,); those without a score are never flagged but by "everything"."""
-    found = sweep(scores, truth, all_thresholds(scores)[::-1])
-    rates = [np.r_[0.0, rate, 1.0] for rate in (found.false_positive_rate, found.recall)]
+    """Return the curve over every cut of the tiles (T,); only "everything" flags those without a score."""
+    swept = sweep(scores, truth, all_thresholds(scores)[::-1])
+    rates = [np.r_[0.0, rate, 1.0] for rate in (swept.false_positive_rate, swept.recall)]
     return Roc(
         false_positive_rate=rates[0],
         recall=rates[1],
-        thresholds=np.r_[np.inf, found.thresholds, -np.inf],
+        thresholds=np.r_[np.inf, swept.thresholds, -np.inf],
         area=float((np.diff(rates[0]) * (rates[1][1:] + rates[1][:-1]) / 2).sum()),
     )
 
 
 def precision_recall(scores: Scores, truth: Bools) -> PrecisionRecall:
-    """Over every cut of the tiles (T,) that flags something."""
-    found = sweep(scores, truth, all_thresholds(scores)[::-1])
-    flags = found.true_positives + found.false_positives > 0
-    recall, precision = found.recall[flags], found.precision[flags]
+    """Return the curve over every cut of the tiles (T,) that flags something."""
+    swept = sweep(scores, truth, all_thresholds(scores)[::-1])
+    flags = swept.true_positives + swept.false_positives > 0
+    recall, precision = swept.recall[flags], swept.precision[flags]
     return PrecisionRecall(
         recall=recall,
         precision=precision,
-        thresholds=found.thresholds[flags],
+        thresholds=swept.thresholds[flags],
         average_precision=float((np.diff(recall, prepend=0.0) * precision).sum()),
     )
 

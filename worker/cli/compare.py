@@ -42,7 +42,7 @@ def compare(
     threshold: float | None = None,
     progress: Progress = no_progress,
 ) -> TwoVisits:
-    """The whole method on files. Raises PipelineError, and OSError for a file that is not there."""
+    """Return the whole method on files. Raises PipelineError, and OSError for a file that is not there."""
     settings = PipelineSettings.model_validate({}).for_model(detector.card.preprocessing)
     earlier, later = (
         [ScanFile(name=str(path), path=path) for path in paths] for paths in (references, currents)
@@ -54,32 +54,34 @@ def compare(
     return TwoVisits(built=built, located=located, changes=changes)
 
 
-def write_results(found: TwoVisits, out: Path, *, map_id: str, survey_id: str, model: str) -> dict[str, Path]:
-    """`tiles.geojson`, `cloud.ply` and `picture.png` in the folder `out`, by what they are. Raises OSError."""
+def write_results(
+    visits: TwoVisits, out: Path, *, map_id: str, survey_id: str, model: str
+) -> dict[str, Path]:
+    """Write `tiles.geojson`, `cloud.ply` and `picture.png` to the folder `out`, by what they are. Raises OSError."""
     out.mkdir(parents=True, exist_ok=True)
     files = {"tiles": out / "tiles.geojson", "cloud": out / "cloud.ply", "picture": out / "picture.png"}
-    features = feature_collection(found.changes, map_id=map_id, survey_id=survey_id, model=model)
+    features = feature_collection(visits.changes, map_id=map_id, survey_id=survey_id, model=model)
     files["tiles"].write_text(json.dumps(features, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-    write_coloured_cloud(files["cloud"], found.located.current, found.changes)
+    write_coloured_cloud(files["cloud"], visits.located.current, visits.changes)
     draw_picture(
         files["picture"],
-        found.built.reference.points,
-        found.located.current,
-        found.changes,
+        visits.built.reference.points,
+        visits.located.current,
+        visits.changes,
         title=f"{survey_id} compared with {map_id}",
     )
     return files
 
 
-def document(found: TwoVisits, files: dict[str, Path], *, model: str) -> dict[str, Any]:
-    """The comparison, JSON-ready; changed tiles most certain first, metres, frame of the first reference."""
-    changed = [tile for tile in tile_results(found.changes) if tile.state == "changed"]
+def document(visits: TwoVisits, files: dict[str, Path], *, model: str) -> dict[str, Any]:
+    """Return the comparison, JSON-ready; changed tiles most certain first, metres, frame of the first reference."""
+    changed = [tile for tile in tile_results(visits.changes) if tile.state == "changed"]
     return {
         "model": model,
-        "threshold": found.changes.threshold,
-        "counts": {"tiles": len(found.changes.states), **found.changes.counts()},
-        "reference": [_registration(outcome) for outcome in found.built.outcomes],
-        "current": [_registration(outcome) for outcome in found.located.outcomes],
+        "threshold": visits.changes.threshold,
+        "counts": {"tiles": len(visits.changes.states), **visits.changes.counts()},
+        "reference": [_registration(outcome) for outcome in visits.built.outcomes],
+        "current": [_registration(outcome) for outcome in visits.located.outcomes],
         "changed": [asdict(tile) for tile in sorted(changed, key=lambda tile: -(tile.score or 0.0))],
         "files": {what: str(path) for what, path in files.items()},
     }

@@ -67,7 +67,10 @@ def save_arrays(path: Path, arrays: Arrays) -> None:
 
 
 def load_arrays(path: Path, names: Collection[str] | None = None) -> Arrays:
-    """Read what `save_arrays` kept, or of it the arrays of these names. Raises OSError, and ValueError, which names the file, for any other file."""
+    """Read what `save_arrays` kept, or of it the arrays of these names.
+
+    Raises OSError, and ValueError, which names the file, for any other file.
+    """
     try:
         with np.load(path, allow_pickle=False) as archive:
             return {name: archive[name] for name in archive if names is None or name in names}
@@ -159,4 +162,4 @@ def _inner(name: str, field: str) -> str:
 def _kept(name: str, arrays: Arrays) -> bool:
     """Whether any array belongs to the value of this name."""
     own = (name, f"{name}_points")
-    return any(found in own or found.startswith(f"{name}.") for found in arrays)
+    return any(kept in own or kept.startswith(f"{name}.") for kept in arrays)

@@ -43,22 +43,22 @@ class TileGrid:
     lowest: tuple[int, int, int] = (0, 0, 0)  #: indices of the first tile
 
     def lower(self, indices: Indices) -> Floats:
-        """(T, 3) metres, map frame: minimum corners."""
+        """Return (T, 3) metres, map frame: minimum corners."""
         return self.origin + indices * self.size
 
     def centers(self, indices: Indices) -> Floats:
-        """(T, 3) metres, map frame."""
+        """Return (T, 3) metres, map frame."""
         return self.origin + (indices + 0.5) * self.size
 
     def locate(self, points: Points) -> NDArray[np.int64]:
-        """(N,) the cell that holds each point (N, 3), metres, map frame; -1 outside the grid.
+        """Return (N,) the cell that holds each point (N, 3), metres, map frame; -1 outside the grid.
 
         A cell is the flat number of a tile within `shape`, so that cells sort as tiles do.
         """
         return self.cells(np.floor((points - self.origin) / self.size).astype(np.int64))
 
     def cells(self, indices: NDArray[np.integer[Any]]) -> NDArray[np.int64]:
-        """(T,) the cell of each tile (T, 3); -1 outside the grid."""
+        """Return (T,) the cell of each tile (T, 3); -1 outside the grid."""
         place = indices.astype(np.int64) - self.lowest
         inside = np.all((place >= 0) & (place < self.shape), axis=1)
         cells = np.full(len(place), -1, np.int64)
@@ -66,7 +66,7 @@ class TileGrid:
         return cells
 
     def locate_among(self, points: Points, indices: Indices) -> NDArray[np.int64]:
-        """(N,) the row in `indices` (T, 3) of the tile that holds each point (N, 3); -1 where none of them does."""
+        """Return (N,) the row in `indices` (T, 3) of the tile that holds each point (N, 3); -1 where none does."""
         wanted, cells = self.cells(indices), self.locate(points)
         if not len(wanted):
             return np.full(len(points), -1, np.int64)
@@ -95,13 +95,13 @@ class TilePairs:
 
 
 def tile_id(index: NDArray[np.int32]) -> str:
-    """`tile_III_JJJ_KKK` (paper, Table A1)."""
+    """Return `tile_III_JJJ_KKK` (paper, Table A1)."""
     i, j, k = (int(number) for number in index)
     return f"tile_{i:03d}_{j:03d}_{k:03d}"
 
 
 def grid_over(points: Points, *, tile_size: tuple[float, float, float], voxel_size: float) -> TileGrid:
-    """The grid that starts at the map's minimum corner, snapped down to a voxel so that no voxel is cut in two.
+    """Return the grid that starts at the map's minimum corner, snapped down to a voxel so that no voxel is cut in two.
 
     Raises MapFailed where the points span more tiles than a building has.
     """
@@ -111,7 +111,7 @@ def grid_over(points: Points, *, tile_size: tuple[float, float, float], voxel_si
 
 
 def grown(grid: TileGrid, points: Points) -> TileGrid:
-    """The same grid over the points of a newer version; a tile that both have keeps its index. Raises MapFailed."""
+    """Return the grid over the points of a newer version; a tile of both keeps its index. Raises MapFailed."""
     return _spanned(points, grid.origin, grid.size)
 
 
@@ -121,7 +121,7 @@ def _spanned(points: Points, origin: Floats, size: Floats) -> TileGrid:
     if count.prod() > _MOST_TILES:
         extent = " x ".join(f"{edge:.0f}" for edge in count * size)
         raise MapFailed(f"the map spans {extent} m; remove stray points, or cut it into several maps")
-    shape, lowest = (tuple(int(value) for value in each) for each in (count, low))
+    shape, lowest = (tuple(int(value) for value in values) for values in (count, low))
     return TileGrid(
         origin=origin,
         size=size,

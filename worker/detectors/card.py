@@ -17,7 +17,7 @@ S = TypeVar("S", bound=BaseModel)
 
 
 class Preprocessing(BaseModel):
-    """How a map has to be built for a model: tied to the weights, so it comes from the card and never from a default."""
+    """How a map is built for a model: tied to the weights, so it comes from the card and never from a default."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 

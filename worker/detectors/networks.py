@@ -1,6 +1,6 @@
 """The networks that can be trained, by the key of their detector.
 
-They stand apart from `worker.detectors.store`, for a GPU machine that only trains has torch and NumPy and nothing else.
+They stand apart from `worker.detectors.store`: a GPU machine that only trains has torch and NumPy and nothing else.
 """
 
 from __future__ import annotations

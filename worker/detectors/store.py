@@ -1,4 +1,4 @@
-"""Opens the models of `model_store/`: a card, and weights that match it."""
+"""The models of `model_store/`: opened and written, a card with weights that match it."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ DETECTORS: dict[str, DetectorClass] = {"c2c": CloudToCloud, "spicd-net": SpicdNe
 
 
 def open_detector(model_store: Path, name: str = "spicd-net/1", device: Device = "auto") -> Detector:
-    """The detector `<name>/<version>`, ready to score.
+    """Return the detector `<name>/<version>`, ready to score.
 
     Raises DetectorUnavailable when there is no such model, its card is unsound, its weights are not those of
     the card, or the device is not there.
@@ -61,7 +61,7 @@ def open_detector(model_store: Path, name: str = "spicd-net/1", device: Device =
 
 
 def make_detector(card: Card, content: bytes | None, device: Device = "auto") -> Detector:
-    """The detector of a card and of the bytes of its weights file, None where it has none. Raises DetectorUnavailable."""
+    """Return the detector of a card and the bytes of its weights file (None: none). Raises DetectorUnavailable."""
     name = card.model
     if card.detector not in DETECTORS:
         raise DetectorUnavailable(
@@ -80,12 +80,12 @@ def settings_of(card: Card) -> dict[str, Any]:
 
 
 def open_card(model_store: Path, name: str) -> Card:
-    """The card of `<name>/<version>` without its weights. Raises DetectorUnavailable."""
+    """Return the card of `<name>/<version>` without its weights. Raises DetectorUnavailable."""
     return read_card(_folder(model_store, name))
 
 
 def read_card(folder: Path) -> Card:
-    """The card in a model's folder. Raises DetectorUnavailable."""
+    """Return the card in a model's folder. Raises DetectorUnavailable."""
     path = folder / "card.json"
     try:
         return Card.model_validate_json(path.read_bytes())
@@ -98,7 +98,7 @@ def read_card(folder: Path) -> Card:
 
 
 def resolve_device(device: Device) -> torch.device:
-    """The device to run on; `auto` is the GPU when there is one. Raises DetectorUnavailable."""
+    """Return the device to run on; `auto` is the GPU when there is one. Raises DetectorUnavailable."""
     if device == "cuda" and not torch.cuda.is_available():
         raise DetectorUnavailable("device cuda is asked for, but torch finds no CUDA GPU; use auto or cpu")
     if device == "auto":
@@ -114,7 +114,7 @@ def _folder(model_store: Path, name: str) -> Path:
 
 
 def _weights_file(folder: Path, card: Card) -> bytes | None:
-    """The weights named by the card, read once so that what is hashed is what is loaded."""
+    """Return the weights named by the card, read once so that what is hashed is what is loaded."""
     if card.weights is None:
         return None
     path = folder / card.weights
@@ -125,9 +125,9 @@ def _weights_file(folder: Path, card: Card) -> bytes | None:
 
 
 def _checked_weights(name: str, card: Card, content: bytes) -> Weights:
-    found = hashlib.sha256(content).hexdigest()
-    if found != card.sha256:
-        raise DetectorUnavailable(f"the weights of {name} have sha256 {found}, its card says {card.sha256}")
+    digest = hashlib.sha256(content).hexdigest()
+    if digest != card.sha256:
+        raise DetectorUnavailable(f"the weights of {name} have sha256 {digest}, its card says {card.sha256}")
     try:
         weights: Weights = load(content)
     except SafetensorError as unsound:
@@ -139,7 +139,7 @@ WEIGHTS = "weights.safetensors"
 
 
 def write_model(folder: Path, card: Card, weights: Weights) -> Path:
-    """The weights before the card, whose `sha256` is put in here; returns the folder."""
+    """Write the weights before the card, whose `sha256` is put in here; returns the folder."""
     content = weights_content(weights)
     folder.mkdir(parents=True, exist_ok=True)
     (folder / WEIGHTS).write_bytes(content)
@@ -148,13 +148,13 @@ def write_model(folder: Path, card: Card, weights: Weights) -> Path:
 
 
 def write_card(folder: Path, card: Card) -> None:
-    """`card.json`, aside and renamed. Raises ValueError for a figure that JSON has not, such as NaN."""
+    """Write `card.json`. Raises ValueError for a figure that JSON has not, such as NaN."""
     text = json.dumps(card.model_dump(mode="json"), indent=2, allow_nan=False)
     write_text(folder / "card.json", text + "\n")
 
 
 def weights_content(weights: Weights) -> bytes:
-    """As safetensors; the same weights, the same bytes."""
+    """Return the weights as safetensors; the same weights, the same bytes."""
     content: bytes = save({name: tensor.contiguous() for name, tensor in weights.items()})
     return content
 
@@ -163,11 +163,11 @@ def weights_of(detector: Detector) -> Weights:
     """Return the weights of a detector, to train further from. Raises TrainingFailed where it has none."""
     if not isinstance(detector, TrainedDetector):
         raise TrainingFailed(
-            f"model {detector.card.model} cannot be trained further: a detector {detector.card.detector!r} has no weights"
+            f"model {detector.card.model} cannot be trained further: detector {detector.card.detector!r} has no weights"
         )
     return detector.weights()
 
 
 def sha256_of(weights: Weights) -> str:
-    """What the card of a model with these weights says."""
+    """Return what the card of a model with these weights says."""
     return hashlib.sha256(weights_content(weights)).hexdigest()

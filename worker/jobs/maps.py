@@ -20,14 +20,14 @@ from worker.pipeline.results.manifest import manifest
 
 
 @step
-def register_map(at: Context) -> None:
+def register_map(context: Context) -> None:
     """Scans to a fused, tiled map: the first version of it, or a later one."""
-    version = at.catalog.versions.of_job(at.job.job_id)
-    card = card_of(at, version.model)
-    made = make_version(at, version, pipeline_settings(at, version, card))
-    _put_map(at, made.built, card)
-    at.catalog.versions.save_result(
-        at.job.job_id,
+    version = context.catalog.versions.of_job(context.job.job_id)
+    card = card_of(context, version.model)
+    made = make_version(context, version, pipeline_settings(context, version, card))
+    _put_map(context, made.built, card)
+    context.catalog.versions.save_result(
+        context.job.job_id,
         outcomes=made.outcomes,
         bounds=_bounds(made.built.reference.points),
         counts={
@@ -38,35 +38,35 @@ def register_map(at: Context) -> None:
         },
         registration=made.registration(),
     )
-    at.catalog.blobs.delete_prefix(blob_keys.map_work(at.job.job_id))
+    context.catalog.blobs.delete_prefix(blob_keys.map_work(context.job.job_id))
 
 
 @step
-def describe_map(at: Context) -> None:
+def describe_map(context: Context) -> None:
     """What the model can know of the reference alone; then the map is ready."""
-    version = at.catalog.versions.of_job(at.job.job_id)
-    encode_reference(at, version, kept_detector(at, version.model), version.model)
-    at.catalog.jobs.succeed(at.job.job_id)
+    version = context.catalog.versions.of_job(context.job.job_id)
+    encode_reference(context, version, kept_detector(context, version.model), version.model)
+    context.catalog.jobs.succeed(context.job.job_id)
 
 
-def encode_reference(at: Context, version: VersionRecord, detector: Detector, model: str) -> None:
+def encode_reference(context: Context, version: VersionRecord, detector: Detector, model: str) -> None:
     """Keep what the model can compute of the map alone, so that its first survey has half of the work."""
-    reference = kept_reference(at, version)
+    reference = kept_reference(context, version)
     embedding = detector.encode_reference(
         Side(points=reference.points, normals=reference.normals),
         reference.tiles(min_points=detector.card.preprocessing.min_points),
-        progress=lambda _, share: at.report("describing", share),
+        progress=lambda _, share: context.report("describing", share),
     )
     key = blob_keys.map_embedding(version.job_id, model, detector.card.sha256)
-    put(at, key, lambda path: npz.save_arrays(path, embedding))
+    put(context, key, lambda path: npz.save_arrays(path, embedding))
 
 
-def _put_map(at: Context, built: BuiltMap, card: Card) -> None:
+def _put_map(context: Context, built: BuiltMap, card: Card) -> None:
     """Keep the map's files: cloud, reference, manifest."""
-    job_id, reference, needs = at.job.job_id, built.reference, card.preprocessing
-    put(at, blob_keys.map_reference(job_id), lambda path: npz.save(path, reference))
+    job_id, reference, needs = context.job.job_id, built.reference, card.preprocessing
+    put(context, blob_keys.map_reference(job_id), lambda path: npz.save(path, reference))
     put(
-        at,
+        context,
         blob_keys.map_cloud(job_id),
         lambda path: write_ply(path, reference.points, colors=reference.colors),
     )
@@ -77,7 +77,7 @@ def _put_map(at: Context, built: BuiltMap, card: Card) -> None:
         min_points=needs.min_points,
         voxel_size=needs.voxel_size,
     )
-    at.catalog.blobs.put_bytes(blob_keys.map_manifest(job_id), json.dumps(listing).encode())
+    context.catalog.blobs.put_bytes(blob_keys.map_manifest(job_id), json.dumps(listing).encode())
 
 
 def _bounds(points: Points) -> Bounds:

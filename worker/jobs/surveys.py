@@ -24,76 +24,78 @@ from worker.progress import Progress
 
 
 @step
-def register_survey(at: Context) -> None:
+def register_survey(context: Context) -> None:
     """Scans to one cloud in the map's frame; a survey with no accepted scan fails here."""
-    survey, version, settings = _asked(at)
-    reference = kept_reference(at, version)
+    survey, version, settings = _asked(context)
+    reference = kept_reference(context, version)
     with ExitStack() as stack:
-        files = scan_files(at, survey.scans, stack)
+        files = scan_files(context, survey.scans, stack)
         try:
-            located = locate_survey(files, reference, settings=settings, progress=at.report)
+            located = locate_survey(files, reference, settings=settings, progress=context.report)
         except NoScanAccepted as error:
-            at.catalog.surveys.save_outcomes(survey.survey_id, scan_outcomes(survey.scans, error.outcomes))
+            context.catalog.surveys.save_outcomes(
+                survey.survey_id, scan_outcomes(survey.scans, error.outcomes)
+            )
             raise
         key_of = functools.partial(blob_keys.survey_scan, survey.survey_id)
-        save_scans(at, survey.scans, files, located.outcomes, key_of)
-    at.catalog.surveys.save_outcomes(survey.survey_id, scan_outcomes(survey.scans, located.outcomes))
-    put(at, blob_keys.survey_current(survey.survey_id), lambda path: npz.save(path, located.current))
+        save_scans(context, survey.scans, files, located.outcomes, key_of)
+    context.catalog.surveys.save_outcomes(survey.survey_id, scan_outcomes(survey.scans, located.outcomes))
+    put(context, blob_keys.survey_current(survey.survey_id), lambda path: npz.save(path, located.current))
 
 
 @step
-def score_survey(at: Context) -> None:
+def score_survey(context: Context) -> None:
     """The map and the survey side by side to class probabilities."""
-    survey, version, settings = _asked(at)
-    detector = kept_detector(at, survey.model)
+    survey, version, settings = _asked(context)
+    detector = kept_detector(context, survey.model)
     embedding = None
     key = blob_keys.map_embedding(version.job_id, survey.model, detector.card.sha256)
-    if at.catalog.blobs.exists(key):
-        with at.catalog.blobs.local(key) as path:
+    if context.catalog.blobs.exists(key):
+        with context.catalog.blobs.local(key) as path:
             embedding = npz.load_arrays(path)
     map_key = functools.partial(blob_keys.map_scan, version.job_id)
     survey_key = functools.partial(blob_keys.survey_scan, survey.survey_id)
     comparison = compare(
-        kept_reference(at, version),
-        _kept_current(at, survey),
+        kept_reference(context, version),
+        _kept_current(context, survey),
         settings=settings,
-        reference_scans=kept_scans(at, version.scans, map_key),
-        current_scans=kept_scans(at, survey.scans, survey_key),
+        reference_scans=kept_scans(context, version.scans, map_key),
+        current_scans=kept_scans(context, survey.scans, survey_key),
     )
-    progress = scoring(at.report, encoded=embedding is not None)
+    progress = scoring(context.report, encoded=embedding is not None)
     detection = detector.detect(comparison, embedding=embedding, progress=progress)
-    put(at, blob_keys.survey_scores(survey.survey_id), lambda path: npz.save(path, detection))
+    put(context, blob_keys.survey_scores(survey.survey_id), lambda path: npz.save(path, detection))
 
 
 @step
-def export_survey(at: Context) -> None:
+def export_survey(context: Context) -> None:
     """Scores to tile states, the coloured cloud and the picture; then the survey is ready."""
-    survey, version, settings = _asked(at)
+    survey, version, settings = _asked(context)
     survey_id = survey.survey_id
-    at.report("exporting", 0.0)
-    reference, current = kept_reference(at, version), _kept_current(at, survey)
-    with at.catalog.blobs.local(blob_keys.survey_scores(survey_id)) as path:
+    context.report("exporting", 0.0)
+    reference, current = kept_reference(context, version), _kept_current(context, survey)
+    with context.catalog.blobs.local(blob_keys.survey_scores(survey_id)) as path:
         detection = npz.load(path, Detection)
-    card = card_of(at, survey.model)
+    card = card_of(context, survey.model)
     threshold = card.threshold if survey.threshold is None else survey.threshold
     pairs = compare(reference, current, settings=settings).tile_pairs
     changes = decide(pairs, detection, threshold=threshold)
-    put(at, blob_keys.survey_cloud(survey_id), lambda path: write_coloured_cloud(path, current, changes))
-    at.report("exporting", 0.4)
+    put(context, blob_keys.survey_cloud(survey_id), lambda path: write_coloured_cloud(path, current, changes))
+    context.report("exporting", 0.4)
     title = f"Map {survey.map_id}: survey of {survey.captured_at:%Y-%m-%d %H:%M} UTC"
     put(
-        at,
+        context,
         blob_keys.survey_picture(survey_id),
         lambda path: draw_picture(path, reference.points, current, changes, title=title),
     )
-    at.report("exporting", 0.9)
+    context.report("exporting", 0.9)
     tiles = [_tile_record(result) for result in tile_results(changes)]
-    at.catalog.surveys.save_result(survey_id, tiles=tiles, threshold=threshold)
-    at.catalog.jobs.succeed(at.job.job_id)
+    context.catalog.surveys.save_result(survey_id, tiles=tiles, threshold=threshold)
+    context.catalog.jobs.succeed(context.job.job_id)
 
 
 def scoring(report: Progress, *, encoded: bool) -> Progress:
-    """Report a detector's stages as one; a model that did not encode the map does so now, which is half of the work."""
+    """Report a detector's stages as one; where the map has to be encoded now, that is half of the work."""
 
     def progress(stage: str, share: float) -> None:
         half = 0.0 if stage == "encoding" else 0.5
@@ -102,17 +104,21 @@ def scoring(report: Progress, *, encoded: bool) -> Progress:
     return progress
 
 
-def _asked(at: Context) -> tuple[SurveyRecord, VersionRecord, PipelineSettings]:
+def _asked(context: Context) -> tuple[SurveyRecord, VersionRecord, PipelineSettings]:
     """Return the survey of the job, the map that it is compared with, and the settings. Raises DetectorUnavailable."""
-    if at.job.survey_id is None:
-        raise LookupError(f"job {at.job.job_id} has no survey")
-    survey = at.catalog.surveys.get(at.job.survey_id)
-    version = at.catalog.versions.get(survey.map_id, survey.map_version)
-    return survey, version, pipeline_settings(at, version, card_that_fits(at, survey.model, version.model))
+    if context.job.survey_id is None:
+        raise LookupError(f"job {context.job.job_id} has no survey")
+    survey = context.catalog.surveys.get(context.job.survey_id)
+    version = context.catalog.versions.get(survey.map_id, survey.map_version)
+    return (
+        survey,
+        version,
+        pipeline_settings(context, version, card_that_fits(context, survey.model, version.model)),
+    )
 
 
-def _kept_current(at: Context, survey: SurveyRecord) -> CurrentMap:
-    with at.catalog.blobs.local(blob_keys.survey_current(survey.survey_id)) as path:
+def _kept_current(context: Context, survey: SurveyRecord) -> CurrentMap:
+    with context.catalog.blobs.local(blob_keys.survey_current(survey.survey_id)) as path:
         return npz.load(path, CurrentMap)
 
 

@@ -1,4 +1,4 @@
-"""A map that goes on: further scans extend it, an accepted survey renews it; frame, grid and ids of tiles stay."""
+"""New versions of a map: further scans extend it, an accepted survey renews it; frame, grid and ids of tiles stay."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class KeptMap:
 def extend_map(
     base: KeptMap, files: Sequence[ScanFile], *, settings: PipelineSettings, progress: Progress = no_progress
 ) -> BuiltMap:
-    """A new version: further scans placed on the map and fused with what it was made of; tiles keep their ids.
+    """Extend a map: register further scans to it and fuse them with what it was made of; tiles keep their ids.
 
     The outcomes are those of the new files. Raises ScanError where no file can be read, NoScanAccepted where none
     finds a place, and NothingToTile.
@@ -54,7 +54,7 @@ def renew_map(
     settings: PipelineSettings,
     progress: Progress = no_progress,
 ) -> BuiltMap:
-    """A new version: a survey that was accepted as the new state of things; tiles keep their ids.
+    """Renew a map by a survey that was accepted as the new state of things; tiles keep their ids.
 
     In the tiles `replaced` (T, 3) the survey's points take the place of the older ones, elsewhere they join them.
     Raises NothingToTile.
@@ -67,7 +67,7 @@ def renew_map(
 
 
 def without(scan: RegisteredScan, grid: TileGrid, tiles: Indices) -> RegisteredScan:
-    """The scan less its points in these tiles (T, 3)."""
+    """Return the scan less its points in these tiles (T, 3)."""
     stays = grid.locate_among(scan.points, tiles) < 0
     colors = None if scan.colors is None else scan.colors[stays]
     return replace(scan, points=scan.points[stays], colors=colors)

@@ -13,8 +13,8 @@ from worker.training.anomalies import OPERATIONS
 from worker.training.dataset import TileSet
 from worker.training.pairs import PairSettings, altered
 
-#: Share of changed tiles that the threshold is chosen for: of the simulated revisits 4% changed. The paper's experiments
-#: change 24 of 172, but nobody patrols a building of which a seventh changes between two rounds.
+#: Share of changed tiles that the threshold is chosen for: of the simulated revisits 4% changed. The paper's
+#: experiments change 24 of 172, but nobody patrols a building of which a seventh changes between two rounds.
 PREVALENCE = 0.05
 SWEEP = np.round(np.arange(0.02, 0.99, 0.01), 2)
 UNCHANGED, WHOLE = "unchanged", "whole"
@@ -56,7 +56,7 @@ class SurveyFigures:
 
 
 def survey_pairs(tiles: TileSet, settings: PairSettings, *, seed: int) -> SurveyPairs:
-    """Both ways round, every tile with two visits: unchanged and under each operation; and every observation of another visit."""
+    """Pair both ways round every tile of two visits, unchanged and changed, and every observation of another visit."""
     rng = np.random.default_rng((seed, 3))
     half = (np.asarray(tiles.tile_size) / 2).astype(np.float32)
     reference: list[Points] = []
@@ -111,5 +111,5 @@ def figures_at(threshold: float, scores: NDArray[np.float32], pairs: SurveyPairs
 
 
 def area_under_roc(scores: NDArray[np.float32], pairs: SurveyPairs) -> float:
-    """Return the chance that a changed pair scores above an unchanged one, over those that a threshold is chosen by."""
+    """Return the chance that a changed pair scores above an unchanged one; `pairs.decisive` alone count."""
     return roc(scores[pairs.decisive], pairs.changed[pairs.decisive]).area

@@ -43,7 +43,7 @@ class TileSet:
         return len(self.points_a)
 
     def subset(self, chosen: NDArray[np.bool_]) -> TileSet:
-        """The tiles where `chosen` (T,) is true."""
+        """Return the tiles where `chosen` (T,) is true."""
         kept, place = np.flatnonzero(chosen).tolist(), np.cumsum(chosen) - 1
         return TileSet(
             points_a=tuple(self.points_a[i] for i in kept),
@@ -78,14 +78,12 @@ def load_tiles(path: Path) -> TileSet:
 
 
 def _in_precision(tiles: TileSet, kind: type[np.floating[Any]]) -> TileSet:
-    """The same set with its points in another type."""
+    """Return the same set with its points in another type."""
 
     def cast(clouds: tuple[Points, ...]) -> tuple[Points, ...]:
         return tuple(points.astype(kind) for points in clouds)
 
-    observations = zip(
-        tiles.observations, cast(tuple(each.points for each in tiles.observations)), strict=True
-    )
+    observations = zip(tiles.observations, cast(tuple(one.points for one in tiles.observations)), strict=True)
     return replace(
         tiles,
         points_a=cast(tiles.points_a),
@@ -95,7 +93,7 @@ def _in_precision(tiles: TileSet, kind: type[np.floating[Any]]) -> TileSet:
 
 
 def joined(parts: Sequence[TileSet], *, source: str) -> TileSet:
-    """The tiles of several sets in one, each set a building of its own. Raises ValueError for none."""
+    """Return the tiles of several sets in one, each set a building of its own. Raises ValueError for none."""
     if not parts:
         raise ValueError("a training set needs a building")
     starts = np.cumsum([0, *map(len, parts)]).tolist()
@@ -115,7 +113,7 @@ def joined(parts: Sequence[TileSet], *, source: str) -> TileSet:
 
 
 def split_tiles(tiles: TileSet, *, share: float = 0.1, seed: int = 42) -> tuple[TileSet, TileSet]:
-    """Training and validation tiles (paper, Section 3.8: a spatial 90/10 split).
+    """Split into training and validation tiles (paper, Section 3.8: a spatial 90/10 split).
 
     From every building the `share` of tiles nearest to a random one of its outermost tiles, a region in one
     piece, is held out.

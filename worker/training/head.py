@@ -40,9 +40,9 @@ def train_head(
     out: Path,
     progress: Progress = no_progress,
 ) -> HeadResult:
-    """Train the network's head in place for `settings.head_epochs`, and leave the best one; a log goes to the folder `out`.
+    """Train the network's head in place for `settings.head_epochs`, leave the best one, and log to the folder `out`.
 
-    Loss, rate and choice of the best are those of the whole training (paper, Sections 3.7 and 3.8); an epoch has as many pairs.
+    Loss, rate, choice of the best and pairs an epoch are those of the whole training (paper, Sections 3.7 and 3.8).
     """
     begun = time.monotonic()
     network.eval()
@@ -97,7 +97,7 @@ class _HeadRun:
         self.best, self.best_epoch = copy.deepcopy(head.state_dict()), 0
 
     def epoch(self, number: int, seconds: float) -> EpochRow:
-        """One pass over newly drawn pairs, and the same held-out ones."""
+        """Train on newly drawn pairs, and validate on the same held-out ones."""
         settings = self._settings
         rate = self._schedule.rate((number - 1) / settings.head_epochs)
         for group in self._optimizer.param_groups:
@@ -138,7 +138,7 @@ class _HeadRun:
 
     def _answers(self, drawn: Drawn, rows: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         reference, current, statistics, labels = (
-            each[rows].to(self._device)
-            for each in (drawn.reference, drawn.current, drawn.statistics, drawn.labels)
+            part[rows].to(self._device)
+            for part in (drawn.reference, drawn.current, drawn.statistics, drawn.labels)
         )
         return self._head(reference, current, statistics), labels

@@ -1,7 +1,8 @@
 """Pairs whose descriptors and statistics are computed once: all that a head needs to be trained on its own.
 
-Encoding a tile is nearly all of the work of a training step. With a frozen encoder it is done once for every observation,
-and a head then sees a thousand times as many pairs in the same time. Nothing is augmented: the observations differ as visits do.
+Encoding a tile is nearly all of the work of a training step. With a frozen encoder it is done once for every
+observation, and a head then sees a thousand times as many pairs in the same time. Nothing is augmented: the
+observations differ as visits do.
 """
 
 from __future__ import annotations
@@ -63,11 +64,13 @@ class PairPool:
         self._shares = _shares(self.kinds, settings)
 
     def draw(self, count: int, rng: np.random.Generator) -> Drawn:
-        """About `count` pairs in random order, the same for the same generator."""
+        """Draw about `count` pairs in random order, the same for the same generator."""
         parts = [
             self._picked(self.kinds[name], round(count * share), rng) for name, share in self._shares.items()
         ]
-        reference, current, statistics, labels = (np.concatenate(each) for each in zip(*parts, strict=True))
+        reference, current, statistics, labels = (
+            np.concatenate(column) for column in zip(*parts, strict=True)
+        )
         order = rng.permutation(len(labels))
         return Drawn(
             reference=self._descriptors[torch.from_numpy(reference[order])],
@@ -79,7 +82,7 @@ class PairPool:
     def _picked(
         self, pairs: PooledPairs, count: int, rng: np.random.Generator
     ) -> tuple[NDArray[np.generic], ...]:
-        """`count` of them: rows, rows, statistics, labels; each twice only where there are too few."""
+        """Draw `count` of them: rows, rows, statistics, labels; each twice only where there are too few."""
         chosen = rng.choice(len(pairs.reference), count, replace=count > len(pairs.reference))
         reference, current = pairs.reference[chosen], pairs.current[chosen]
         statistics = pairs.statistics[chosen]
@@ -138,32 +141,32 @@ def keep_pairs(
 
 
 def _gathered(tiles: TileSet, settings: PairSettings, rng: np.random.Generator) -> _Gathering:
-    found = _Gathering()
+    gathering = _Gathering()
     half = (np.asarray(tiles.tile_size) / 2).astype(np.float32)
-    first = [found.cloud(points) for points in tiles.points_a]
-    second = [found.cloud(points) if len(points) else None for points in tiles.points_b]
+    first = [gathering.cloud(points) for points in tiles.points_a]
+    second = [gathering.cloud(points) if len(points) else None for points in tiles.points_b]
     for tile, (a, b) in enumerate(zip(first, second, strict=True)):
-        found.pair("stored", a, a)
+        gathering.pair("stored", a, a)
         if b is not None:
-            found.pair("revisit", a, b)
+            gathering.pair("revisit", a, b)
         after = changed(tiles.points_a[tile] if b is None else tiles.points_b[tile], settings, half, rng)
-        found.pair("synthetic", a, found.cloud(after))
+        gathering.pair("synthetic", a, gathering.cloud(after))
     for observation in tiles.observations:
-        here, a, b = found.cloud(observation.points), first[observation.tile], second[observation.tile]
+        here, a, b = gathering.cloud(observation.points), first[observation.tile], second[observation.tile]
         if observation.rebuilt:
-            found.pair("rebuilt" if observation.changed else "untouched", a, here)
+            gathering.pair("rebuilt" if observation.changed else "untouched", a, here)
             continue
         kind = "whole" if observation.changed else "beside"
-        found.pair(kind, a, here)
+        gathering.pair(kind, a, here)
         if b is not None:  # another honest observation of what was there before
-            found.pair(kind, b, here)
+            gathering.pair(kind, b, here)
     for i, j in _apart(tiles, settings.min_separation, rng):
-        found.pair("different", first[i], first[j])
-    return found
+        gathering.pair("different", first[i], first[j])
+    return gathering
 
 
 def _apart(tiles: TileSet, min_separation: float, rng: np.random.Generator) -> Iterator[tuple[int, int]]:
-    """Some pairs of tiles of two buildings, or that far apart in one."""
+    """Return some pairs of tiles of two buildings, or that far apart in one."""
     for i in range(len(tiles)):
         for j in rng.integers(len(tiles), size=DIFFERENT_EACH).tolist():
             away = float(np.linalg.norm(tiles.centres[i] - tiles.centres[j]))
@@ -187,7 +190,7 @@ def _compared(
 
 
 def _shares(kinds: dict[str, PooledPairs], settings: PairSettings) -> dict[str, float]:
-    """Of all pairs, by kind; what a class lacks goes to its other kinds."""
+    """Return the shares of all pairs, by kind; what a class lacks goes to its other kinds."""
     synthetic = 1 - settings.edited_share - settings.rebuilt_share
     if not {"whole", "rebuilt"} & kinds.keys():
         synthetic = 1.0

@@ -60,6 +60,6 @@ def cut_log(folder: Path, epochs: int) -> None:
 
 
 def by_class(name: str, values: tuple[float, float, float]) -> dict[str, float]:
-    """The columns of a figure that every class has."""
+    """Return the columns of a figure that every class has."""
     classes = ("unchanged", "changed", "different")
     return {f"{name}_{of}": value for of, value in zip(classes, values, strict=True)}

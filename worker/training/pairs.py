@@ -75,7 +75,7 @@ PAPER_PAIRS = PairSettings(
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Observations:
-    """Two dense observations of one tile, (n, 3) each, between which nothing changed, and two between which something did."""
+    """Two dense observations of one tile, (n, 3) each, with nothing changed in between, and two with a change."""
 
     unchanged: tuple[Points, Points]
     changed: tuple[Points, Points] | None = None  #: None: a synthetic change is due
@@ -106,8 +106,8 @@ class PairMaker:
     def batches(self, count: int, size: int, rng: np.random.Generator) -> Iterator[list[Pair]]:
         """Draw `count` pairs in the classes' exact shares, `size` at a time; a last few are left out.
 
-        With `twins` each changed pair comes with an unchanged one of the same tile and observations, so that nothing but
-        the change tells them apart.
+        With `matched_pairs` each changed pair comes with an unchanged one of the same tile and observations, so that
+        nothing but the change tells them apart.
         """
         ready: list[Pair] = []
         groups = composition(count, self._settings.shares, matched_pairs=self._settings.matched_pairs)
@@ -119,7 +119,7 @@ class PairMaker:
                 ready = ready[size:]
 
     def pair(self, label: int, rng: np.random.Generator, observations: Observations | None = None) -> Pair:
-        """One example of a class, of the given observations where the class is of one tile."""
+        """Draw one example of a class, of the given observations where the class is of one tile."""
         observations = observations or self._observations((label,), rng)
         settings = self._settings
         if label == DIFFERENT:
@@ -155,7 +155,7 @@ class PairMaker:
         return self._sampled(first, changed(second, settings, self._half, rng), intensity, rng)
 
     def _different(self, rng: np.random.Generator) -> tuple[Points, Points]:
-        """Tiles of two buildings, or at least `min_separation` apart in one. Raises ValueError where no two are."""
+        """Draw tiles of two buildings, or `min_separation` apart in one. Raises ValueError where no two are."""
         points = self._tiles.points_a
         i = int(rng.integers(len(points)))
         others = self._apart(i)
@@ -168,13 +168,13 @@ class PairMaker:
         return self._patch(points[i], rng), self._patch(points[int(rng.choice(others))], rng)
 
     def _apart(self, i: int) -> NDArray[np.intp]:
-        """The tiles that are no part of tile i's surroundings."""
+        """Return the tiles that are no part of tile i's surroundings."""
         tiles = self._tiles
         away = np.linalg.norm(tiles.centres - tiles.centres[i], axis=1) >= self._settings.min_separation
         return np.flatnonzero(away | (tiles.buildings != tiles.buildings[i]))
 
     def _observations(self, labels: tuple[int, ...], rng: np.random.Generator) -> Observations:
-        """At a random tile, for pairs of these labels; visits in either order."""
+        """Draw a tile for pairs of these labels; visits in either order."""
         settings, draw = self._settings, rng.random()
         if CHANGED in labels:
             if draw < settings.edited_share and self._edited:
@@ -198,16 +198,16 @@ class PairMaker:
         return Observations(unchanged=(a, b) if rng.random() < 0.5 else (b, a), revisit=True)
 
     def _revisited(self, observation: Observation, rng: np.random.Generator) -> Observations:
-        """The observation beside the first visit's, and in the unchanged pair that matches a changed one the second visit's."""
+        """Pair the observation with the first visit's; the unchanged pair that matches is of both honest visits."""
         a, b = self._tiles.points_a[observation.tile], self._tiles.points_b[observation.tile]
         forth = rng.random() < 0.5
-        found = (a, observation.points) if forth else (observation.points, a)
+        both = (a, observation.points) if forth else (observation.points, a)
         if not observation.changed:
-            return Observations(unchanged=found, revisit=True)
-        return Observations(unchanged=(a, b) if forth else (b, a), changed=found, revisit=True)
+            return Observations(unchanged=both, revisit=True)
+        return Observations(unchanged=(a, b) if forth else (b, a), changed=both, revisit=True)
 
     def _rebuilt_observations(self, rng: np.random.Generator) -> Observations:
-        """A rebuilt map against the map: a tile that a synthetic change was made in, and one that none was."""
+        """Pair a rebuilt map with the map: a tile that a synthetic change was made in, and one that none was."""
         changed = self._rebuilt[int(rng.integers(len(self._rebuilt)))]
         pair = (self._tiles.points_a[changed.tile], changed.points)
         if not self._untouched:
@@ -224,17 +224,17 @@ class PairMaker:
         return self._patch(reference, rng), self._patch(current, rng)
 
     def _patch(self, points: Points, rng: np.random.Generator) -> Points:
-        """The distinct points of a patch: what repeats would add, a max-pool does not see."""
+        """Return the distinct points of a patch: what repeats would add, a max-pool does not see."""
         return patch(points, size=self._settings.patch_points, seed=int(rng.integers(2**31))).distinct
 
 
 def _stored_again(points: Points, rng: np.random.Generator) -> Points:
-    """(n, 3) a stored patch as it comes from the disk (paper, Section 3.5.3)."""
+    """Return (n, 3) a stored patch as it comes from the disk (paper, Section 3.5.3)."""
     return (points + rng.normal(scale=STORED_JITTER, size=points.shape)).astype(np.float32)
 
 
 def changed(points: Points, settings: PairSettings, half: Half, rng: np.random.Generator) -> Points:
-    """(n, 3) -> (m, 3): the tile under one of the operations, each as likely.
+    """Change a tile (n, 3) by one of the operations, each as likely.
 
     A change of which too little shows is drawn again, a dozen times at most: a tile may have no place for one.
     """
@@ -245,7 +245,7 @@ def changed(points: Points, settings: PairSettings, half: Half, rng: np.random.G
 def altered(
     points: Points, operation: Operation, settings: PairSettings, half: Half, rng: np.random.Generator
 ) -> Points:
-    """As `changed`, under the given operation."""
+    """Change a tile as `changed` does, by the given operation."""
     for _ in range(12):
         change = Change(magnitude=rng.uniform(*settings.magnitude), density=rng.uniform(*settings.density))
         result = operation(points, change, half, rng)
@@ -257,7 +257,7 @@ def altered(
 def composition(
     count: int, shares: tuple[float, float, float], *, matched_pairs: bool = True
 ) -> list[tuple[int, ...]]:
-    """`count` labels in exact shares, as groups of one tile each; what rounding leaves is unchanged."""
+    """Return `count` labels in exact shares, as groups of one tile each; what rounding leaves is unchanged."""
     changed_count, different = (round(count * share) for share in shares[1:])
     unchanged = count - changed_count - different
     both = min(unchanged, changed_count) if matched_pairs else 0

@@ -12,7 +12,7 @@ _END = object()
 
 
 def prefetched(items: Iterable[T], ahead: int = 4) -> Iterator[T]:
-    """The same items in the same order, made by one thread up to `ahead` in advance.
+    """Return the same items in the same order, made by one thread up to `ahead` in advance.
 
     An exception in the making is raised here. Leaving the loop early ends the thread.
     """

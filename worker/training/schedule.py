@@ -20,11 +20,11 @@ class Schedule:
     end: float = 1e-5
 
     def done(self, epochs: float, seconds: float) -> float:
-        """Share 0..1 of the run behind us after so many epochs (fractions count) and seconds."""
+        """Return share 0..1 of the run behind us after so many epochs (fractions count) and seconds."""
         by_time = 0.0 if self.minutes is None else seconds / (60 * self.minutes)
         by_epochs = epochs / self.epochs if self.epochs else 1.0
         return min(max(by_epochs, by_time), 1.0)
 
     def rate(self, done: float) -> float:
-        """Learning rate at that share."""
+        """Return the learning rate at that share."""
         return self.end + (self.start - self.end) * 0.5 * (1 + math.cos(math.pi * done))

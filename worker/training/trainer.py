@@ -155,7 +155,7 @@ class Run:
         self._best, self._best_epoch = tuple(state["best"]), state["best_epoch"]
 
     def _train_pass(self, began: float, progress: Progress) -> _Trained:
-        """One epoch's steps. Ends early when the time is up."""
+        """Take one epoch's steps; ends early when the time is up."""
         settings, schedule = self._settings, self._settings.schedule
         steps = max(settings.train_pairs // settings.batch, 1)
         # Each epoch has its own stream, so that a resumed run sees the pairs that an unbroken one sees.
@@ -177,7 +177,7 @@ class Run:
         return _Trained(loss=float(np.mean(losses)), accuracy=float(np.mean(hits)), rate=rate)
 
     def _step(self, batch: Labelled, rate: float) -> tuple[float, float]:
-        """The loss before the step, and the share of pairs that the network had right."""
+        """Return the loss before the step, and the share of pairs that the network had right."""
         for group in self._optimizer.param_groups:
             group["lr"] = rate
         logits, loss = self._kind.answer(self._network, batch)
@@ -195,7 +195,7 @@ class Run:
 
     @torch.no_grad()
     def _validate(self, began: float, progress: Progress) -> ClassFigures:
-        """On the same pairs after every epoch."""
+        """Validate on the same pairs after every epoch."""
         settings = self._settings
         rng = np.random.default_rng((settings.seed, 2))
         batches = prefetched(self._batches(self._makers[1], settings.validation_pairs, rng))
@@ -243,7 +243,7 @@ class Run:
 
 
 def _of_epochs(settings: dict[str, Any]) -> dict[str, Any]:
-    """Without what only comes after the last epoch, and may be asked for then."""
+    """Leave out what only comes after the last epoch, and may be asked for then."""
     return {name: value for name, value in settings.items() if not name.startswith("head_")}
 
 

@@ -70,7 +70,7 @@ class CloudToCloud:
 
 
 def tile_distances(comparison: Comparison, *, farthest: float = FARTHEST) -> Floats:
-    """Return the mean nearest distance of each tile, the larger of both directions: (T,) metres, NaN without a point."""
+    """Return the mean nearest distance of each tile, the larger of both directions: (T,) metres, NaN for no point."""
     there, back = distances_both_ways(comparison, farthest=farthest)
     larger: Floats = np.fmax(tile_means(there), tile_means(back))
     return larger

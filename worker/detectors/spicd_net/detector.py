@@ -30,7 +30,7 @@ REFERENCE, CURRENT = 0, 1  #: streams of the Chamfer sample, so that two equal p
 class SpicdNet:
     """Detector (worker.detectors.detector) around the network of the paper's Section 3.6.
 
-    A tile of the reference is encoded by itself, so a map keeps its descriptors and a survey encodes its own tiles only.
+    A tile of the map is encoded by itself, so a map keeps its descriptors and a survey encodes its own tiles only.
     """
 
     settings_class = SpicdNetSettings
@@ -128,7 +128,7 @@ class SpicdNet:
         return chamfer_statistics(self._compared(before, REFERENCE), self._compared(after, CURRENT))
 
     def _compared(self, patches: Sequence[Patch], stream: int) -> list[Tensor]:
-        """What of each patch the Chamfer branch sees, (n, 3)."""
+        """Return what of each patch the Chamfer branch sees, (n, 3)."""
         settings = self._settings
         if settings.chamfer_points is None:
             clouds = [prepared.distinct for prepared in patches]

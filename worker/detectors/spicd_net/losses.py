@@ -11,19 +11,19 @@ ORTHOGONALITY = 0.001
 
 
 def total_loss(logits: Tensor, labels: Tensor, transforms: tuple[Tensor, ...]) -> Tensor:
-    """Focal loss and the T-Nets' orthogonality, L = L_focal + 0.001 L_ortho."""
+    """Return focal loss and the T-Nets' orthogonality, L = L_focal + 0.001 L_ortho."""
     return focal_loss(logits, labels) + ORTHOGONALITY * orthogonality(transforms)
 
 
 def focal_loss(logits: Tensor, labels: Tensor) -> Tensor:
-    """Mean of -alpha_c (1 - p_c)^2 log p_c over (B, 3) logits, c the true class of each of (B,) labels."""
+    """Return mean of -alpha_c (1 - p_c)^2 log p_c over (B, 3) logits, c the true class of each of (B,) labels."""
     log_p = logits.float().log_softmax(dim=1).gather(1, labels[:, None])[:, 0]  # (B,)
     alpha = torch.tensor(ALPHA, device=logits.device)[labels]
     return -(alpha * (1 - log_p.exp()) ** GAMMA * log_p).mean()
 
 
 def orthogonality(transforms: tuple[Tensor, ...]) -> Tensor:
-    """|I - A A'|^2 (Frobenius), averaged over the batch and over the T-Nets' matrices, each (B, k, k)."""
+    """Return |I - A A'|^2 (Frobenius), averaged over the batch and over the T-Nets' matrices, each (B, k, k)."""
     losses = []
     for matrix in transforms:
         matrix = matrix.float()  # noqa: PLW2901

@@ -74,7 +74,7 @@ class PointEncoder(nn.Module):
         self.mlp4 = PooledLinear(128, DESCRIPTOR)
 
     def forward(self, points: Tensor, sizes: list[int]) -> tuple[Tensor, Tensor, Tensor]:
-        """(P, 3) metres, centroid at 0 -> descriptor (B, 1024), transforms (B, 3, 3) and (B, 64, 64)"""
+        """Return (P, 3) metres, centroid at 0 -> descriptor (B, 1024), transforms (B, 3, 3) and (B, 64, 64)"""
         a3 = self.input_transform(points, sizes)
         features = functional.relu(self.mlp2(functional.relu(self.mlp1(transformed(points, a3, sizes)))))
         a64 = self.feature_transform(features, sizes)
@@ -162,5 +162,5 @@ class SpicdNetwork(nn.Module):
 
 
 def transformed(x: Tensor, matrices: Tensor, sizes: list[int]) -> Tensor:
-    """(P, k) and a matrix (B, k, k) for each cloud -> (P, k)"""
+    """Return (P, k) and a matrix (B, k, k) for each cloud -> (P, k)"""
     return torch.cat([cloud @ matrix for cloud, matrix in zip(torch.split(x, sizes), matrices, strict=True)])

@@ -139,7 +139,7 @@ class SpicdNetTraining:
         return np.roll(statistics, STATISTICS // 2, axis=1)
 
     def _compared(self, distinct: Points, rng: np.random.Generator) -> Points:
-        """All points, or so many of the padded patch without replacement, drawn anew each time (paper, Section 3.6.3)."""
+        """Return all points, or a new draw without replacement from the padded patch (paper, Section 3.6.3)."""
         if self.chamfer_points is None:
             return distinct
         places = rng.choice(self.patch_points, self.chamfer_points, replace=False)

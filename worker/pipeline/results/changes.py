@@ -42,9 +42,9 @@ class ChangeSet:
         return change_score(self.probabilities)
 
     def counts(self) -> dict[str, int]:
-        """Tiles by state, every state named."""
-        found = Counter(int(state) for state in self.states)
-        return {state.label: found[state] for state in TileState}
+        """Count the tiles by state, every state named."""
+        counts = Counter(int(state) for state in self.states)
+        return {state.label: counts[state] for state in TileState}
 
 
 def decide(pairs: TilePairs, detection: Detection, *, threshold: float) -> ChangeSet:

@@ -42,7 +42,7 @@ class TileResult:
 
 
 def tile_results(changes: ChangeSet) -> list[TileResult]:
-    """Every tile of the reference, in the grid's order."""
+    """Return every tile of the reference, in the grid's order."""
     tiles = changes.pairs.reference
     lower = tiles.grid.lower(tiles.indices)
     return [
@@ -77,7 +77,7 @@ def _rounded(corner: NDArray[np.float64]) -> tuple[float, float, float]:
 
 
 def write_coloured_cloud(path: Path, current: CurrentMap, changes: ChangeSet) -> None:
-    """The survey's fused cloud as PLY, each point in the colour of its tile's state.
+    """Write the survey's fused cloud as PLY, each point in the colour of its tile's state.
 
     Scalar fields: `change_score` (float; NaN where not scored) and `tile_state` (uchar; TileState, or 255
     outside every reference tile).
@@ -97,11 +97,11 @@ def write_coloured_cloud(path: Path, current: CurrentMap, changes: ChangeSet) ->
     )
 
 
-def _colors(state: NDArray[np.uint8]) -> Colors:
+def _colors(states: NDArray[np.uint8]) -> Colors:
     table = np.full((256, 3), _NOT_IN_A_TILE_COLOR, np.uint8)
-    for each, color in STATE_COLORS.items():
-        table[each] = color
-    return table[state]
+    for state, color in STATE_COLORS.items():
+        table[state] = color
+    return table[states]
 
 
 CONFORMS_TO = (
@@ -114,7 +114,7 @@ MAP_FRAME = "http://www.opengis.net/def/crs/OGC/0/Engineering3D"
 def feature_collection(
     changes: ChangeSet, *, map_id: str, survey_id: str, model: str, captured_at: str | None = None
 ) -> dict[str, Any]:
-    """Every tile of the map, JSON-ready. `captured_at` is RFC 3339; where it is unknown, `time` is null."""
+    """Return every tile of the map, JSON-ready. `captured_at` is RFC 3339; where it is unknown, `time` is null."""
     properties = {
         "map_id": map_id,
         "survey_id": survey_id,

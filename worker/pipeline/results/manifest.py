@@ -11,10 +11,10 @@ from worker.cloud.types import Points
 def manifest(
     points: Points, tiles: Tiles, *, patch_size: int | None, min_points: int, voxel_size: float
 ) -> dict[str, Any]:
-    """Table A1's fields for the map cloud (M, 3) and its tiles; JSON-ready, metres, map frame.
+    """Return Table A1's fields for the map cloud (M, 3) and its tiles; JSON-ready, metres, map frame.
 
-    `tile_origin` and `tile_lowest_idx` are added to them, so that the grid can be rebuilt exactly. `dense_voxel` is the
-    map's voxel size. No tile has a file: the tiles are cut from the map's cloud along the grid, so `file` and
+    `tile_origin` and `tile_lowest_idx` are added to them, so that the grid can be rebuilt exactly. `dense_voxel` is
+    the map's voxel size. No tile has a file: the tiles are cut from the map's cloud along the grid, so `file` and
     `dense_file` are null and `save_dense_tiles` is false. `patch_size` is null for a detector that has no patches.
     """
     size = [float(edge) for edge in tiles.grid.size]

@@ -1,4 +1,4 @@
-"""What stands around the map in a picture, and the look that both share: title, scale bar, legend."""
+"""The picture of a survey: the map from above, its tiles by state, title, scale bar and legend."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ HEAD, FOOT, SIDE = 0.75, 1.0, 0.55  # inches above, below and left of it
 
 
 def draw_scale_bar(figure: Figure, extent: Extent, scale: float) -> None:
-    """At the head, on the right; `scale` is inches a metre."""
+    """Draw a scale bar at the head, on the right; `scale` is inches a metre."""
     wide, high = figure.get_size_inches()
     longest = max((extent[1] - extent[0]) / 4, 0.5)
     length = next(size for size in (20.0, 10.0, 5.0, 2.0, 1.0, 0.5) if size <= longest)
@@ -56,7 +56,7 @@ def draw_scale_bar(figure: Figure, extent: Extent, scale: float) -> None:
 
 
 def dress(figure: Figure, axes: Axes, extent: Extent, changes: ChangeSet, title: str) -> None:
-    """Axes, title and counts at the head, legend at the foot."""
+    """Write axes, title and counts at the head, the legend at the foot."""
     axes.set_xlim(extent[0], extent[1])
     axes.set_ylim(extent[2], extent[3])
     axes.tick_params(labelsize=7, colors=QUIET, length=2)
@@ -94,7 +94,7 @@ def _legend_entry(state: TileState, count: int) -> Patch:
 
 
 def color_of(state: TileState) -> tuple[float, float, float]:
-    """Red, green, blue, 0..1."""
+    """Return red, green, blue, 0..1."""
     red, green, blue = (channel / 255 for channel in STATE_COLORS[state])
     return red, green, blue
 
@@ -130,7 +130,7 @@ def draw_picture(
 
 
 def _extent(changes: ChangeSet) -> Extent:
-    """left, right, bottom, top in metres: all tiles, and half a metre around."""
+    """Return left, right, bottom, top in metres: all tiles, and half a metre around."""
     tiles = changes.pairs.reference
     lower = tiles.grid.lower(tiles.indices)
     left, bottom = lower[:, :2].min(axis=0) - 0.5
@@ -150,7 +150,7 @@ def _draw_walls(axes: Axes, reference: Points, current: Points, extent: Extent) 
 
 
 def _standing(points: Points, floor: float, extent: Extent) -> NDArray[np.float64]:
-    """(rows, columns) voxels from 15 cm to 2 m above the floor in each pixel."""
+    """Return (rows, columns) voxels from 15 cm to 2 m above the floor in each pixel."""
     body = points[(points[:, 2] > floor + 0.15) & (points[:, 2] < floor + 2.0)]
     left, right, bottom, top = extent
     pixel = max(_PIXEL, (top - bottom) / _MOST_PIXELS, (right - left) / _MOST_PIXELS)
@@ -160,7 +160,7 @@ def _standing(points: Points, floor: float, extent: Extent) -> NDArray[np.float6
 
 
 def _near(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Grown by two pixels, 10 cm: noise at a wall is not news."""
+    """Grow the mask by two pixels, 10 cm: noise at a wall is no change."""
     grown = mask.copy()
     for axis in (0, 1):
         for shift in (-2, -1, 1, 2):
@@ -191,7 +191,7 @@ def _draw_tiles(axes: Axes, changes: ChangeSet, *, tile_inches: float) -> None:
 
 
 def _topmost(changes: ChangeSet) -> list[int]:
-    """Of each column of the grid the row of the tile that is shown: by precedence, then by score."""
+    """Return of each column of the grid the row of the tile that is shown: by precedence, then by score."""
     shown: dict[tuple[int, int], int] = {}
     for row in sorted(range(len(changes.states)), key=lambda row: _order(changes, row)):
         i, j, _ = changes.pairs.reference.indices[row]
@@ -205,7 +205,7 @@ def _order(changes: ChangeSet, row: int) -> tuple[int, float]:
 
 
 def _label(axes: Axes, changes: ChangeSet, row: int, *, with_id: bool) -> None:
-    """In a corner of the tile, off what stands in it: the score, and the numbers of the id that tables name."""
+    """Write in a corner of the tile, off what stands in it: the score, and the numbers of the id that tables name."""
     tiles = changes.pairs.reference
     index = tiles.indices[row]
     x, y = tiles.grid.lower(index)[0], tiles.grid.lower(index)[1] + tiles.grid.size[1]
