@@ -7,7 +7,7 @@ flagged: nobody was told of it.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from worker.cloud.types import Bools, Floats
 
 Scores = NDArray[np.floating[Any]]
+RATIOS = ("precision", "recall", "f1", "accuracy", "false_positive_rate")  #: of a Confusion
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -30,14 +31,8 @@ class Confusion:
     unobserved_changed: int = 0  #: of those, the truly changed
 
     def __add__(self, other: Confusion) -> Confusion:
-        return Confusion(
-            true_positives=self.true_positives + other.true_positives,
-            false_positives=self.false_positives + other.false_positives,
-            false_negatives=self.false_negatives + other.false_negatives,
-            true_negatives=self.true_negatives + other.true_negatives,
-            unobserved=self.unobserved + other.unobserved,
-            unobserved_changed=self.unobserved_changed + other.unobserved_changed,
-        )
+        ours, theirs = asdict(self), asdict(other)
+        return Confusion(**{name: count + theirs[name] for name, count in ours.items()})
 
     @property
     def changed(self) -> int:
@@ -78,21 +73,9 @@ class Confusion:
 
     def figures(self) -> dict[str, float | int | None]:
         """Return all of the above, JSON-ready: None where a ratio has no meaning."""
-        ratios = {
-            "precision": self.precision,
-            "recall": self.recall,
-            "f1": self.f1,
-            "accuracy": self.accuracy,
-            "false_positive_rate": self.false_positive_rate,
-        }
-        return {
-            "true_positives": self.true_positives,
-            "false_positives": self.false_positives,
-            "false_negatives": self.false_negatives,
-            "true_negatives": self.true_negatives,
-            "unobserved": self.unobserved,
-            "unobserved_changed": self.unobserved_changed,
-            **{name: None if np.isnan(value) else round(value, 4) for name, value in ratios.items()},
+        ratios = {name: getattr(self, name) for name in RATIOS}
+        return asdict(self) | {
+            name: None if np.isnan(value) else round(value, 4) for name, value in ratios.items()
         }
 
 

@@ -46,19 +46,19 @@ def map_cloud(job_id: str) -> str:
 
 
 def map_reference(job_id: str) -> str:
-    """What surveys are registered to: points and normals of the reference map."""
+    """What surveys are registered to and compared with: points, normals and grid of the reference map."""
     return map_folder(job_id) + "reference.npz"
 
 
 def map_tiles(job_id: str) -> str:
-    """The dense points of the map's tiles."""
+    """What release 0.1 kept the map's grid in, with the points of its tiles; later ones have no such file."""
     return map_folder(job_id) + "tiles.npz"
 
 
 def map_embedding(job_id: str, model: str, sha256: str | None) -> str:
     """What one model computed of the reference alone; `model` is `name/version`, the digest that of its weights.
 
-    Other weights under the same name find no description, rather than one that is not theirs.
+    Other weights under the same name find no embedding, rather than one that is not theirs.
     """
     made_by = f"{model.replace('/', '-')}-{(sha256 or 'none')[:12]}"
     return f"{map_folder(job_id)}description-{safe_name(made_by)}.npz"
@@ -119,18 +119,13 @@ def survey_folder(survey_id: str) -> str:
     return f"surveys/{survey_id}/"
 
 
-def survey_pairs(survey_id: str) -> str:
-    """The survey's tiles beside those of the map."""
-    return survey_folder(survey_id) + "pairs.npz"
-
-
 def survey_current(survey_id: str) -> str:
     """The survey's scans fused in the map frame."""
     return survey_folder(survey_id) + "current.npz"
 
 
 def survey_scores(survey_id: str) -> str:
-    """The class probabilities of every tile."""
+    """The class probabilities of every tile, and of voxels where the detector has them."""
     return survey_folder(survey_id) + "scores.npz"
 
 

@@ -85,8 +85,11 @@ def finish_model(context: Context) -> None:
     folder, blobs = context.scratch / "run", context.catalog.blobs
     _fetch(context, folder)
     context.report("calibrating", 0.0)
-    with blobs.local(blob_keys.model_tiles(context.job.job_id)) as tiles:
-        made = _published(context, model, version, folder / BEST, tiles)
+    try:
+        with blobs.local(blob_keys.model_tiles(context.job.job_id)) as tiles:
+            made = _published(context, model, version, folder / BEST, tiles)
+    except ValueError as error:  # files of an earlier release
+        raise TrainingFailed(str(error)) from error
     card = read_card(made).model_copy(update={"licence": ""})
     weights = (made / str(card.weights)).read_bytes()
     blobs.put_bytes(blob_keys.model_weights(context.job.job_id), weights)

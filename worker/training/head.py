@@ -17,9 +17,8 @@ from worker.metrics import ClassFigures, class_figures
 from worker.progress import Progress, no_progress
 from worker.training.dataset import TileSet
 from worker.training.kept_pairs import Drawn, PairPool, keep_pairs
-from worker.training.log import HEAD_LOG, EpochRow, append_row, by_class
-from worker.training.schedule import Schedule
-from worker.training.settings import TrainSettings
+from worker.training.log import HEAD_LOG, EpochRow, append_row, row_of
+from worker.training.settings import Schedule, TrainSettings
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -117,16 +116,13 @@ class _HeadRun:
         if figures.rank > self.measured.rank:
             self.measured, self.best_epoch = figures, number
             self.best = copy.deepcopy(self._head.state_dict())
-        return EpochRow(
+        return row_of(
+            figures,
             epoch=number,
             seconds=round(seconds, 1),
             learning_rate=rate,
             train_loss=float(np.mean(losses)),
             train_accuracy=float(np.mean(hits)),
-            validation_loss=figures.loss,
-            accuracy=figures.accuracy,
-            **by_class("precision", figures.precision),
-            **by_class("recall", figures.recall),
         )
 
     @torch.no_grad()

@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
 from worker.files import write_atomically
+from worker.metrics import ClassFigures
 
 LOG = "epochs.csv"
 HEAD_LOG = "head_epochs.csv"  #: of what the head was trained on its own
@@ -59,7 +60,9 @@ def cut_log(folder: Path, epochs: int) -> None:
     write_atomically(path, write)
 
 
-def by_class(name: str, values: tuple[float, float, float]) -> dict[str, float]:
-    """Return the columns of a figure that every class has."""
+def row_of(figures: ClassFigures, **others: float) -> EpochRow:
+    """Return a row with the figures of the validation pairs."""
     classes = ("unchanged", "changed", "different")
-    return {f"{name}_{of}": value for of, value in zip(classes, values, strict=True)}
+    by_class = {f"precision_{name}": value for name, value in zip(classes, figures.precision, strict=True)}
+    by_class |= {f"recall_{name}": value for name, value in zip(classes, figures.recall, strict=True)}
+    return EpochRow(validation_loss=figures.loss, accuracy=figures.accuracy, **by_class, **others)  # type: ignore[arg-type]

@@ -24,25 +24,19 @@ class PairSettings:
     """How pairs are made; the defaults are the paper's but for those that say so."""
 
     patch_points: int = 4096  #: points of a padded patch
-    chamfer_points: int | None = (
-        None  #: ours: the Chamfer branch compares all points of both patches; the paper's is 128 of each
-    )
+    #: Ours: the Chamfer branch compares all points of both patches; the paper's is 128 of each.
+    chamfer_points: int | None = None
     shares: tuple[float, float, float] = (0.50, 0.35, 0.15)  #: of the three classes
-    rerun_share: float = (
-        0.7  #: of unchanged pairs of one observation: sampled anew, the rest are stored patches
-    )
-    stored_still: bool = (
-        True  #: ours: a stored patch that comes back is not augmented either, nor a change of one
-    )
-    edited_share: float = (
-        0.65  #: ours: of changed pairs, those of whole things added, removed or moved, where there are any
-    )
-    rebuilt_share: float = (
-        0.35  #: ours: of changed pairs, those changed in some of the scans that the map is fused of
-    )
-    beside_share: float = (
-        0.5  #: ours: of unchanged pairs without a twin, those beside a change, where there are any
-    )
+    #: Of unchanged pairs of one observation: sampled anew, the rest are stored patches.
+    rerun_share: float = 0.7
+    #: Ours: a stored patch that comes back is not augmented either, nor a change of one.
+    stored_still: bool = True
+    #: Ours: of changed pairs, those of whole things added, removed or moved, where there are any.
+    edited_share: float = 0.65
+    #: Ours: of changed pairs, those changed in some of the scans that the map is fused of.
+    rebuilt_share: float = 0.35
+    #: Ours: of unchanged pairs that match no changed one, those beside a change, where there are any.
+    beside_share: float = 0.5
     revisit_share: float = 0.7  #: ours: pairs of both visits, where there are two; 0 is the paper's protocol
     revisit_intensity: float = 0.0  #: ours: of the nuisance on such pairs, which have an honest one
     changed_intensity: float = 0.5  #: of the nuisance on changed pairs
@@ -52,9 +46,8 @@ class PairSettings:
     shown_distance: float = 0.075  #: metres; with `min_shown` what the simulator's truth calls a change
     min_separation: float = 3.0  #: metres between different tiles of one building
     symmetries: bool = True  #: ours: both patches under one of the square's eight symmetries
-    matched_pairs: bool = (
-        True  #: ours: a changed pair comes with an unchanged one of the same tile and observations
-    )
+    #: Ours: a changed pair comes with an unchanged one of the same tile and observations.
+    matched_pairs: bool = True
     augmentation: Augmentation = field(default_factory=Augmentation)
     nuisance: Nuisance = field(default_factory=Nuisance)
 
@@ -80,9 +73,8 @@ class Observations:
     unchanged: tuple[Points, Points]
     changed: tuple[Points, Points] | None = None  #: None: a synthetic change is due
     revisit: bool = False  #: of two visits, not one tile twice
-    still: bool = (
-        False  #: of the very same scans, so that nothing differs but the change: no nuisance, no noise
-    )
+    #: Of the very same scans, so that nothing differs but the change: no nuisance, no noise.
+    still: bool = False
 
 
 class PairMaker:

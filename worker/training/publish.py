@@ -50,6 +50,27 @@ DEVIATIONS = (
 )
 PAPER_DENSITY = (0.075, 0.075)
 
+#: By the setting that says whether.
+OURS = {
+    "revisit_share": "revisit_share of the pairs are two independent visits, not one tile sampled twice",
+    "edited_share": (
+        "edited_share of the changed pairs are visits after whole things were added, removed and moved"
+    ),
+    "rebuilt_share": (
+        "rebuilt_share of the changed pairs were changed in some of the scans that the map is fused of"
+    ),
+    "chamfer_points": "the Chamfer statistics are of all points of both patches, not of 128 of each",
+    "stored_still": "a stored patch that comes back is not augmented, nor a change of one",
+    "matched_pairs": "a changed pair comes with an unchanged one of the same tile",
+    "min_shown": "changes that hardly show are drawn again",
+    "symmetries": "pairs are turned by the square's symmetries",
+    "density": "change density is the range given in settings",
+    "initialize_head": (
+        "the head's first layers are initialised from data, so that the Chamfer statistics are heard from the start"
+    ),
+    "head_epochs": "after the last epoch the head was trained on alone, on descriptors computed once",
+}
+
 
 def publish(
     checkpoint: Path,
@@ -185,35 +206,16 @@ def deviations(settings: dict[str, Any]) -> list[str]:
     """Return where a training with these settings, as `whole` returns them, departs from the paper, in words."""
     pairs = settings["pairs"]
     ours = {
-        "revisit_share of the pairs are two independent visits, not one tile sampled twice": pairs[
-            "revisit_share"
-        ],
-        "edited_share of the changed pairs are visits after whole things were added, removed and moved": pairs[
-            "edited_share"
-        ],
-        "rebuilt_share of the changed pairs were changed in some of the scans that the map is fused of": pairs[
-            "rebuilt_share"
-        ],
-        "the Chamfer statistics are of all points of both patches, not of 128 of each": (
-            pairs["chamfer_points"] is None
-        ),
-        "a stored patch that comes back is not augmented, nor a change of one": pairs["stored_still"],
-        "a changed pair comes with an unchanged one of the same tile": pairs["matched_pairs"],
-        "changes that hardly show are drawn again": pairs["min_shown"],
-        "pairs are turned by the square's symmetries": pairs["symmetries"],
-        "change density is the range given in settings": tuple(pairs["density"]) != PAPER_DENSITY,
-        "the head's first layers are initialised from data, so that the Chamfer statistics are heard from the start": (
-            settings["initialize_head"]
-        ),
-        "after the last epoch the head was trained on alone, on descriptors computed once": settings[
-            "head_epochs"
-        ],
+        **settings,
+        **pairs,
+        "chamfer_points": pairs["chamfer_points"] is None,
+        "density": tuple(pairs["density"]) != PAPER_DENSITY,
     }
-    return [*DEVIATIONS, *(words for words, true in ours.items() if true)]
+    return [*DEVIATIONS, *(words for name, words in OURS.items() if ours[name])]
 
 
 def _take_log(log: Path, place: Path) -> None:
-    """None rather than that of an earlier training."""
+    """Copy the log; without one, take away that of an earlier training."""
     if log.exists():
         shutil.copyfile(log, place)
     else:
@@ -226,21 +228,11 @@ def main() -> None:
     parser.add_argument("checkpoint", type=Path)
     parser.add_argument("tiles", type=Path, help="the training set that it was made with")
     parser.add_argument("--unseen", type=Path, help="tiles of other buildings, to measure on")
-    parser.add_argument("--store", type=Path, default=MODEL_STORE)
+    parser.add_argument("--store", type=Path, default=MODEL_STORE, dest="model_store")
     parser.add_argument("--version", default="1")
     parser.add_argument("--summary", default="SPICD-Net as the paper describes it")
     parser.add_argument("--command", default="", help="how the training was started, for the card")
-    given = parser.parse_args()
-    folder = publish(
-        given.checkpoint,
-        given.tiles,
-        given.store,
-        unseen=given.unseen,
-        version=given.version,
-        summary=given.summary,
-        command=given.command,
-    )
-    sys.stdout.write(f"{folder}\n")
+    sys.stdout.write(f"{publish(**vars(parser.parse_args()))}\n")
 
 
 if __name__ == "__main__":

@@ -1,14 +1,38 @@
-"""What of a training can be set."""
+"""What of a training can be set, and the learning rate that follows."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from worker.detectors.networks import NETWORKS
 from worker.detectors.trainable import TrainableNetwork
 from worker.training.pairs import PAPER_PAIRS, SAMPLE_POINTS, PairSettings
-from worker.training.schedule import Schedule
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Schedule:
+    """Cosine from `start` to `end` over the run (paper, Section 3.8).
+
+    A run may be bounded by epochs, by wall-clock minutes, or by both; whichever is nearer to its end sets the
+    place on the curve, so that the rate has come down when the time is up.
+    """
+
+    epochs: int
+    minutes: float | None = None
+    start: float = 1e-3
+    end: float = 1e-5
+
+    def done(self, epochs: float, seconds: float) -> float:
+        """Return share 0..1 of the run behind us after so many epochs (fractions count) and seconds."""
+        by_time = 0.0 if self.minutes is None else seconds / (60 * self.minutes)
+        by_epochs = epochs / self.epochs if self.epochs else 1.0
+        return min(max(by_epochs, by_time), 1.0)
+
+    def rate(self, done: float) -> float:
+        """Return the learning rate at that share."""
+        return self.end + (self.start - self.end) * 0.5 * (1 + math.cos(math.pi * done))
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -27,9 +51,8 @@ class TrainSettings:
     weight_decay: float = 1e-4
     held_out: float = 0.1  #: share of the tiles
     seed: int = 42
-    start_from: str | None = (
-        None  #: what network is trained on, with a fresh optimiser: a checkpoint, or as said with `start`
-    )
+    #: What network is trained on, with a fresh optimiser: a checkpoint, or as said with `start`.
+    start_from: str | None = None
     fresh_head: bool = False  #: ours: of that network the encoder alone is taken, and the head starts anew
     initialize_head: bool = True  #: ours: the head's first layers start as if their inputs were standardised
     head_epochs: int = 0  #: ours: after the last epoch the head goes on alone, on descriptors computed once
@@ -49,12 +72,8 @@ class TrainSettings:
 
     @property
     def schedule(self) -> Schedule:
-        return Schedule(
-            epochs=self.epochs,
-            minutes=self.minutes,
-            start=self.learning_rate,
-            end=self.final_learning_rate,
-        )
+        start, end = self.learning_rate, self.final_learning_rate
+        return Schedule(epochs=self.epochs, minutes=self.minutes, start=start, end=end)
 
 
 #: Sections 3.5 to 3.8 to the letter.

@@ -19,7 +19,7 @@ from worker.metrics import ClassFigures, class_figures
 from worker.progress import Progress, no_progress
 from worker.training.dataset import TileSet, load_tiles, split_tiles
 from worker.training.head import train_head
-from worker.training.log import EpochRow, append_row, by_class, cut_log
+from worker.training.log import EpochRow, append_row, cut_log, row_of
 from worker.training.pairs import PairMaker
 from worker.training.prefetch import prefetched
 from worker.training.settings import TrainSettings, whole
@@ -227,16 +227,13 @@ class Run:
         write_atomically(self._out / name, partial(torch.save, state))
 
     def _log(self, trained: _Trained, figures: ClassFigures) -> EpochRow:
-        row = EpochRow(
+        row = row_of(
+            figures,
             epoch=self._epochs,
             seconds=round(self._seconds, 1),
             learning_rate=trained.rate,
             train_loss=trained.loss,
             train_accuracy=trained.accuracy,
-            validation_loss=figures.loss,
-            accuracy=figures.accuracy,
-            **by_class("precision", figures.precision),
-            **by_class("recall", figures.recall),
         )
         append_row(self._out, row)
         return row

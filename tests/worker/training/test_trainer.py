@@ -15,8 +15,7 @@ from worker.training.dataset import save_tiles
 from worker.training.log import LOG
 from worker.training.pairs import PairSettings
 from worker.training.prefetch import prefetched
-from worker.training.schedule import Schedule
-from worker.training.settings import PAPER, TrainSettings
+from worker.training.settings import PAPER, Schedule, TrainSettings
 from worker.training.trainer import BEST, CHECKPOINT, INITIALIZATION_PAIRS, train
 
 TINY = TrainSettings(

@@ -20,7 +20,7 @@ from worker.detectors.detector import Detector
 
 @dataclass(kw_only=True, slots=True)
 class CachedDetector:
-    """A detector on one map: the reference is described once, and a tile is scored once for each content.
+    """A detector on one map: the reference is encoded once, and a tile is scored once for each content.
 
     Most tiles of the experiments are the same points again.
     """

@@ -15,7 +15,7 @@ from worker.cloud.types import Arrays, Points
 from worker.detectors.card import Card
 from worker.detectors.comparison import Comparison, Side
 from worker.detectors.detector import Detection
-from worker.detectors.spicd_net.chamfer import STATISTICS, chamfer_statistics
+from worker.detectors.spicd_net.chamfer import chamfer_statistics
 from worker.detectors.spicd_net.frozen import FrozenEncoder
 from worker.detectors.spicd_net.network import DESCRIPTOR, SpicdNetwork
 from worker.detectors.spicd_net.settings import SpicdNetSettings
@@ -84,14 +84,6 @@ class SpicdNet:
         seen = self._encoded(after, progress, "scoring")
         probabilities[observed] = self._probabilities(known, seen, self._statistics(before, after))
         return Detection(probabilities=probabilities)
-
-    def statistics(self, pairs: TilePairs) -> NDArray[np.float32]:
-        """Return what the Chamfer branch is given, (T, 8); NaN where not observed."""
-        observed = np.flatnonzero(pairs.observed)
-        statistics = np.full((len(pairs.observed), STATISTICS), np.nan, np.float32)
-        if len(observed):
-            statistics[observed] = self._statistics(*self._both(pairs, observed)).cpu().numpy()
-        return statistics
 
     def _both(self, pairs: TilePairs, chosen: NDArray[np.intp]) -> tuple[list[Patch], list[Patch]]:
         return (

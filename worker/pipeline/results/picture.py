@@ -25,21 +25,15 @@ Extent = tuple[float, float, float, float]  #: left, right, bottom, top; metres,
 
 INK = "#1a1a1a"
 QUIET = "#666666"
-#: of the tiles in one column of the grid, the one that is shown; the rest would lie under it
-PRECEDENCE = (TileState.CHANGED, TileState.INCONSISTENT, TileState.UNOBSERVED, TileState.UNCHANGED)
-FILL = {
-    TileState.CHANGED: 0.4,
-    TileState.INCONSISTENT: 0.3,
-    TileState.UNOBSERVED: 0.1,
-    TileState.UNCHANGED: 0.0,
+#: How strongly a tile is filled, and a second sign beside the colour, for eyes and printers without it. Of the tiles
+#: in one column of the grid the first in this order is shown; the rest would lie under it.
+STYLES = {
+    TileState.CHANGED: (0.4, ""),
+    TileState.INCONSISTENT: (0.3, "xx"),
+    TileState.UNOBSERVED: (0.1, "//"),
+    TileState.UNCHANGED: (0.0, ""),
 }
-#: a second sign beside the colour, for eyes and printers without it
-HATCH = {
-    TileState.CHANGED: "",
-    TileState.INCONSISTENT: "xx",
-    TileState.UNOBSERVED: "//",
-    TileState.UNCHANGED: "",
-}
+PRECEDENCE = tuple(STYLES)
 HATCH_WIDTH = 0.5  # points
 HEAD, FOOT, SIDE = 0.75, 1.0, 0.55  # inches above, below and left of it
 
@@ -84,11 +78,11 @@ def dress(figure: Figure, axes: Axes, extent: Extent, changes: ChangeSet, title:
 
 
 def _legend_entry(state: TileState, count: int) -> Patch:
-    color = color_of(state)
+    color, (fill, hatch) = color_of(state), STYLES[state]
     return Patch(
-        facecolor=(*color, max(FILL[state], 0.05)),
+        facecolor=(*color, max(fill, 0.05)),
         edgecolor=color,
-        hatch=HATCH[state],
+        hatch=hatch,
         label=f"{count} {state.label}",
     )
 
@@ -173,16 +167,16 @@ def _draw_tiles(axes: Axes, changes: ChangeSet, *, tile_inches: float) -> None:
     lower = tiles.grid.lower(tiles.indices)
     for row in _topmost(changes):
         state = TileState(int(changes.states[row]))
-        color = color_of(state)
+        color, (fill, hatch) = color_of(state), STYLES[state]
         axes.add_patch(
             Rectangle(
                 (lower[row, 0], lower[row, 1]),
                 float(tiles.grid.size[0]),
                 float(tiles.grid.size[1]),
-                facecolor=(*color, FILL[state]),
+                facecolor=(*color, fill),
                 edgecolor=(0.6, 0.6, 0.6, 0.35) if state is TileState.UNCHANGED else color,
                 linewidth=2.0 if state is TileState.CHANGED else 0.6,
-                hatch=HATCH[state],
+                hatch=hatch,
                 zorder=3 if state is TileState.CHANGED else 2,
             )
         )
