@@ -18,8 +18,13 @@ from scipy.spatial import cKDTree
 from worker.cloud.normals import estimate_normals
 from worker.cloud.tiling import TilePairs, Tiles
 from worker.cloud.types import Floats, Normals, Points
-from worker.detectors.c2c.detector import tile_distances
-from worker.detectors.c2c.distances import FARTHEST, distances_both_ways, split_by_tile, tile_means
+from worker.detectors.c2c.detector import (
+    FARTHEST,
+    distances_both_ways,
+    split_by_tile,
+    tile_distances,
+    tile_means,
+)
 from worker.detectors.comparison import Comparison
 from worker.threads import query_threads
 

@@ -83,6 +83,7 @@ def store(tmp_path: Path) -> Path:
         summary="for tests",
         threshold=0.5,
         preprocessing=needs,
+        detector_settings={"patch_points": 4096, "seed": 42},
         sha256=OURS,
         evaluation={"validation": {"f1": 0.5}},
     )

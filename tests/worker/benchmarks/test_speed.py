@@ -23,6 +23,7 @@ def model_store(tmp_path: Path) -> Path:
         summary="untrained",
         threshold=0.5,
         preprocessing=needs,
+        detector_settings={"patch_points": 4096, "seed": 42},
         weights="weights.safetensors",
     )
     write_model(tmp_path / "spicd-net" / "1", card, SpicdNetwork().state_dict())

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Self
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 from torch import Tensor
 
 from worker.cloud.patches import Patch, patch
@@ -18,13 +20,35 @@ from worker.detectors.detector import Detection
 from worker.detectors.spicd_net.chamfer import chamfer_statistics
 from worker.detectors.spicd_net.frozen import FrozenEncoder
 from worker.detectors.spicd_net.network import DESCRIPTOR, SpicdNetwork
-from worker.detectors.spicd_net.settings import SpicdNetSettings
 from worker.progress import Progress, no_progress
 
 #: Tiles between two calls of `progress`, so how soon a dismissed job stops: some 40 ms on two cores.
 TILES_PER_REPORT = 8
 
 REFERENCE, CURRENT = 0, 1  #: streams of the Chamfer sample, so that two equal patches are not sampled alike
+
+
+class SpicdNetSettings(BaseModel):
+    """`detector_settings` of a card of this detector: what of the input is tied to the weights."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    patch_points: int = Field(gt=0, description="points of a patch after FPS and repetition")
+    chamfer_points: int | None = Field(
+        default=128,
+        gt=0,
+        description="of each patch, that are compared; null: all, where the paper takes 128",
+    )
+    seed: int = Field(description="of FPS and of the Chamfer sample")
+
+    @model_validator(mode="after")
+    def _sample_fits(self) -> Self:
+        if self.chamfer_points is not None and self.patch_points < self.chamfer_points:
+            raise ValueError(
+                f"the Chamfer sample takes {self.chamfer_points} of a patch's {self.patch_points} points "
+                "without replacement"
+            )
+        return self
 
 
 class SpicdNet:
