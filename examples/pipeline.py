@@ -15,7 +15,7 @@ from pathlib import Path
 from worker.cloud.formats.pcd import write_pcd
 from worker.detectors.card import MODEL_STORE
 from worker.detectors.store import open_detector
-from worker.pipeline.flow import PipelineSettings, build_map, detect, locate_survey
+from worker.pipeline import PipelineSettings, build_map, detect, locate_survey
 from worker.pipeline.registration.results import ScanFile
 from worker.pipeline.results.export import TileResult, tile_results, write_coloured_cloud
 from worker.simulation.scenes import random_edits, random_room
@@ -26,9 +26,9 @@ def changed_tiles(before: list[ScanFile], after: list[ScanFile], cloud: Path) ->
     """Return the tiles that changed between two visits, and write the later one as a coloured cloud."""
     detector = open_detector(MODEL_STORE, "spicd-net/1")
     settings = PipelineSettings().for_model(detector.card.preprocessing)
-    reference = build_map(before, settings=settings)
-    survey = locate_survey(after, reference.reference, reference.tiles, settings=settings)
-    changes = detect(survey.pairs, detector)
+    built = build_map(before, settings=settings)
+    survey = locate_survey(after, built.reference, settings=settings)
+    changes = detect(survey.comparison, detector)
     write_coloured_cloud(cloud, survey.current, changes)
     return [tile for tile in tile_results(changes) if tile.state == "changed"]
 

@@ -1,4 +1,4 @@
-"""Counts of tiles right and wrong, and the ratios made of them (paper, Section 4.3).
+"""Counts of tiles or pairs right and wrong, and the ratios made of them (paper, Section 4.3).
 
 A tile is flagged where its score is above the threshold (Section 3.9.4). A tile without a score (NaN) is never
 flagged: nobody was told of it.
@@ -7,7 +7,7 @@ flagged: nobody was told of it.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from worker.cloud.types import Bools, Floats
 
 Scores = NDArray[np.floating[Any]]
+RATIOS = ("precision", "recall", "f1", "accuracy", "false_positive_rate")  #: of a Confusion
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -30,14 +31,8 @@ class Confusion:
     unobserved_changed: int = 0  #: of those, the truly changed
 
     def __add__(self, other: Confusion) -> Confusion:
-        return Confusion(
-            true_positives=self.true_positives + other.true_positives,
-            false_positives=self.false_positives + other.false_positives,
-            false_negatives=self.false_negatives + other.false_negatives,
-            true_negatives=self.true_negatives + other.true_negatives,
-            unobserved=self.unobserved + other.unobserved,
-            unobserved_changed=self.unobserved_changed + other.unobserved_changed,
-        )
+        ours, theirs = asdict(self), asdict(other)
+        return Confusion(**{name: count + theirs[name] for name, count in ours.items()})
 
     @property
     def changed(self) -> int:
@@ -71,23 +66,16 @@ class Confusion:
         """NaN where everything changed."""
         return _ratio(self.false_positives, self.false_positives + self.true_negatives)
 
+    def precision_at(self, prevalence: float) -> float:
+        """Return the precision where such a share (0..1) of the tiles changed, at the same recall and false alarms."""
+        hits, alarms = prevalence * self.recall, (1 - prevalence) * self.false_positive_rate
+        return hits / (hits + alarms) if hits + alarms > 0 else 0.0
+
     def figures(self) -> dict[str, float | int | None]:
-        """All of the above, JSON-ready: None where a ratio has no meaning."""
-        ratios = {
-            "precision": self.precision,
-            "recall": self.recall,
-            "f1": self.f1,
-            "accuracy": self.accuracy,
-            "false_positive_rate": self.false_positive_rate,
-        }
-        return {
-            "true_positives": self.true_positives,
-            "false_positives": self.false_positives,
-            "false_negatives": self.false_negatives,
-            "true_negatives": self.true_negatives,
-            "unobserved": self.unobserved,
-            "unobserved_changed": self.unobserved_changed,
-            **{name: None if np.isnan(value) else round(value, 4) for name, value in ratios.items()},
+        """Return all of the above, JSON-ready: None where a ratio has no meaning."""
+        ratios = {name: getattr(self, name) for name in RATIOS}
+        return asdict(self) | {
+            name: None if np.isnan(value) else round(value, 4) for name, value in ratios.items()
         }
 
 
@@ -106,30 +94,13 @@ def confusion(scores: Scores, truth: Bools, threshold: float, observed: Bools | 
 
 
 def pooled(counts: Iterable[Confusion]) -> Confusion:
-    """All counts added up, so that figures are micro-aggregated (paper, Table 5, last row)."""
+    """Return all counts added up, so that figures are micro-aggregated (paper, Table 5, last row)."""
     return sum(counts, Confusion())
 
 
 def _ratio(part: int, whole: int) -> float:
     return part / whole if whole else float("nan")
 
-
-__all__ = [
-    "PAPER_SWEEP",
-    "Confusion",
-    "Operating",
-    "PrecisionRecall",
-    "Roc",
-    "Scores",
-    "Sweep",
-    "all_thresholds",
-    "best_f1",
-    "confusion",
-    "pooled",
-    "precision_recall",
-    "roc",
-    "sweep",
-]
 
 #: Thresholds that the paper sweeps (Section 3.9.3).
 PAPER_SWEEP: Floats = np.round(np.arange(0.10, 0.905, 0.01), 2)
@@ -195,7 +166,7 @@ class PrecisionRecall:
 
 
 def sweep(scores: Scores, truth: Bools, thresholds: Floats = PAPER_SWEEP) -> Sweep:
-    """Counts of tiles (T,) at each threshold."""
+    """Count tiles (T,) at each threshold."""
     changed, unchanged = (np.sort(scores[chosen & ~np.isnan(scores)]) for chosen in (truth, ~truth))
     above = [len(part) - np.searchsorted(part, thresholds, side="right") for part in (changed, unchanged)]
     return Sweep(
@@ -208,7 +179,7 @@ def sweep(scores: Scores, truth: Bools, thresholds: Floats = PAPER_SWEEP) -> Swe
 
 
 def all_thresholds(scores: Scores) -> Floats:
-    """(K,) ascending: one below every score, then one in each gap, then the highest score; every cut there is."""
+    """Return every cut there is, (K,) ascending: below every score, in each gap, at the highest score."""
     values = np.unique(scores[~np.isnan(scores)]).astype(np.float64)
     if not len(values):
         return np.zeros(1)
@@ -217,39 +188,39 @@ def all_thresholds(scores: Scores) -> Floats:
 
 
 def best_f1(scores: Scores, truth: Bools, thresholds: Floats | None = PAPER_SWEEP) -> Operating:
-    """The threshold with the highest F1 over tiles (T,), the middle one of equals; of every cut if None is given.
+    """Return the threshold with the highest F1 over tiles (T,), the middle of equals; of every cut if None is given.
 
     Raises ValueError where nothing changed: every threshold is then as good.
     """
     if not truth.any():
         raise ValueError("a threshold cannot be chosen by F1 where no tile changed")
-    found = sweep(scores, truth, all_thresholds(scores) if thresholds is None else thresholds)
-    equals = np.flatnonzero(found.f1 >= found.f1.max() - 1e-12)
-    threshold = float(found.thresholds[equals[len(equals) // 2]])
+    swept = sweep(scores, truth, all_thresholds(scores) if thresholds is None else thresholds)
+    equals = np.flatnonzero(swept.f1 >= swept.f1.max() - 1e-12)
+    threshold = float(swept.thresholds[equals[len(equals) // 2]])
     return Operating(threshold=threshold, counts=confusion(scores, truth, threshold))
 
 
 def roc(scores: Scores, truth: Bools) -> Roc:
-    """Over every cut of the tiles (T,); those without a score are never flagged but by "everything"."""
-    found = sweep(scores, truth, all_thresholds(scores)[::-1])
-    rates = [np.r_[0.0, rate, 1.0] for rate in (found.false_positive_rate, found.recall)]
+    """Return the curve over every cut of the tiles (T,); only "everything" flags those without a score."""
+    swept = sweep(scores, truth, all_thresholds(scores)[::-1])
+    rates = [np.r_[0.0, rate, 1.0] for rate in (swept.false_positive_rate, swept.recall)]
     return Roc(
         false_positive_rate=rates[0],
         recall=rates[1],
-        thresholds=np.r_[np.inf, found.thresholds, -np.inf],
+        thresholds=np.r_[np.inf, swept.thresholds, -np.inf],
         area=float((np.diff(rates[0]) * (rates[1][1:] + rates[1][:-1]) / 2).sum()),
     )
 
 
 def precision_recall(scores: Scores, truth: Bools) -> PrecisionRecall:
-    """Over every cut of the tiles (T,) that flags something."""
-    found = sweep(scores, truth, all_thresholds(scores)[::-1])
-    flags = found.true_positives + found.false_positives > 0
-    recall, precision = found.recall[flags], found.precision[flags]
+    """Return the curve over every cut of the tiles (T,) that flags something."""
+    swept = sweep(scores, truth, all_thresholds(scores)[::-1])
+    flags = swept.true_positives + swept.false_positives > 0
+    recall, precision = swept.recall[flags], swept.precision[flags]
     return PrecisionRecall(
         recall=recall,
         precision=precision,
-        thresholds=found.thresholds[flags],
+        thresholds=swept.thresholds[flags],
         average_precision=float((np.diff(recall, prepend=0.0) * precision).sum()),
     )
 
@@ -258,3 +229,33 @@ def _ratios(part: NDArray[np.int64], whole: NDArray[np.int64] | int) -> Floats:
     total = np.broadcast_to(np.asarray(whole, np.float64), part.shape)
     ratios: Floats = np.divide(part, total, out=np.full(part.shape, np.nan), where=total > 0)
     return ratios
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ClassFigures:
+    """How a classifier of pairs does on three classes."""
+
+    loss: float
+    accuracy: float
+    precision: tuple[float, float, float]  #: of each class; 0 for a class never answered
+    recall: tuple[float, float, float]
+
+    @property
+    def rank(self) -> tuple[float, float]:
+        """Which checkpoint is better: accuracy, then the worst class's precision (paper, Section 3.8)."""
+        return self.accuracy, min(self.precision)
+
+
+def class_figures(probabilities: NDArray[np.float32], labels: NDArray[np.int64], loss: float) -> ClassFigures:
+    """Count the answers (n, 3) beside the labels (n,)."""
+    answers = np.zeros((3, 3), dtype=np.int64)  # true class, answered class
+    np.add.at(answers, (labels, probabilities.argmax(axis=1)), 1)
+    hits = np.diag(answers)
+    precision = (hits / np.maximum(answers.sum(axis=0), 1)).tolist()
+    recall = (hits / np.maximum(answers.sum(axis=1), 1)).tolist()
+    return ClassFigures(
+        loss=loss,
+        accuracy=float(hits.sum() / max(len(labels), 1)),
+        precision=(precision[0], precision[1], precision[2]),
+        recall=(recall[0], recall[1], recall[2]),
+    )

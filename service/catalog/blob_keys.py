@@ -50,8 +50,10 @@ def map_folder(job_id: str) -> str:
 
 
 map_cloud = _within(map_folder, "cloud.ply")  #: the fused reference map
-map_reference = _within(map_folder, "reference.npz")  #: points and normals, which surveys are registered to
-map_tiles = _within(map_folder, "tiles.npz")  #: the dense points of the map's tiles
+map_reference = _within(
+    map_folder, "reference.npz"
+)  #: points, normals and grid, which surveys are compared with
+map_tiles = _within(map_folder, "tiles.npz")  #: where release 0.1 kept the grid; later ones have no such file
 map_manifest = _within(map_folder, "manifest.json")  #: the tile manifest (paper, Table A1)
 map_work = _within(map_folder, "work/")  #: what the building of a map remembers of itself while it lasts
 
@@ -97,9 +99,10 @@ def survey_folder(survey_id: str) -> str:
     return f"surveys/{survey_id}/"
 
 
-survey_pairs = _within(survey_folder, "pairs.npz")  #: the survey's tiles beside those of the map
 survey_current = _within(survey_folder, "current.npz")  #: the survey's scans fused in the map frame
-survey_scores = _within(survey_folder, "scores.npz")  #: the class probabilities of every tile
+survey_scores = _within(
+    survey_folder, "scores.npz"
+)  #: probabilities of tiles, and of voxels where there are such
 survey_cloud = _within(survey_folder, "cloud.ply")  #: the current map coloured by result
 survey_picture = _within(survey_folder, "picture.png")  #: the top view with tiles by state
 

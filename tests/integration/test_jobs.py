@@ -45,7 +45,7 @@ def run_until_killed(job: JobRecord, name: str) -> None:
             run(job, name)
 
 
-def description_key(house: House, model: str) -> str:
+def embedding_key(house: House, model: str) -> str:
     """Of what this model's weights said of the map."""
     card = open_card(house.material.model_store, model)
     return blob_keys.map_embedding(house.catalog.maps.get(MAP).job_id, model, card.sha256)
@@ -79,7 +79,7 @@ def test_a_map_is_ready_with_its_counts_scans_and_files(house: House) -> None:
     assert listing["n_valid_patches"] == found.counts["tiles"]
     assert found.bounds is not None
     assert found.bounds.max == pytest.approx(listing["map_bounds"]["max"])
-    assert house.catalog.blobs.exists(description_key(house, MODEL))
+    assert house.catalog.blobs.exists(embedding_key(house, MODEL))
 
 
 def test_a_survey_is_ready_with_a_state_for_every_tile_of_the_map(house: House) -> None:
@@ -120,7 +120,7 @@ def test_a_threshold_of_0_finds_every_observed_tile_changed(house: House) -> Non
 def test_a_model_that_cuts_alike_scores_a_map_that_was_described_for_another(house: House) -> None:
     ours, theirs = (house.tiles(house.survey(job).survey_id) for job in house.done)
     assert house.survey(house.done[1]).model == SAME_CUT
-    assert not house.catalog.blobs.exists(description_key(house, SAME_CUT))
+    assert not house.catalog.blobs.exists(embedding_key(house, SAME_CUT))
     assert len(ours) == len(theirs)
     for one, two in zip(ours, theirs, strict=True):  # the same weights under another name
         assert one["score"] == pytest.approx(two["score"], abs=1e-4)
@@ -319,13 +319,13 @@ def test_a_step_before_its_turn_is_harmless(house: House, visited: JobRecord) ->
     assert out_of_turn == in_turn
 
 
-@pytest.mark.parametrize(("described", "expected"), [(True, [0.0, 1.0]), (False, [0.0, 0.5, 0.5, 1.0])])
-def test_scoring_never_goes_back_when_the_map_has_to_be_described_first(
-    described: bool, expected: list[float]
+@pytest.mark.parametrize(("encoded", "expected"), [(True, [0.0, 1.0]), (False, [0.0, 0.5, 0.5, 1.0])])
+def test_scoring_never_goes_back_when_the_map_has_to_be_encoded_first(
+    encoded: bool, expected: list[float]
 ) -> None:
     told: list[float] = []
-    progress = scoring(lambda _, share: told.append(share), described=described)
-    for stage in ("score",) if described else ("describe", "score"):
+    progress = scoring(lambda _, share: told.append(share), encoded=encoded)
+    for stage in ("scoring",) if encoded else ("encoding", "scoring"):
         progress(stage, 0.0)
         progress(stage, 1.0)
     assert told == expected

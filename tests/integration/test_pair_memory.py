@@ -9,7 +9,7 @@ import pytest
 
 from service.catalog import blob_keys
 from service.catalog.blobs import Blobs
-from worker.jobs.pair_cache import KeptPairs
+from worker.jobs.pair_cache import StoredPairCache
 from worker.pipeline.registration.scan_to_scan import PairResult
 
 JOB = "job-1"
@@ -54,7 +54,7 @@ def pair(target: int, source: int, *, rmse: float = 0.02) -> PairResult:
 
 
 def loaded(blobs: Blobs, job_id: str = JOB) -> dict[tuple[int, int], PairResult]:
-    return {(each.target, each.source): each for each in KeptPairs(blobs, job_id).load()}
+    return {(each.target, each.source): each for each in StoredPairCache(blobs, job_id).load()}
 
 
 def writes(blobs: Blobs) -> int:
@@ -66,7 +66,7 @@ def test_a_new_build_remembers_nothing(blobs: Blobs) -> None:
 
 
 def test_pairs_come_back_as_they_were_those_that_met_nothing_too(blobs: Blobs) -> None:
-    memory = KeptPairs(blobs, JOB)
+    memory = StoredPairCache(blobs, JOB)
     saved = [pair(0, 1), pair(1, 2, rmse=np.inf)]
     memory.save(saved)
     memory.flush()
@@ -80,7 +80,7 @@ def test_pairs_come_back_as_they_were_those_that_met_nothing_too(blobs: Blobs) -
 
 
 def test_pairs_within_two_seconds_of_a_write_wait_for_the_next(blobs: Blobs, clock: Clock) -> None:
-    memory = KeptPairs(blobs, JOB, clock=clock)
+    memory = StoredPairCache(blobs, JOB, clock=clock)
     for number in range(1, 20):
         clock.now += 0.25
         memory.save([pair(0, number)])
@@ -93,7 +93,7 @@ def test_pairs_within_two_seconds_of_a_write_wait_for_the_next(blobs: Blobs, clo
 
 
 def test_nothing_new_writes_nothing(blobs: Blobs, clock: Clock) -> None:
-    memory = KeptPairs(blobs, JOB, clock=clock)
+    memory = StoredPairCache(blobs, JOB, clock=clock)
     for _ in range(5):
         clock.now += 10
         memory.save([])
@@ -103,7 +103,7 @@ def test_nothing_new_writes_nothing(blobs: Blobs, clock: Clock) -> None:
 def test_a_second_attempt_adds_to_the_first_and_neither_overwrites_the_other(
     blobs: Blobs, clock: Clock
 ) -> None:
-    first, second = (KeptPairs(blobs, JOB, clock=clock) for _ in range(2))
+    first, second = (StoredPairCache(blobs, JOB, clock=clock) for _ in range(2))
     for number, memory in enumerate((first, second, first)):  # the first was thought dead
         clock.now += 3
         memory.save([pair(0, number + 1)])
@@ -111,7 +111,7 @@ def test_a_second_attempt_adds_to_the_first_and_neither_overwrites_the_other(
 
 
 def test_each_build_has_its_own(blobs: Blobs, clock: Clock) -> None:
-    other = KeptPairs(blobs, "job-11", clock=clock)
+    other = StoredPairCache(blobs, "job-11", clock=clock)
     clock.now += 3
     other.save([pair(0, 1)])
     assert loaded(blobs) == {}
@@ -119,7 +119,7 @@ def test_each_build_has_its_own(blobs: Blobs, clock: Clock) -> None:
 
 
 def test_what_another_release_wrote_is_left_aside(blobs: Blobs, clock: Clock) -> None:
-    memory = KeptPairs(blobs, JOB, clock=clock)
+    memory = StoredPairCache(blobs, JOB, clock=clock)
     memory.save([pair(0, 1)])
     memory.flush()
     blobs.put_bytes(blob_keys.map_pairs(JOB, "old"), b'[{"target": 0, "source": 2}]')

@@ -15,7 +15,7 @@ from tests.support.house import MAP, MODEL, OTHER_CUT, House, run
 from worker.detectors.card import Card
 from worker.detectors.spicd_net.detector import SpicdNet
 from worker.errors import DetectorUnavailable, TrainingFailed
-from worker.jobs import tile_sets, training
+from worker.jobs import site_training_set, training
 from worker.jobs.models import kept_detector
 from worker.jobs.step import Context
 from worker.pipeline import archive
@@ -49,8 +49,9 @@ def test_the_training_set_is_the_map_seen_by_the_halves_of_its_scans(house: Hous
     job = asked(house)
     run(job, "pack")
     tiles = packed(house, job)
-    with house.catalog.blobs.local(blob_keys.map_tiles(house.catalog.versions.ready(MAP, 1).job_id)) as path:
-        of_map = archive.load_tiles(path)
+    key = blob_keys.map_reference(house.catalog.versions.ready(MAP, 1).job_id)
+    with house.catalog.blobs.local(key) as path:
+        of_map = archive.load_reference(path).tiles(min_points=512)
     assert tiles.centres == pytest.approx(of_map.grid.centers(of_map.indices))
     twice = [at for at, points in enumerate(tiles.points_b) if len(points)]
     assert 5 < len(twice) < len(tiles)
@@ -73,7 +74,7 @@ def test_halves_are_of_every_other_scan() -> None:
         )
         for number in range(5)
     ]
-    first, second = tile_sets.halves(scans, voxel_size=0.05)
+    first, second = site_training_set.halves(scans, voxel_size=0.05)
     assert sorted(first[:, 0]) == [0, 2, 4]
     assert sorted(second[:, 0]) == [1, 3]
 
@@ -84,7 +85,7 @@ def strip(length: int, *, twice: int) -> TileSet:
     return TileSet(
         points_a=(point,) * length,
         points_b=tuple(point if number % twice == 0 else nothing for number in range(length)),
-        looks=(),
+        observations=(),
         centres=np.c_[1.5 * np.arange(length), np.zeros((length, 2))],
         buildings=np.zeros(length, np.int32),
         tile_size=(1.5, 1.5, 1.0),
@@ -102,13 +103,13 @@ def strip(length: int, *, twice: int) -> TileSet:
     ],
 )
 def test_a_tenth_is_held_out_or_the_least_that_is_enough(tiles: TileSet, share: float) -> None:
-    assert tile_sets.held_out_share(tiles, min_separation=3.0) == share
+    assert site_training_set.held_out_share(tiles, min_separation=3.0) == share
 
 
 @pytest.mark.parametrize("tiles", [strip(1, twice=1), strip(5, twice=1), strip(100, twice=50)])
 def test_what_is_too_little_to_train_on_is_refused_with_its_numbers(tiles: TileSet) -> None:
     with pytest.raises(TrainingFailed, match=f"the map has {len(tiles)} tiles"):
-        tile_sets.held_out_share(tiles, min_separation=3.0)
+        site_training_set.held_out_share(tiles, min_separation=3.0)
 
 
 def test_a_model_is_trained_further_calibrated_and_named_by_a_survey(house: House) -> None:
@@ -118,9 +119,10 @@ def test_a_model_is_trained_further_calibrated_and_named_by_a_survey(house: Hous
     assert house.catalog.jobs.get(job.job_id).status == "successful"
     assert (model.model, model.status, model.map_version) == ("lobby-net/1", "ready", 1)
     card = Card.model_validate(model.card)
-    assert (card.name, card.version, card.preprocessing.patch_points) == ("lobby-net", "1", 512)
+    assert (card.name, card.version) == ("lobby-net", "1")
+    assert card.detector_settings["patch_points"] == 512
     trained_on = card.training["settings"]["pairs"]["chamfer_points"]
-    assert card.preprocessing.chamfer_points == trained_on == 128  # as the base, whose card names none
+    assert card.detector_settings["chamfer_points"] == trained_on == 128  # as the base, whose card names none
     assert (card.training["map_id"], card.training["base"]) == (MAP, MODEL)
     assert set(card.evaluation) == {"validation", MODEL, "pairs"}  # beside what it started from
     assert card.evaluation["validation"]["threshold"] == card.threshold

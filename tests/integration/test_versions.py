@@ -13,7 +13,7 @@ from service.catalog.records import JobRecord, ScanOutcome, ScanRecord, VersionR
 from tests.support.house import MAP, House, run
 from worker.cloud.formats.scan import read_scan
 from worker.cloud.poses import difference
-from worker.cloud.tiling import Tiles, inside_tiles, tile_id
+from worker.cloud.tiling import Tiles, tile_id
 from worker.cloud.types import Indices, Points
 from worker.jobs import versions
 from worker.pipeline import archive
@@ -55,8 +55,8 @@ def counted(house: House, number: int) -> dict[str, int]:
 
 
 def tiles_of(house: House, job_id: str) -> Tiles:
-    with house.catalog.blobs.local(blob_keys.map_tiles(job_id)) as path:
-        return archive.load_tiles(path)
+    with house.catalog.blobs.local(blob_keys.map_reference(job_id)) as path:
+        return archive.load_reference(path).tiles(min_points=512)
 
 
 def scan_of(house: House, job_id: str, scan: ScanOutcome) -> RegisteredScan:
@@ -165,12 +165,12 @@ def test_a_survey_that_is_accepted_takes_the_place_of_the_map_where_it_found_it_
     ids = {tile_id(index) for index in replaced}
     for scan in first.scans:
         whole, rest = (scan_of(house, each.job_id, scan) for each in (first, second))
-        assert not inside_tiles(rest.points, grid, replaced).any()
+        assert (grid.locate_among(rest.points, replaced) < 0).all()
         assert np.array_equal(rest.points, without(whole, grid, replaced).points)
         assert len(rest.points) < len(whole.points)
     seen = scan_of(house, second.job_id, second.scans[-1])
     points = cloud(house, second.job_id)
-    new = points[inside_tiles(points, grid, replaced)]
+    new = points[grid.locate_among(points, replaced) >= 0]
     low, high = seen.points.min(axis=0), seen.points.max(axis=0)
     assert len(new) > 0
     assert ((new >= low - 1e-4) & (new <= high + 1e-4)).all()  # all of it was seen by the survey

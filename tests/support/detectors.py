@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from worker.cloud.tiling import TilePairs, Tiles
+from worker.cloud.tiling import Tiles
 from worker.cloud.types import Arrays
 from worker.detectors.card import Card, Preprocessing
-from worker.detectors.detector import TileScores
+from worker.detectors.comparison import Comparison, Side
+from worker.detectors.detector import Detection
 from worker.progress import Progress, no_progress
 
 
@@ -20,27 +21,28 @@ class CountingDetector:
         detector="counting",
         summary="",
         threshold=0.0,
-        preprocessing=Preprocessing(
-            voxel_size=0.05, tile_size=(1.5, 1.5, 1.0), patch_points=4096, min_points=512, seed=1
-        ),
+        preprocessing=Preprocessing(voxel_size=0.05, tile_size=(1.5, 1.5, 1.0), min_points=512),
     )
 
     def __init__(self) -> None:
-        self.described = 0
+        self.encoded = 0
         self.asked: list[int] = []
 
-    def describe(self, tiles: Tiles, *, progress: Progress = no_progress) -> Arrays:
-        self.described += 1
+    def encode_reference(self, reference: Side, tiles: Tiles, *, progress: Progress = no_progress) -> Arrays:
+        self.encoded += 1
         return {"counts": np.array([len(points) for points in tiles.points])}
 
-    def score(
-        self, pairs: TilePairs, *, description: Arrays | None = None, progress: Progress = no_progress
-    ) -> TileScores:
-        known = self.describe(pairs.reference) if description is None else description
+    def detect(
+        self, comparison: Comparison, *, embedding: Arrays | None = None, progress: Progress = no_progress
+    ) -> Detection:
+        pairs = comparison.tile_pairs
+        known = (
+            self.encode_reference(comparison.reference, pairs.reference) if embedding is None else embedding
+        )
         assert len(known["counts"]) == len(pairs.current)
         self.asked.append(int(pairs.observed.sum()))
         now = np.array([len(points) for points in pairs.current])
         share = np.abs(now - known["counts"]) / known["counts"]
         probabilities = np.stack([1 - share, share, 0 * share], axis=1).astype(np.float32)
         probabilities[~pairs.observed] = np.nan
-        return TileScores(probabilities=probabilities)
+        return Detection(probabilities=probabilities)

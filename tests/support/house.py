@@ -125,9 +125,8 @@ def _models(folder: Path) -> None:
             detector="spicd-net",
             summary="never trained",
             threshold=0.4,
-            preprocessing=Preprocessing(
-                voxel_size=0.05, tile_size=(tile, tile, 1.0), patch_points=512, min_points=512, seed=42
-            ),
+            preprocessing=Preprocessing(voxel_size=0.05, tile_size=(tile, tile, 1.0), min_points=512),
+            detector_settings={"patch_points": 512, "seed": 42},
             weights="weights.safetensors",
             sha256=hashlib.sha256(weights).hexdigest(),
         )

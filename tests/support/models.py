@@ -22,9 +22,8 @@ def make_untrained(folder: Path) -> None:
         detector="spicd-net",
         summary="never trained",
         threshold=0.4,
-        preprocessing=Preprocessing(
-            voxel_size=0.05, tile_size=(1.5, 1.5, 1.0), patch_points=4096, min_points=512, seed=42
-        ),
+        preprocessing=Preprocessing(voxel_size=0.05, tile_size=(1.5, 1.5, 1.0), min_points=512),
+        detector_settings={"patch_points": 4096, "seed": 42},
         weights="weights.safetensors",
         sha256=hashlib.sha256(weights).hexdigest(),
     )

@@ -9,7 +9,7 @@ import numpy as np
 from worker.cloud.formats.scan import Scan
 from worker.cloud.types import Matrix4, Points
 from worker.cloud.voxels import Voxels
-from worker.detectors.detector import TileScores
+from worker.detectors.detector import Detection
 from worker.pipeline.registration.settings import RegistrationSettings
 from worker.pipeline.registration.surface import Surface, surface_of
 from worker.simulation.scenes import random_room
@@ -48,8 +48,8 @@ def simulated_room() -> Room:
     return Room(before=before, after=after, target=surface_of(fused, RegistrationSettings()))
 
 
-def scores_of(*rows: tuple[float, float, float]) -> TileScores:
-    return TileScores(probabilities=np.array(rows, np.float32))
+def scores_of(*rows: tuple[float, float, float]) -> Detection:
+    return Detection(probabilities=np.array(rows, np.float32))
 
 
 def wall(x: float, *, y: tuple[float, float] = (-2.0, 2.0)) -> np.ndarray:

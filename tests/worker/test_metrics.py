@@ -10,6 +10,7 @@ from worker.metrics import (
     Confusion,
     all_thresholds,
     best_f1,
+    class_figures,
     confusion,
     pooled,
     precision_recall,
@@ -124,3 +125,12 @@ def test_average_precision_of_six_tiles_is_that_by_hand() -> None:
     found = precision_recall(SCORES, TRUTH)
     assert found.average_precision == pytest.approx((1 + 2 / 3 + 3 / 5) / 3)
     assert found.recall[-1] == 1.0
+
+
+def test_class_figures_of_a_known_confusion():
+    answers = np.eye(3, dtype=np.float32)[[0, 0, 1, 1, 2, 0]]
+    found = class_figures(answers, np.array([0, 0, 0, 1, 2, 2]), loss=0.5)
+    assert found.accuracy == pytest.approx(4 / 6)
+    assert found.precision == pytest.approx((2 / 3, 1 / 2, 1))
+    assert found.recall == pytest.approx((2 / 3, 1, 1 / 2))
+    assert found.rank == (found.accuracy, 0.5)

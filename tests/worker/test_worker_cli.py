@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
@@ -11,11 +12,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.support import toy
 from tests.support.models import make_untrained
 from worker.benchmarks.plots import draw_curves
 from worker.cli import detect, main
 from worker.cloud.formats.pcd import write_pcd
 from worker.cloud.formats.scan import read_scan
+from worker.detectors.card import MODEL_STORE
 from worker.progress import Progress
 from worker.simulation.scenes import rigid
 from worker.training.dataset import TileSet, load_tiles, save_tiles
@@ -86,6 +89,28 @@ def test_detect_writes_features_a_cloud_and_a_picture_and_tells_where(
         )
     assert read_scan(Path(told["files"]["cloud"])).points[:, 0].max() < 2.2
     assert Path(told["files"]["picture"]).read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("model", "threshold"), [("c2c/1", 0.5), (toy.MODEL, 0.25)])
+def test_detect_takes_any_detector_of_the_store_by_its_name(
+    files: tuple[str, str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    model: str,
+    threshold: float,
+) -> None:
+    store = tmp_path / "models"
+    shutil.copytree(MODEL_STORE / "c2c", store / "c2c")
+    toy.install(monkeypatch, store)
+    words = ["--out", str(tmp_path / "out"), "--model-store", str(store), "--model", model, "--json"]
+    assert run("detect", *files, *words) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert (told["model"], told["threshold"]) == (model, threshold)
+    assert 0 < told["counts"]["unobserved"] < told["counts"]["tiles"]
+    features = json.loads((tmp_path / "out" / "tiles.geojson").read_text())["features"]
+    assert {feature["properties"]["model"] for feature in features} == {model}
 
 
 @pytest.mark.slow
@@ -242,7 +267,7 @@ def _save_small_set(path: Path) -> None:
     tiles = TileSet(
         points_a=clouds,
         points_b=clouds,
-        looks=(),
+        observations=(),
         centres=np.array([[4.0 * number, 0, 0] for number in range(20)]),
         buildings=np.zeros(20, np.int32),
         tile_size=(1.5, 1.5, 1.0),

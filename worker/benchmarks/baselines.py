@@ -7,10 +7,9 @@ tile that was not observed gets NaN. Scores are in metres or shares; each has a 
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from importlib.util import find_spec
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,12 +18,31 @@ from scipy.spatial import cKDTree
 from worker.cloud.normals import estimate_normals
 from worker.cloud.tiling import TilePairs, Tiles
 from worker.cloud.types import Floats, Normals, Points
+from worker.detectors.c2c.detector import (
+    FARTHEST,
+    distances_both_ways,
+    split_by_tile,
+    tile_distances,
+    tile_means,
+)
+from worker.detectors.comparison import Comparison
 from worker.threads import query_threads
 
-FARTHEST = 1.0  #: metres; no nearest distance counts as more, and none is searched beyond
 FAR = 0.10  #: metres; two voxels of the fused maps
-PACKAGE = "py4dgeo"  #: of the real M3C2, an extra of the install
 NORMAL_RADIUS, NORMAL_NEIGHBORS = 0.15, 30  #: metres; of the plane that M3C2-approx puts through a point
+
+
+class Baseline(Protocol):
+    """A method that needs no training."""
+
+    @property
+    def name(self) -> str:
+        """As tables call it."""
+        ...
+
+    def score(self, pairs: TilePairs) -> Floats:
+        """(T,) the higher the more changed; NaN where the tile was not observed."""
+        ...
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -42,14 +60,12 @@ class CloudToCloud:
         return {"mean": "C2C (mean)", "far": "C2C (share over 10 cm)"}[self.statistic]
 
     def score(self, pairs: TilePairs) -> Floats:
-        reference, current = pairs.reference.points, pairs.current
-        ways = (_nearest(current, reference), _nearest(reference, current))
-        return _where_observed(np.fmax(*(self._by_tile(distances) for distances in ways)), pairs)
-
-    def _by_tile(self, distances: Sequence[Floats]) -> Floats:
+        comparison = Comparison.of_tiles(pairs)
         if self.statistic == "mean":
-            return _means(distances)
-        return _means([(part > FAR).astype(np.float64) for part in distances])
+            return _where_observed(tile_distances(comparison), pairs)
+        ways = distances_both_ways(comparison)
+        shares = (tile_means([(part > FAR).astype(np.float64) for part in way]) for way in ways)
+        return _where_observed(np.fmax(*shares), pairs)
 
 
 @dataclass(kw_only=True, slots=True)
@@ -60,7 +76,7 @@ class M3c2Approximation:
     mean distance in metres. Along the plane nothing is measured, so a removed or a shifted flat thing shows little.
     """
 
-    _reference: tuple[Tiles, Normals] | None = field(default=None, init=False)  # of the reference scored last
+    _known: tuple[Tiles, Normals] | None = field(default=None, init=False)  # of the reference scored last
 
     @property
     def name(self) -> str:
@@ -76,36 +92,25 @@ class M3c2Approximation:
         off = np.full(len(moved), FARTHEST)
         normals = self._normals(pairs.reference, planes)[nearest[met]]
         off[met] = np.abs(np.einsum("ij,ij->i", moved[met] - planes[nearest[met]], normals))
-        return _where_observed(_means(_parts(off, pairs.current)), pairs)
+        return _where_observed(tile_means(split_by_tile(off, pairs.current)), pairs)
 
     def _normals(self, reference: Tiles, points: Points) -> Normals:
-        if self._reference is None or self._reference[0] is not reference:
-            normals = estimate_normals(points, radius=NORMAL_RADIUS, max_neighbors=NORMAL_NEIGHBORS)
-            self._reference = (reference, normals)
-        return self._reference[1]
-
-
-def _nearest(points: Sequence[Points], others: Sequence[Points]) -> list[Floats]:
-    """Return for each tile the metres (n,) from its points to the nearest of all the others', at most FARTHEST."""
-    sought, cloud = np.concatenate(points), np.concatenate(others)
-    if not len(cloud):
-        return [np.full(len(part), FARTHEST) for part in points]
-    distance, _ = cKDTree(cloud).query(sought, distance_upper_bound=FARTHEST, workers=query_threads())
-    return _parts(np.minimum(distance, FARTHEST), points)
-
-
-def _parts(values: Floats, tiles: Sequence[Points]) -> list[Floats]:
-    """Split values (N,) into one array a tile, as its points."""
-    return list(np.split(values, np.cumsum([len(part) for part in tiles])[:-1]))
-
-
-def _means(parts: Sequence[Floats]) -> Floats:
-    """Return the mean of each part: (T,), NaN for a tile without points."""
-    return np.array([part.mean() if len(part) else np.nan for part in parts])
+        if self._known is None or self._known[0] is not reference:
+            found = estimate_normals(points, radius=NORMAL_RADIUS, max_neighbors=NORMAL_NEIGHBORS)
+            self._known = (reference, found)
+        return self._known[1]
 
 
 def _where_observed(scores: Floats, pairs: TilePairs) -> Floats:
     return np.where(pairs.observed, scores, np.nan)
+
+
+PACKAGE = "py4dgeo"
+
+
+def m3c2_is_installed() -> bool:
+    """Whether `M3c2` can be used."""
+    return find_spec(PACKAGE) is not None
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -113,8 +118,7 @@ class M3c2:
     """Signed distances along local normals, each with its level of detection.
 
     The score of a tile is the share of its core points that changed: those whose distance is significant at
-    95%, and those with points of one cloud only in their cylinder, for something is gone. Core points are every
-    `every`th of the reference.
+    95%, and those with points of one cloud only in their cylinder, for something is gone. Core points are every `every`th of the reference.
     """
 
     every: int = 4
@@ -156,20 +160,6 @@ class M3c2:
         return changed
 
 
-Baseline = CloudToCloud | M3c2Approximation | M3c2
-
-
-def installed_baselines() -> tuple[Baseline, ...]:
-    """Return those that this machine can run: the real M3C2 needs a library that is an extra of the install."""
-    always = (CloudToCloud(), CloudToCloud(statistic="far"), M3c2Approximation())
-    return (*always, M3c2()) if m3c2_is_installed() else always
-
-
-def m3c2_is_installed() -> bool:
-    """Tell whether `M3c2` can be used."""
-    return find_spec(PACKAGE) is not None
-
-
 def _library() -> Any:
     """py4dgeo, kept from writing to stdout and from leaving a log file in the working folder."""
     import py4dgeo  # noqa: PLC0415 (optional, and three seconds to import)
@@ -180,3 +170,9 @@ def _library() -> Any:
         logger.removeHandler(handler)
     logger.setLevel(logging.ERROR)
     return py4dgeo
+
+
+def installed_baselines() -> tuple[Baseline, ...]:
+    """Return those that this machine can run: the real M3C2 needs a library that is an extra of the install."""
+    always = (CloudToCloud(), CloudToCloud(statistic="far"), M3c2Approximation())
+    return (*always, M3c2()) if m3c2_is_installed() else always

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from rich.table import Table
 
+from worker import files
 from worker.cloud.types import Floats
 
 Document = dict[str, Any]  #: JSON-ready
@@ -51,9 +52,7 @@ def write_json(path: Path, document: Document) -> None:
 def write_bytes(path: Path, content: bytes) -> None:
     """Write a file aside and rename it, its folder made where there is none. Raises OSError."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    aside = path.with_name(path.name + ".tmp")
-    aside.write_bytes(content)
-    aside.replace(path)
+    files.write_bytes(path, content)
 
 
 def titled_table(title: str, *columns: str) -> Table:

@@ -20,11 +20,13 @@ from worker.benchmarks.baselines import installed_baselines
 from worker.benchmarks.plots import Log, read_log
 from worker.cloud.tiling import TilePairs, Tiles
 from worker.cloud.types import Arrays
-from worker.detectors.detector import Detector, TileScores
+from worker.detectors.comparison import Comparison, side_of
+from worker.detectors.detector import Detection, Detector
 from worker.detectors.store import DETECTORS, open_card, open_detector, resolve_device, sha256_of
 from worker.errors import DetectorUnavailable
 from worker.progress import Progress, no_progress
 from worker.training.log import LOG
+from worker.training.settings import detector_settings
 
 #: (T,) the higher the more changed; NaN where the tile was not observed
 TileScore = NDArray[np.floating[Any]]
@@ -75,18 +77,13 @@ def open_model(model_store: Path, model: str, weights: Path | None = None) -> De
     card = open_card(model_store, model)
     try:
         state = torch.load(weights, map_location="cpu", weights_only=True)
-        own = {
-            "patch_points": state["settings"]["pairs"]["patch_points"],
-            "chamfer_points": state["settings"]["pairs"].get("chamfer_points", 128),
-            "seed": state["settings"]["seed"],
-        }
         update = {
             "version": weights.stem,
-            "preprocessing": card.preprocessing.model_copy(update=own),
+            "detector_settings": detector_settings(state["settings"]),
             "sha256": sha256_of(state["network"]),
         }
         card = card.model_copy(update=update)
-        return DETECTORS[card.detector](card, state["network"], resolve_device("auto"))
+        return DETECTORS[card.detector].load(card, state["network"], resolve_device("auto"))
     except OSError as missing:
         raise DetectorUnavailable(f"no checkpoint at {weights}: {missing.strerror}") from missing
     except (AttributeError, KeyError, TypeError, EOFError, RuntimeError, pickle.UnpicklingError) as unsound:
@@ -104,12 +101,12 @@ def training_log(model_store: Path, model: str, weights: Path | None) -> Log | N
 
 def encode_reference(detector: Detector, tiles: Tiles, progress: Progress = no_progress) -> Arrays:
     """Return the reference embedding of the tiles: what the detector keeps with a map."""
-    return detector.describe(tiles, progress=progress)
+    return detector.encode_reference(side_of(tiles), tiles, progress=progress)
 
 
-def tile_scores(detector: Detector, pairs: TilePairs, embedding: Arrays | None = None) -> TileScores:
+def tile_scores(detector: Detector, pairs: TilePairs, embedding: Arrays | None = None) -> Detection:
     """Compare every observed pair; `embedding` is that of the map, if kept."""
-    return detector.score(pairs, description=embedding)
+    return detector.detect(Comparison.of_tiles(pairs), embedding=embedding)
 
 
 def change_scores(

@@ -20,9 +20,9 @@ from rich.table import Table
 from worker.benchmarks.baselines import CloudToCloud
 from worker.benchmarks.documents import Document, pose_spread, shown, spread, titled_table
 from worker.benchmarks.methods import TileScore, change_scores, encode_reference, open_model, tile_scores
-from worker.benchmarks.tiles import selected
 from worker.benchmarks.timing import StageClock, machine
 from worker.benchmarks.trajectory import map_frame, placed_scans, scan_files
+from worker.cloud import npz
 from worker.cloud.poses import transformed
 from worker.cloud.tiling import TilePairs, pair_tiles
 from worker.cloud.types import Arrays, Matrix4
@@ -30,11 +30,12 @@ from worker.cloud.voxels import Voxels
 from worker.detectors.card import MODEL_STORE
 from worker.detectors.detector import Detector
 from worker.pipeline import archive
-from worker.pipeline.flow import BuiltMap, NoScanAccepted, PipelineSettings, build_map, locate_survey
+from worker.pipeline.flow import BuiltMap, NoScanAccepted, build_map, locate_survey
 from worker.pipeline.registration.results import ScanFile
 from worker.pipeline.results.changes import decide
 from worker.pipeline.results.export import tile_results, write_coloured_cloud
 from worker.pipeline.results.picture import draw_picture
+from worker.pipeline.settings import PipelineSettings
 from worker.progress import Progress, no_progress
 from worker.simulation.scenes import corridor
 from worker.simulation.sensor import SimulatedScan
@@ -125,23 +126,23 @@ def _survey(
     folder: Path,
 ) -> Document:
     """Time a survey of one scan from file to files, as the jobs run it."""
-    archive.save_reference(folder / "reference.npz", built.reference)
+    npz.save(folder / "reference.npz", built.reference)
     clock = StageClock(no_progress)
     clock("load map", 0.0)
     reference = archive.load_reference(folder / "reference.npz")
     try:
-        survey = locate_survey([file], reference, built.tiles, settings=settings, progress=clock)
+        survey = locate_survey([file], reference, settings=settings, progress=clock)
     except NoScanAccepted as refused:
         return {"rejected": str(refused), **clock.seconds()}
     clock("score", 0.0)
-    scores = tile_scores(detector, survey.pairs, embedding)
+    scores = tile_scores(detector, survey.comparison.tile_pairs, embedding)
     clock("decide and export", 0.0)
-    changes = decide(survey.pairs, scores, threshold=detector.card.threshold)
+    changes = decide(survey.comparison.tile_pairs, scores, threshold=detector.card.threshold)
     write_coloured_cloud(folder / "cloud.ply", survey.current, changes)
     tile_results(changes)
     clock("picture", 0.0)
     draw_picture(folder / "picture.png", reference.points, survey.current, changes, title="bench")
-    return {"observed_tiles": int(survey.pairs.observed.sum()), **clock.seconds()}
+    return {"observed_tiles": int(survey.comparison.observed.sum()), **clock.seconds()}
 
 
 def _full_visit(scans: tuple[SimulatedScan, ...], built: BuiltMap, map_from_world: Matrix4) -> TilePairs:
@@ -191,7 +192,7 @@ def ways(pairs: TilePairs, detector: Detector) -> dict[str, Callable[[], TileSco
 
 def resized(pairs: TilePairs, count: int) -> TilePairs:
     """Return `count` observed pairs, the first ones or some twice."""
-    return selected(pairs, np.resize(np.flatnonzero(pairs.observed), count))
+    return pairs.subset(np.resize(np.flatnonzero(pairs.observed), count))
 
 
 def tables(figures: Document) -> Group:

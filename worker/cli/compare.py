@@ -10,15 +10,16 @@ from typing import Any
 
 from service.tile_features import tile_collection, tile_feature
 from worker.detectors.detector import Detector
-from worker.pipeline.flow import (
+from worker.pipeline import (
     BuiltMap,
     LocatedSurvey,
     PipelineSettings,
+    ScanFile,
     build_map,
     detect,
     locate_survey,
 )
-from worker.pipeline.registration.results import ScanFile, ScanResult
+from worker.pipeline.registration.results import ScanResult
 from worker.pipeline.results.changes import ChangeSet
 from worker.pipeline.results.export import tile_results, write_coloured_cloud
 from worker.pipeline.results.picture import draw_picture
@@ -26,7 +27,7 @@ from worker.progress import Progress, no_progress
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Comparison:
+class TwoVisits:
     """Two visits, and what is different."""
 
     built: BuiltMap
@@ -41,23 +42,23 @@ def compare(
     *,
     threshold: float | None = None,
     progress: Progress = no_progress,
-) -> Comparison:
-    """The whole method on files. Raises PipelineError, and OSError for a file that is not there."""
+) -> TwoVisits:
+    """Return the whole method on files. Raises PipelineError, and OSError for a file that is not there."""
     settings = PipelineSettings.model_validate({}).for_model(detector.card.preprocessing)
     earlier, later = (
         [ScanFile(name=str(path), path=path) for path in paths] for paths in (references, currents)
     )
     on_map, on_survey = _titled("map", progress), _titled("survey", progress)
     built = build_map(earlier, settings=settings, progress=on_map)
-    located = locate_survey(later, built.reference, built.tiles, settings=settings, progress=on_survey)
-    changes = detect(located.pairs, detector, threshold=threshold, progress=on_survey)
-    return Comparison(built=built, located=located, changes=changes)
+    located = locate_survey(later, built.reference, settings=settings, progress=on_survey)
+    changes = detect(located.comparison, detector, threshold=threshold, progress=on_survey)
+    return TwoVisits(built=built, located=located, changes=changes)
 
 
 def write_results(
-    found: Comparison, out: Path, *, map_id: str, survey_id: str, model: str
+    visits: TwoVisits, out: Path, *, map_id: str, survey_id: str, model: str
 ) -> dict[str, Path]:
-    """`tiles.geojson`, `cloud.ply` and `picture.png` in the folder `out`, by what they are. Raises OSError."""
+    """Write `tiles.geojson`, `cloud.ply` and `picture.png` to the folder `out`, by what they are. Raises OSError."""
     out.mkdir(parents=True, exist_ok=True)
     files = {"tiles": out / "tiles.geojson", "cloud": out / "cloud.ply", "picture": out / "picture.png"}
     survey = {
@@ -65,32 +66,32 @@ def write_results(
         "survey_id": survey_id,
         "model": model,
         "captured_at": None,
-        "threshold": found.changes.threshold,
+        "threshold": visits.changes.threshold,
     }
     tiles = tile_collection(
-        tile_feature(**asdict(tile), survey=survey) for tile in tile_results(found.changes)
+        tile_feature(**asdict(tile), survey=survey) for tile in tile_results(visits.changes)
     )
     files["tiles"].write_text(json.dumps(tiles, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-    write_coloured_cloud(files["cloud"], found.located.current, found.changes)
+    write_coloured_cloud(files["cloud"], visits.located.current, visits.changes)
     draw_picture(
         files["picture"],
-        found.built.reference.points,
-        found.located.current,
-        found.changes,
+        visits.built.reference.points,
+        visits.located.current,
+        visits.changes,
         title=f"{survey_id} compared with {map_id}",
     )
     return files
 
 
-def document(found: Comparison, files: dict[str, Path], *, model: str) -> dict[str, Any]:
-    """The comparison, JSON-ready; changed tiles most certain first, metres, frame of the first reference."""
-    changed = [tile for tile in tile_results(found.changes) if tile.state == "changed"]
+def document(visits: TwoVisits, files: dict[str, Path], *, model: str) -> dict[str, Any]:
+    """Return the comparison, JSON-ready; changed tiles most certain first, metres, frame of the first reference."""
+    changed = [tile for tile in tile_results(visits.changes) if tile.state == "changed"]
     return {
         "model": model,
-        "threshold": found.changes.threshold,
-        "counts": {"tiles": len(found.changes.states), **found.changes.counts()},
-        "reference": [_registration(outcome) for outcome in found.built.outcomes],
-        "current": [_registration(outcome) for outcome in found.located.outcomes],
+        "threshold": visits.changes.threshold,
+        "counts": {"tiles": len(visits.changes.states), **visits.changes.counts()},
+        "reference": [_registration(outcome) for outcome in visits.built.outcomes],
+        "current": [_registration(outcome) for outcome in visits.located.outcomes],
         "changed": [asdict(tile) for tile in sorted(changed, key=lambda tile: -(tile.score or 0.0))],
         "files": {what: str(path) for what, path in files.items()},
     }

@@ -48,10 +48,12 @@ def detect(
 
     with terminal.progress_bar() as progress:
         detector = open_detector(model_store, model, device)
-        found = compare([reference, *(more or [])], current, detector, threshold=threshold, progress=progress)
+        visits = compare(
+            [reference, *(more or [])], current, detector, threshold=threshold, progress=progress
+        )
         progress("writing", 0.0)
-        files = write_results(found, out, map_id=reference.name, survey_id=current[0].name, model=model)
-    result = document(found, files, model=model)
+        files = write_results(visits, out, map_id=reference.name, survey_id=current[0].name, model=model)
+    result = document(visits, files, model=model)
     if as_json:
         terminal.print_json(result)
     else:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+import functools
+import inspect
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -10,11 +12,12 @@ import typer
 
 from worker.cli import terminal
 from worker.progress import Progress
+from worker.training.options import OPTIONS, Option, with_options
 
 
 def register(commands: typer.Typer) -> None:
     """Add `train` to the command line."""
-    commands.command("train")(train)
+    commands.command("train")(with_training_options(train))
 
 
 def train(
@@ -29,49 +32,11 @@ def train(
     offices: Annotated[int | None, typer.Option(min=0, help="Simulated offices of a new set.")] = None,
     corridors: Annotated[int | None, typer.Option(min=0, help="Simulated corridors.")] = None,
     rooms: Annotated[int | None, typer.Option(min=0, help="Simulated single rooms.")] = None,
-    epochs: Annotated[int | None, typer.Option(min=0, help="At most so many.")] = None,
-    minutes: Annotated[
-        float | None, typer.Option(min=0, help="Wall clock of the training; the learning rate follows it.")
-    ] = None,
-    train_pairs: Annotated[int | None, typer.Option("--train-pairs", min=1, help="An epoch.")] = None,
-    validation_pairs: Annotated[
-        int | None, typer.Option("--validation-pairs", min=1, help="After each epoch.")
-    ] = None,
-    batch: Annotated[int | None, typer.Option(min=2, help="Pairs.")] = None,
-    revisit_share: Annotated[
-        float | None,
-        typer.Option("--revisit-share", min=0, max=1, help="Of pairs of two visits, not one sampled twice."),
-    ] = None,
-    edited_share: Annotated[
-        float | None,
-        typer.Option("--edited-share", min=0, max=1, help="Of changed pairs, those of whole things."),
-    ] = None,
-    rebuilt_share: Annotated[
-        float | None,
-        typer.Option(
-            "--rebuilt-share", min=0, max=1, help="Of changed pairs, those of a map with changed scans."
-        ),
-    ] = None,
-    density: Annotated[
-        tuple[float, float] | None, typer.Option(help="Least and largest share of points that changes take.")
-    ] = None,
-    start_from: Annotated[
-        Path | None, typer.Option("--start-from", help="Checkpoint whose network is trained on.")
-    ] = None,
-    fresh_head: Annotated[
-        bool | None, typer.Option("--fresh-head", help="Take its encoder alone, and start the head anew.")
-    ] = None,
-    head_epochs: Annotated[
-        int | None,
-        typer.Option("--head-epochs", min=0, help="Of the head alone, after the rest: seconds each."),
-    ] = None,
-    learning_rate: Annotated[
-        float | None, typer.Option("--learning-rate", min=0, help="To begin with.")
-    ] = None,
     device: Annotated[Literal["auto", "cpu", "cuda"], typer.Option(envvar="SPICD_DEVICE")] = "auto",
     threads: Annotated[int | None, typer.Option(min=1, help="Of the CPU.")] = None,
+    **options: Any,
 ) -> None:
-    """Train SPICD-Net on simulated visits; what is left out keeps its default, which is the paper's where it has one."""
+    """Train SPICD-Net on simulated visits; what is left out keeps its default, the paper's where it has one."""
     # Not at the head of the file: torch takes seconds, which `--help` need not wait for.
     import torch  # noqa: PLC0415
 
@@ -82,40 +47,38 @@ def train(
 
     if threads is not None:
         torch.set_num_threads(threads)
-    where = resolve_device(device).type
-    default = PAPER if paper else TrainSettings()
-    settings = replace(
-        default,
-        device=where,
-        coarse_search=where == "cpu",
-        pairs=replace(
-            default.pairs,
-            **_given(
-                revisit_share=revisit_share,
-                edited_share=edited_share,
-                rebuilt_share=rebuilt_share,
-                density=density,
-            ),
-        ),
-        **_given(
-            epochs=epochs,
-            minutes=minutes,
-            train_pairs=train_pairs,
-            validation_pairs=validation_pairs,
-            batch=batch,
-            learning_rate=learning_rate,
-            fresh_head=fresh_head,
-            head_epochs=head_epochs,
-            start_from=None if start_from is None else str(start_from),
-        ),
-    )
+    settings = with_options(PAPER if paper else TrainSettings(), options, device=resolve_device(device).type)
     tiles = tiles or folder / "tiles.npz"
-    buildings = _given(offices=offices, corridors=corridors, rooms=rooms)
+    asked = {"offices": offices, "corridors": corridors, "rooms": rooms}
+    buildings = {name: count for name, count in asked.items() if count is not None}
     with terminal.progress_bar() as progress:
         _make_tiles(tiles, buildings, progress)
         best = run(settings, tiles, folder, progress, on_epoch=draw_curves)
     terminal.output().print(
         f"{best}\n`python -m worker.training.publish {best} {tiles}` makes a model of it", highlight=False
+    )
+
+
+def with_training_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Return the command with its `**options` spelled out in the signature, which Typer reads."""
+    signature = inspect.signature(command, eval_str=True)
+    own = [parameter for name, parameter in signature.parameters.items() if name != "options"]
+    added = [_parameter(option) for option in OPTIONS]
+
+    @functools.wraps(command)
+    def spelled_out(**values: Any) -> None:
+        command(**values)
+
+    spelled_out.__annotations__ = {parameter.name: parameter.annotation for parameter in (*own, *added)}
+    spelled_out.__signature__ = signature.replace(parameters=[*own, *added])  # type: ignore[attr-defined]
+    return spelled_out
+
+
+def _parameter(option: Option) -> inspect.Parameter:
+    kind = tuple[(option.kind,) * option.count] if option.count > 1 else option.kind  # type: ignore[misc]
+    given = typer.Option(option.flag, help=option.help, min=option.least, max=option.most)
+    return inspect.Parameter(
+        option.name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=Annotated[kind | None, given]
     )
 
 
@@ -130,7 +93,3 @@ def _make_tiles(path: Path, buildings: dict[str, Any], progress: Progress) -> No
         raise ValueError(
             f"{path} is there already; name another with --tiles, or leave out {', '.join(buildings)}"
         )
-
-
-def _given(**values: Any) -> dict[str, Any]:
-    return {name: value for name, value in values.items() if value is not None}

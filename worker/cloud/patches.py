@@ -29,11 +29,11 @@ class Patch:
         return (weighted / self.size).astype(np.float32)
 
     def padded(self) -> Points:
-        """(size, 3) float32, the distinct points over and over in their order."""
+        """Return (size, 3) float32, the distinct points over and over in their order."""
         return self.at(np.arange(self.size))
 
     def at(self, places: NDArray[np.int64]) -> Points:
-        """(k, 3) float32, the points at these places (k,) of the padded patch."""
+        """Return (k, 3) float32, the points at these places (k,) of the padded patch."""
         return self.distinct[places % len(self.distinct)]
 
 
@@ -58,7 +58,7 @@ def patch(points: Points, *, size: int = 4096, seed: int) -> Patch:
 
 
 def farthest_points(points: Points, count: int, *, start: int) -> NDArray[np.int64]:
-    """Indices (count,) of farthest point sampling; `start` (0..n-1) chooses the point that it begins with.
+    """Return indices (count,) of farthest point sampling; `start` (0..n-1) chooses the point that it begins with.
 
     `fpsample` does it with a bucketed k-d tree (3-9 ms a tile) and counts `start` in that tree's order, plain
     NumPy in the cloud's own. From their first point on, both choose alike up to ties. NumPy, some twenty times
@@ -68,17 +68,17 @@ def farthest_points(points: Points, count: int, *, start: int) -> NDArray[np.int
         from fpsample import bucket_fps_kdline_sampling  # noqa: PLC0415 (optional where only training runs)
     except ImportError:
         return farthest_points_numpy(points, count, start=start)
-    found = bucket_fps_kdline_sampling(points, count, h=_tree_height(len(points)), start_idx=start)
-    return np.asarray(found, dtype=np.int64)
+    chosen = bucket_fps_kdline_sampling(points, count, h=_tree_height(len(points)), start_idx=start)
+    return np.asarray(chosen, dtype=np.int64)
 
 
 def _tree_height(n: int) -> int:
-    """Height of the k-d tree: buckets of some dozens of points, within what fpsample advises (3 to 9)."""
+    """Return the height of the k-d tree: buckets of some dozens of points, within what fpsample advises (3 to 9)."""
     return int(np.clip(np.log2(n) - 5, 3, 9))
 
 
 def farthest_points_numpy(points: Points, count: int, *, start: int) -> NDArray[np.int64]:
-    """Indices (count,) as `farthest_points` gives them, `start` counted in the cloud's own order; no library but NumPy."""
+    """Return indices (count,) as `farthest_points` does, `start` in the cloud's own order; no library but NumPy."""
     chosen = np.empty(count, dtype=np.int64)
     nearest = np.full(len(points), np.inf, dtype=np.float32)
     for i in range(count):

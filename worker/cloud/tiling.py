@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,12 +43,37 @@ class TileGrid:
     lowest: tuple[int, int, int] = (0, 0, 0)  #: indices of the first tile
 
     def lower(self, indices: Indices) -> Floats:
-        """(T, 3) metres, map frame: minimum corners."""
+        """Return (T, 3) metres, map frame: minimum corners."""
         return self.origin + indices * self.size
 
     def centers(self, indices: Indices) -> Floats:
-        """(T, 3) metres, map frame."""
+        """Return (T, 3) metres, map frame."""
         return self.origin + (indices + 0.5) * self.size
+
+    def locate(self, points: Points | Floats) -> NDArray[np.int64]:
+        """Return (N,) the cell that holds each point (N, 3), metres, map frame; -1 outside the grid.
+
+        A cell is the flat number of a tile within `shape`, so that cells sort as tiles do.
+        """
+        return self.cells(np.floor((points - self.origin) / self.size).astype(np.int64))
+
+    def cells(self, indices: NDArray[np.integer[Any]]) -> NDArray[np.int64]:
+        """Return (T,) the cell of each tile (T, 3); -1 outside the grid."""
+        place = indices.astype(np.int64) - self.lowest
+        inside = np.all((place >= 0) & (place < self.shape), axis=1)
+        cells = np.full(len(place), -1, np.int64)
+        cells[inside] = np.ravel_multi_index(tuple(place[inside].T), self.shape)
+        return cells
+
+    def locate_among(self, points: Points | Floats, indices: Indices) -> NDArray[np.int64]:
+        """Return (N,) the row in `indices` (T, 3) of the tile that holds each point (N, 3); -1 where none does."""
+        wanted, cells = self.cells(indices), self.locate(points)
+        if not len(wanted):
+            return np.full(len(points), -1, np.int64)
+        order = np.argsort(wanted)
+        place = np.searchsorted(wanted, cells, sorter=order).clip(max=len(wanted) - 1)
+        rows: NDArray[np.int64] = np.where((wanted[order[place]] == cells) & (cells >= 0), order[place], -1)
+        return rows
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -67,15 +93,25 @@ class TilePairs:
     current: tuple[Points, ...]  #: T arrays (n, 3) float32, metres, map frame; n may be 0
     observed: Bools  #: (T,) seen densely enough in the survey to be scored
 
+    def subset(self, chosen: NDArray[np.intp]) -> TilePairs:
+        """Return the pairs at these places (t,) alone; a place may come twice."""
+        reference = replace(
+            self.reference,
+            indices=self.reference.indices[chosen],
+            points=tuple(self.reference.points[tile] for tile in chosen),
+        )
+        current = tuple(self.current[tile] for tile in chosen)
+        return TilePairs(reference=reference, current=current, observed=self.observed[chosen])
+
 
 def tile_id(index: NDArray[np.int32]) -> str:
-    """`tile_III_JJJ_KKK` (paper, Table A1)."""
+    """Return `tile_III_JJJ_KKK` (paper, Table A1)."""
     i, j, k = (int(number) for number in index)
     return f"tile_{i:03d}_{j:03d}_{k:03d}"
 
 
 def grid_over(points: Points, *, tile_size: tuple[float, float, float], voxel_size: float) -> TileGrid:
-    """The grid that starts at the map's minimum corner, snapped down to a voxel so that no voxel is cut in two.
+    """Return the grid that starts at the map's minimum corner, snapped down to a voxel so that no voxel is cut in two.
 
     Raises MapFailed where the points span more tiles than a building has.
     """
@@ -85,7 +121,7 @@ def grid_over(points: Points, *, tile_size: tuple[float, float, float], voxel_si
 
 
 def grown(grid: TileGrid, points: Points) -> TileGrid:
-    """The same grid over the points of a newer version; a tile that both have keeps its index. Raises MapFailed."""
+    """Return the grid over the points of a newer version; a tile of both keeps its index. Raises MapFailed."""
     return _spanned(points, grid.origin, grid.size)
 
 
@@ -95,7 +131,7 @@ def _spanned(points: Points, origin: Floats, size: Floats) -> TileGrid:
     if count.prod() > _MOST_TILES:
         extent = " x ".join(f"{edge:.0f}" for edge in count * size)
         raise MapFailed(f"the map spans {extent} m; remove stray points, or cut it into several maps")
-    shape, lowest = (tuple(int(value) for value in each) for each in (count, low))
+    shape, lowest = (tuple(int(value) for value in values) for values in (count, low))
     return TileGrid(
         origin=origin,
         size=size,
@@ -106,56 +142,30 @@ def _spanned(points: Points, origin: Floats, size: Floats) -> TileGrid:
 
 def cut(points: Points, grid: TileGrid, *, min_points: int) -> Tiles:
     """Sort points (N, 3) of the map frame into tiles; those with fewer than `min_points` are left out."""
-    cells, starts, ordered = _by_cell(points, grid)
-    bounds = np.append(starts, len(ordered))
-    kept = np.flatnonzero(np.diff(bounds) >= min_points)
+    located = grid.locate(points)
+    order = np.argsort(located, kind="stable")
+    cells, starts = np.unique(located[order], return_index=True)
+    parts = np.split(points[order].astype(np.float32, copy=False), starts[1:])
+    # without a point there is no cell and one empty part
+    dense = [
+        (cell, part)
+        for cell, part in zip(cells, parts, strict=False)
+        if cell >= 0 and len(part) >= min_points
+    ]
+    kept = np.array([cell for cell, _ in dense], np.int64)
     return Tiles(
         grid=grid,
-        indices=(np.stack(np.unravel_index(cells[kept], grid.shape), axis=1) + grid.lowest).astype(np.int32),
-        points=tuple(ordered[bounds[tile] : bounds[tile + 1]] for tile in kept),
+        indices=(np.stack(np.unravel_index(kept, grid.shape), axis=1) + grid.lowest).astype(np.int32),
+        points=tuple(part for _, part in dense),
     )
 
 
 def pair_tiles(reference: Tiles, current: Points, *, settings: TilingSettings) -> TilePairs:
     """Put beside each reference tile the survey's points (N, 3), map frame, of the same box (Section 3.9.2)."""
-    cells, starts, ordered = _by_cell(current, reference.grid)
-    bounds = np.append(starts, len(ordered))
-    grid = reference.grid
-    wanted = np.ravel_multi_index(tuple((reference.indices - grid.lowest).T), grid.shape)
-    place = np.searchsorted(cells, wanted)
-    found = place < len(cells)
-    found[found] = cells[place[found]] == wanted[found]
-    nothing = np.empty((0, 3), np.float32)
-    points = tuple(
-        ordered[bounds[at] : bounds[at + 1]] if there else nothing
-        for at, there in zip(place, found, strict=True)
-    )
-    seen = np.array([len(part) for part in points])
+    rows = reference.grid.locate_among(current, reference.indices)
+    counts = np.bincount(rows + 1, minlength=len(reference.indices) + 1)  # first those in no tile
+    ordered = current[np.argsort(rows, kind="stable")].astype(np.float32, copy=False)
+    points = tuple(np.split(ordered, np.cumsum(counts)[:-1])[1:])
     expected = np.array([len(part) for part in reference.points]) * settings.min_observed_share
-    return TilePairs(
-        reference=reference, current=points, observed=(seen >= settings.min_points) & (seen >= expected)
-    )
-
-
-def inside_tiles(points: Points, grid: TileGrid, indices: Indices) -> Bools:
-    """(N,) which points (N, 3) of the map frame lie in one of the tiles (T, 3)."""
-    cells = np.floor((points - grid.origin) / grid.size).astype(np.int64) - grid.lowest
-    within = np.all((cells >= 0) & (cells < grid.shape), axis=1)
-    wanted = indices.astype(np.int64) - grid.lowest
-    wanted = wanted[np.all((wanted >= 0) & (wanted < grid.shape), axis=1)]
-    found = np.zeros(len(points), bool)
-    found[within] = np.isin(
-        np.ravel_multi_index(tuple(cells[within].T), grid.shape),
-        np.ravel_multi_index(tuple(wanted.T), grid.shape),
-    )
-    return found
-
-
-def _by_cell(points: Points, grid: TileGrid) -> tuple[NDArray[np.int64], NDArray[np.intp], Points]:
-    """The occupied cells (flat, ascending), where each begins, and the points ordered by cell."""
-    index = np.floor((points - grid.origin) / grid.size).astype(np.int64) - grid.lowest
-    inside = np.all((index >= 0) & (index < grid.shape), axis=1)
-    flat = np.ravel_multi_index(tuple(index[inside].T), grid.shape)
-    order = np.argsort(flat, kind="stable")
-    cells, starts = np.unique(flat[order], return_index=True)
-    return cells, starts, points[inside][order].astype(np.float32, copy=False)
+    observed = (counts[1:] >= settings.min_points) & (counts[1:] >= expected)
+    return TilePairs(reference=reference, current=points, observed=observed)

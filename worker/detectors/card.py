@@ -3,29 +3,27 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 #: The models that come with the code, wherever a command is typed.
 MODEL_STORE = Path(__file__).resolve().parents[2] / "model_store"
 
+#: What release 0.1 kept under `preprocessing` and only SPICD-Net needs.
+_SPICD_NET_SETTINGS_OF_0_1 = ("patch_points", "chamfer_points", "seed")
+
+S = TypeVar("S", bound=BaseModel)
+
 
 class Preprocessing(BaseModel):
-    """What is tied to the weights, and so comes from the card and never from a default."""
+    """How a map is built for a model: tied to the weights, so it comes from the card and never from a default."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     voxel_size: float = Field(gt=0, description="metres; both maps are fused at this size")
     tile_size: tuple[float, float, float] = Field(description="metres")
-    patch_points: int = Field(gt=0, description="points of a patch after FPS and repetition")
     min_points: int = Field(gt=0, description="tiles with fewer points are not scored")
-    chamfer_points: int | None = Field(
-        default=128,
-        gt=0,
-        description="of each patch, that are compared; null: all, where the paper takes 128",
-    )
-    seed: int = Field(description="of FPS and of the Chamfer sample")
 
 
 class Card(BaseModel):
@@ -42,9 +40,43 @@ class Card(BaseModel):
         ge=0, le=1, description="a tile is changed above this score, the probability that it is not as it was"
     )
     preprocessing: Preprocessing
+    detector_settings: dict[str, Any] = Field(
+        default_factory=dict, description="the detector's own; it validates them when it is loaded"
+    )
     weights: str | None = Field(default=None, description="file beside the card")
     sha256: str | None = Field(default=None, description="of the weights file")
     training: dict[str, Any] = Field(default_factory=dict, description="how it was made, with the command")
     evaluation: dict[str, Any] = Field(default_factory=dict, description="what it reaches, with the command")
     licence: str = ""
     sources: tuple[str, ...] = ()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_0_1(cls, card: Any) -> Any:
+        """Move the settings of SPICD-Net to their place in a card that release 0.1 wrote."""
+        if not isinstance(card, dict) or not isinstance(card.get("preprocessing"), dict):
+            return card
+        preprocessing = dict(card["preprocessing"])
+        moved = {
+            name: preprocessing.pop(name) for name in _SPICD_NET_SETTINGS_OF_0_1 if name in preprocessing
+        }
+        if not moved:
+            return card
+        settings = {**moved, **card.get("detector_settings", {})}
+        return {**card, "preprocessing": preprocessing, "detector_settings": settings}
+
+    @property
+    def model(self) -> str:
+        """The model's name, `name/version`."""
+        return f"{self.name}/{self.version}"
+
+    def settings_as(self, kind: type[S]) -> S:
+        """Read the detector's own settings. Raises ValueError, which names each unsound field."""
+        try:
+            return kind.model_validate(self.detector_settings)
+        except ValidationError as unsound:
+            reasons = (
+                f"{'.'.join(['detector_settings', *map(str, error['loc'])])}: {error['msg']}"
+                for error in unsound.errors()
+            )
+            raise ValueError("; ".join(reasons)) from unsound

@@ -1,4 +1,4 @@
-"""What a detector is: paired tiles in, three class probabilities a tile out."""
+"""What a detector is: a map and a survey of it in, class probabilities a tile out, and a voxel where it can."""
 
 from __future__ import annotations
 
@@ -8,26 +8,45 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from worker.cloud.tiling import TilePairs, Tiles
+from worker.cloud.tiling import Tiles
 from worker.cloud.types import Arrays
 from worker.detectors.card import Card
+from worker.detectors.comparison import Comparison, Side
 from worker.progress import Progress, no_progress
 
+Probabilities = NDArray[np.float32]
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class TileScores:
+
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class VoxelScores:
+    """Probabilities of V voxels of the map frame; of the others nothing is said."""
+
+    keys: NDArray[np.int64]  #: (V,) ascending
+    appeared: Probabilities  #: (V,) there is something that was not there
+    disappeared: Probabilities  #: (V,) something is no longer there
+
+
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class Detection:
     """Class probabilities of every tile: no change, changed, different place (paper, Section 3.1)."""
 
-    probabilities: NDArray[np.float32]  #: (T, 3), rows sum to 1; NaN where the tile was not observed
+    probabilities: Probabilities  #: (T, 3), rows sum to 1; NaN where the tile was not observed
+    voxels: VoxelScores | None = None  #: None: the detector scores tiles alone
+
+    @classmethod
+    def of_scores(cls, scores: NDArray[np.floating]) -> Detection:
+        """Take one score a tile (T,), the probability of change, for a method that knows no different place."""
+        change = scores.astype(np.float32)
+        return cls(probabilities=np.stack([1 - change, change, change * 0], axis=1))
 
     @property
-    def change(self) -> NDArray[np.float32]:
+    def change(self) -> Probabilities:
         """(T,) see `change_score`."""
         return change_score(self.probabilities)
 
 
-def change_score(probabilities: NDArray[np.float32]) -> NDArray[np.float32]:
-    """(T, 3) -> (T,) probability that the tile is not as it was, 1 - p0; NaN stays NaN.
+def change_score(probabilities: Probabilities) -> Probabilities:
+    """Return the probability that a tile is not as it was, 1 - p0: (T, 3) -> (T,); NaN stays NaN.
 
     The paper takes class 1 alone (Section 3.9.2). A tile of a registered survey that looks like another place has
     changed altogether, or was registered wrongly: reason enough to look there.
@@ -36,20 +55,20 @@ def change_score(probabilities: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 class Detector(Protocol):
-    """A method of comparing tiles. It prepares its own input and says in its card what it needs.
+    """A method of comparing a survey with its map. It prepares its own input and says in its card what it needs.
 
-    A new detector is one class with this shape, one entry in `worker.detectors.store.DETECTORS`, and one
-    folder in `model_store/` with its card.
+    A new detector is a folder with one class of this shape and a `load`, one entry in
+    `worker.detectors.store.DETECTORS`, and one folder in `model_store/` with its card.
     """
 
     card: Card
 
-    def describe(self, tiles: Tiles, *, progress: Progress = no_progress) -> Arrays:
-        """What can be known of the reference alone, computed once when the map is built; {} if nothing."""
+    def encode_reference(self, reference: Side, tiles: Tiles, *, progress: Progress = no_progress) -> Arrays:
+        """Return what can be computed of the map alone, once when it is built; {} if nothing."""
         ...
 
-    def score(
-        self, pairs: TilePairs, *, description: Arrays | None = None, progress: Progress = no_progress
-    ) -> TileScores:
-        """Compare every observed pair; `description` is `describe(pairs.reference)` from the map, if kept."""
+    def detect(
+        self, comparison: Comparison, *, embedding: Arrays | None = None, progress: Progress = no_progress
+    ) -> Detection:
+        """Score every observed tile; `embedding` is what `encode_reference` returned for the map, if it was kept."""
         ...

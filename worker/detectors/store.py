@@ -1,32 +1,57 @@
-"""Opens the models of `model_store/`: a card, and weights that match it."""
+"""The models of `model_store/`: opened and written, a card with weights that match it."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import pydantic
 import torch
+from pydantic import BaseModel
 from safetensors import SafetensorError
 from safetensors.torch import load, save
 
+from worker.detectors.c2c.detector import CloudToCloud
 from worker.detectors.card import Card
 from worker.detectors.detector import Detector
 from worker.detectors.spicd_net.detector import SpicdNet
-from worker.errors import DetectorUnavailable
+from worker.errors import DetectorUnavailable, TrainingFailed
+from worker.files import write_text
 
 Device = Literal["auto", "cpu", "cuda"]
 Weights = dict[str, torch.Tensor]
 
-#: A new detector is one class and one entry here: card, weights and device to Detector.
-DETECTORS: dict[str, Callable[[Card, Weights, torch.device], Detector]] = {"spicd-net": SpicdNet.load}
+
+class DetectorClass(Protocol):
+    """How a detector is opened."""
+
+    @property
+    def settings_class(self) -> type[BaseModel]:
+        """Of the card's `detector_settings`."""
+        ...
+
+    def load(self, card: Card, weights: Weights, device: torch.device) -> Detector:
+        """Open a model. Raises RuntimeError for weights of another network, ValueError for unsound settings."""
+        ...
+
+
+@runtime_checkable
+class TrainedDetector(Detector, Protocol):
+    """A detector that has weights."""
+
+    def weights(self) -> Weights:
+        """Return what `load` takes."""
+        ...
+
+
+#: A new detector is one folder and one entry here; `worker.detectors.networks` has another where it can be trained.
+DETECTORS: dict[str, DetectorClass] = {"c2c": CloudToCloud, "spicd-net": SpicdNet}
 
 
 def open_detector(model_store: Path, name: str = "spicd-net/1", device: Device = "auto") -> Detector:
-    """The detector `<name>/<version>`, ready to score.
+    """Return the detector `<name>/<version>`, ready to score.
 
     Raises DetectorUnavailable when there is no such model, its card is unsound, its weights are not those of
     the card, or the device is not there.
@@ -36,26 +61,31 @@ def open_detector(model_store: Path, name: str = "spicd-net/1", device: Device =
 
 
 def make_detector(card: Card, content: bytes | None, device: Device = "auto") -> Detector:
-    """The detector of a card and of the bytes of its weights file, None where it has none. Raises DetectorUnavailable."""
-    name = f"{card.name}/{card.version}"
+    """Return the detector of a card and the bytes of its weights file (None: none). Raises DetectorUnavailable."""
+    name = card.model
     if card.detector not in DETECTORS:
         raise DetectorUnavailable(
             f"model {name}: no detector {card.detector!r}; there are {sorted(DETECTORS)}"
         )
     weights = {} if content is None else _checked_weights(name, card, content)
     try:
-        return DETECTORS[card.detector](card, weights, resolve_device(device))
+        return DETECTORS[card.detector].load(card, weights, resolve_device(device))
     except (RuntimeError, ValueError) as unsound:
         raise DetectorUnavailable(f"model {name}: {unsound}") from unsound
 
 
+def settings_of(card: Card) -> dict[str, Any]:
+    """Return the detector's own settings with every default. Raises ValueError, which names each unsound field."""
+    return card.settings_as(DETECTORS[card.detector].settings_class).model_dump()
+
+
 def open_card(model_store: Path, name: str) -> Card:
-    """The card of `<name>/<version>` without its weights. Raises DetectorUnavailable."""
+    """Return the card of `<name>/<version>` without its weights. Raises DetectorUnavailable."""
     return read_card(_folder(model_store, name))
 
 
 def read_card(folder: Path) -> Card:
-    """The card in a model's folder. Raises DetectorUnavailable."""
+    """Return the card in a model's folder. Raises DetectorUnavailable."""
     path = folder / "card.json"
     try:
         return Card.model_validate_json(path.read_bytes())
@@ -68,7 +98,7 @@ def read_card(folder: Path) -> Card:
 
 
 def resolve_device(device: Device) -> torch.device:
-    """The device to run on; `auto` is the GPU when there is one. Raises DetectorUnavailable."""
+    """Return the device to run on; `auto` is the GPU when there is one. Raises DetectorUnavailable."""
     if device == "cuda" and not torch.cuda.is_available():
         raise DetectorUnavailable("device cuda is asked for, but torch finds no CUDA GPU; use auto or cpu")
     if device == "auto":
@@ -84,7 +114,7 @@ def _folder(model_store: Path, name: str) -> Path:
 
 
 def _weights_file(folder: Path, card: Card) -> bytes | None:
-    """The weights named by the card, read once so that what is hashed is what is loaded."""
+    """Return the weights named by the card, read once so that what is hashed is what is loaded."""
     if card.weights is None:
         return None
     path = folder / card.weights
@@ -95,9 +125,9 @@ def _weights_file(folder: Path, card: Card) -> bytes | None:
 
 
 def _checked_weights(name: str, card: Card, content: bytes) -> Weights:
-    found = hashlib.sha256(content).hexdigest()
-    if found != card.sha256:
-        raise DetectorUnavailable(f"the weights of {name} have sha256 {found}, its card says {card.sha256}")
+    digest = hashlib.sha256(content).hexdigest()
+    if digest != card.sha256:
+        raise DetectorUnavailable(f"the weights of {name} have sha256 {digest}, its card says {card.sha256}")
     try:
         weights: Weights = load(content)
     except SafetensorError as unsound:
@@ -109,7 +139,7 @@ WEIGHTS = "weights.safetensors"
 
 
 def write_model(folder: Path, card: Card, weights: Weights) -> Path:
-    """The weights before the card, whose `sha256` is put in here; returns the folder."""
+    """Write the weights before the card, whose `sha256` is put in here; returns the folder."""
     content = weights_content(weights)
     folder.mkdir(parents=True, exist_ok=True)
     (folder / WEIGHTS).write_bytes(content)
@@ -118,19 +148,26 @@ def write_model(folder: Path, card: Card, weights: Weights) -> Path:
 
 
 def write_card(folder: Path, card: Card) -> None:
-    """`card.json`, aside and renamed. Raises ValueError for a figure that JSON has not, such as NaN."""
+    """Write `card.json`. Raises ValueError for a figure that JSON has not, such as NaN."""
     text = json.dumps(card.model_dump(mode="json"), indent=2, allow_nan=False)
-    aside = folder / "card.json.tmp"
-    aside.write_text(text + "\n", encoding="utf-8")
-    aside.replace(folder / "card.json")
+    write_text(folder / "card.json", text + "\n")
 
 
 def weights_content(weights: Weights) -> bytes:
-    """As safetensors; the same weights, the same bytes."""
+    """Return the weights as safetensors; the same weights, the same bytes."""
     content: bytes = save({name: tensor.contiguous() for name, tensor in weights.items()})
     return content
 
 
+def weights_of(detector: Detector) -> Weights:
+    """Return the weights of a detector, to train further from. Raises TrainingFailed where it has none."""
+    if not isinstance(detector, TrainedDetector):
+        raise TrainingFailed(
+            f"model {detector.card.model} cannot be trained further: detector {detector.card.detector!r} has no weights"
+        )
+    return detector.weights()
+
+
 def sha256_of(weights: Weights) -> str:
-    """What the card of a model with these weights says."""
+    """Return what the card of a model with these weights says."""
     return hashlib.sha256(weights_content(weights)).hexdigest()

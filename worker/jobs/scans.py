@@ -9,47 +9,55 @@ from contextlib import ExitStack
 import numpy as np
 
 from service.catalog.records import ScanOutcome
+from worker.cloud import npz
 from worker.jobs.step import Context, put
 from worker.pipeline import archive
 from worker.pipeline.registration.results import RegisteredScan, ScanFile, ScanResult, read_registered
 
 
-def scan_files(at: Context, scans: Sequence[ScanOutcome], stack: ExitStack) -> list[ScanFile]:
-    """The uploads as local files for as long as the stack is open."""
+def scan_files(context: Context, scans: Sequence[ScanOutcome], stack: ExitStack) -> list[ScanFile]:
+    """Return the uploads as local files for as long as the stack is open."""
     files = []
-    for each in scans:
-        scan = at.catalog.scans.get(each.scan_id)
-        path = stack.enter_context(at.catalog.blobs.local(scan.key))
+    for outcome in scans:
+        scan = context.catalog.scans.get(outcome.scan_id)
+        path = stack.enter_context(context.catalog.blobs.local(scan.key))
         pose = None if scan.pose is None else np.array(scan.pose, np.float64)
         files.append(ScanFile(name=scan.filename, path=path, pose=pose))
     return files
 
 
 def scan_outcomes(scans: Sequence[ScanOutcome], outcomes: Sequence[ScanResult]) -> tuple[ScanOutcome, ...]:
-    """What became of each scan, as it is recorded."""
+    """Return what became of each scan, as it is recorded."""
     ids = [scan.scan_id for scan in scans]
     return tuple(_recorded(scan_id, outcome, ids) for scan_id, outcome in zip(ids, outcomes, strict=True))
 
 
 def save_scans(
-    at: Context,
+    context: Context,
     scans: Sequence[ScanOutcome],
     files: Sequence[ScanFile],
     outcomes: Sequence[ScanResult],
     key_of: Callable[[str], str],
 ) -> None:
     """Keep the points of every accepted scan; one file is read at a time."""
-    for done, (each, file, outcome) in enumerate(zip(scans, files, outcomes, strict=True)):
-        at.report("saving", done / len(scans))
-        if outcome.registration is not None:
-            scan = read_registered(file, outcome.registration, max_points=at.settings.max_scan_points)
-            put(at, key_of(each.scan_id), functools.partial(archive.save_scan, scan=scan))
+    for done, (scan, file, result) in enumerate(zip(scans, files, outcomes, strict=True)):
+        context.report("saving", done / len(scans))
+        if result.registration is not None:
+            points = read_registered(file, result.registration, max_points=context.settings.max_scan_points)
+            put(context, key_of(scan.scan_id), functools.partial(npz.save, value=points))
 
 
-def kept_scan(at: Context, key: str) -> RegisteredScan:
-    """An accepted scan as `save_scans` kept it."""
-    with at.catalog.blobs.local(key) as path:
+def kept_scan(context: Context, key: str) -> RegisteredScan:
+    """Return an accepted scan as `save_scans` kept it."""
+    with context.catalog.blobs.local(key) as path:
         return archive.load_scan(path)
+
+
+def kept_scans(
+    context: Context, scans: Sequence[ScanOutcome], key_of: Callable[[str], str]
+) -> list[Callable[[], RegisteredScan]]:
+    """Return what loads each accepted scan."""
+    return [functools.partial(kept_scan, context, key_of(scan.scan_id)) for scan in scans if scan.accepted]
 
 
 def _recorded(scan_id: str, outcome: ScanResult, ids: Sequence[str]) -> ScanOutcome:
@@ -62,14 +70,15 @@ def _recorded(scan_id: str, outcome: ScanResult, ids: Sequence[str]) -> ScanOutc
             rmse=outcome.inlier_rmse,
             reason=outcome.reason,
         )
+    sigma = registration.uncertainty
     return ScanOutcome(
         scan_id=scan_id,
         accepted=True,
         fitness=outcome.fitness,
         rmse=outcome.inlier_rmse,
         map_from_scan=registration.map_from_scan.tolist(),
-        translation_sigma=None if registration.uncertainty is None else registration.uncertainty.translation,
-        rotation_sigma=None if registration.uncertainty is None else registration.uncertainty.rotation,
+        translation_sigma=None if sigma is None else sigma.translation,
+        rotation_sigma=None if sigma is None else sigma.rotation,
         path=tuple(ids[index] for index in registration.path) or None,
         reason=outcome.reason,
     )

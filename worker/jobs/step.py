@@ -92,8 +92,8 @@ def step(run: Callable[[Context], None]) -> Callable[[str], None]:
     return call
 
 
-def put(at: Context, key: str, write: Callable[[Path], None]) -> None:
+def put(context: Context, key: str, write: Callable[[Path], None]) -> None:
     """Have a file written aside, then take it into the blob store in one move."""
-    path = at.scratch / key.replace("/", "_")
+    path = context.scratch / key.replace("/", "_")
     write(path)
-    at.catalog.blobs.put_file(key, path, move=True)
+    context.catalog.blobs.put_file(key, path, move=True)

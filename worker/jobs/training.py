@@ -12,16 +12,16 @@ from typing import Any
 
 from service.catalog import blob_keys
 from service.catalog.records import ModelRecord, VersionRecord
-from worker.detectors.card import Card, Preprocessing
-from worker.detectors.detector import Detector
-from worker.detectors.spicd_net.detector import SpicdNet
-from worker.detectors.store import make_detector, resolve_device
+from worker.detectors.card import Card
+from worker.detectors.networks import NETWORKS
+from worker.detectors.store import make_detector, read_card, resolve_device, settings_of, weights_of
 from worker.errors import Cancelled, TrainingFailed
+from worker.jobs.maps import encode_reference
 from worker.jobs.models import card_that_fits, kept_detector, pipeline_settings
 from worker.jobs.scans import kept_scan
+from worker.jobs.site_training_set import halves, held_out_share, training_set
 from worker.jobs.step import Context, put, step
-from worker.jobs.tile_sets import halves, held_out_share, training_set
-from worker.pipeline import archive
+from worker.jobs.versions import kept_reference
 from worker.pipeline.registration.results import RegisteredScan
 from worker.training.dataset import load_tiles, save_tiles
 from worker.training.log import LOG
@@ -39,72 +39,104 @@ KEPT = (BEST, LOG, CHECKPOINT)  #: what a training goes on from, in the order it
 
 
 @step
-def pack_tiles(at: Context) -> None:
+def pack_tiles(context: Context) -> None:
     """The map's tiles as a training set, each seen by one half of its scans and by the other."""
-    model = at.catalog.models.of_job(at.job.job_id)
-    version = at.catalog.versions.get(model.map_id, model.map_version)
-    card = card_that_fits(at, model.base or version.model, version.model)
-    settings = pipeline_settings(at, version, card)
-    with at.catalog.blobs.local(blob_keys.map_tiles(version.job_id)) as path:
-        tiles = archive.load_tiles(path)
-    visits = halves(_scans(at, version), voxel_size=card.preprocessing.voxel_size)
+    model, version = _asked(context)
+    card = _card(context, model, version)
+    _detector_key(model, card)  # a base that cannot be trained, or too small a map, fails before the wait
+    settings = pipeline_settings(context, version, card)
+    tiles = kept_reference(context, version).tiles(min_points=settings.tiling.min_points)
+    visits = halves(_scans(context, version), voxel_size=card.preprocessing.voxel_size)
     source = f"version {version.version} of map {version.map_id}, its scans parted in two"
     packed = training_set(tiles, visits, settings=settings.tiling, source=source)
-    held_out_share(packed, min_separation=SITE.pairs.min_separation)  # fails here, before the wait
-    put(at, blob_keys.model_tiles(at.job.job_id), lambda path: save_tiles(packed, path))
+    held_out_share(packed, min_separation=SITE.pairs.min_separation)
+    put(context, blob_keys.model_tiles(context.job.job_id), lambda path: save_tiles(packed, path))
 
 
 @step
-def train_model(at: Context) -> None:
+def train_model(context: Context) -> None:
     """From nothing or from another model, for so many minutes; goes on from the last epoch that was kept."""
-    model = at.catalog.models.of_job(at.job.job_id)
-    folder, work = at.scratch / "run", blob_keys.model_work(at.job.job_id)
-    _fetch(at, folder)
+    model, version = _asked(context)
+    folder, work = context.scratch / "run", blob_keys.model_work(context.job.job_id)
+    start = None if model.base is None else weights_of(kept_detector(context, model.base))
+    _fetch(context, folder)
     try:
-        with at.catalog.blobs.local(blob_keys.model_tiles(at.job.job_id)) as tiles:
+        with context.catalog.blobs.local(blob_keys.model_tiles(context.job.job_id)) as tiles:
             train(
-                _settings(at, model, tiles),
+                _settings(context, model, version, tiles),
                 tiles,
                 folder,
-                lambda _, share: at.report("training", share),
-                start=None if model.base is None else _spicd_net(at, model.base).weights(),
-                on_epoch=functools.partial(_keep, at),
+                lambda _, share: context.report("training", share),
+                start=start,
+                on_epoch=functools.partial(_keep, context),
             )
-    except FloatingPointError as error:
-        at.catalog.blobs.delete_prefix(work)
+    except (FloatingPointError, ValueError) as error:  # no number, or files of an earlier release
+        context.catalog.blobs.delete_prefix(work)
         raise TrainingFailed(str(error)) from error
     except Cancelled:
-        at.catalog.blobs.delete_prefix(work)
+        context.catalog.blobs.delete_prefix(work)
         raise
 
 
 @step
-def finish_model(at: Context) -> None:
-    """Choose the threshold on held-out tiles, write the model and its card, and describe the map with it."""
-    model = at.catalog.models.of_job(at.job.job_id)
-    version = at.catalog.versions.get(model.map_id, model.map_version)
-    folder, blobs = at.scratch / "run", at.catalog.blobs
-    _fetch(at, folder)
-    at.report("calibrating", 0.0)
-    with blobs.local(blob_keys.model_tiles(at.job.job_id)) as tiles:
-        made = _published(at, model, version, folder / BEST, tiles)
-    card = Card.model_validate_json((made / "card.json").read_bytes()).model_copy(update={"licence": ""})
+def finish_model(context: Context) -> None:
+    """Choose the threshold on held-out tiles, write the model and its card, and encode the map with it."""
+    model, version = _asked(context)
+    folder, blobs = context.scratch / "run", context.catalog.blobs
+    _fetch(context, folder)
+    context.report("calibrating", 0.0)
+    try:
+        with blobs.local(blob_keys.model_tiles(context.job.job_id)) as tiles:
+            made = _published(context, model, version, folder / BEST, tiles)
+    except ValueError as error:  # files of an earlier release
+        raise TrainingFailed(str(error)) from error
+    card = read_card(made).model_copy(update={"licence": ""})
     weights = (made / str(card.weights)).read_bytes()
-    blobs.put_bytes(blob_keys.model_weights(at.job.job_id), weights)
-    blobs.put_file(blob_keys.model_log(at.job.job_id), folder / LOG)
-    _describe(at, make_detector(card, weights, at.settings.device), model, version)
-    at.catalog.models.save_card(at.job.job_id, card.model_dump(mode="json"))
-    at.catalog.jobs.succeed(at.job.job_id)
-    blobs.delete_prefix(blob_keys.model_work(at.job.job_id))
+    blobs.put_bytes(blob_keys.model_weights(context.job.job_id), weights)
+    blobs.put_file(blob_keys.model_log(context.job.job_id), folder / LOG)
+    encode_reference(context, version, make_detector(card, weights, context.settings.device), model.model)
+    context.catalog.models.save_card(context.job.job_id, card.model_dump(mode="json"))
+    context.catalog.jobs.succeed(context.job.job_id)
+    blobs.delete_prefix(blob_keys.model_work(context.job.job_id))
 
 
-def _settings(at: Context, model: ModelRecord, tiles: Path) -> TrainSettings:
-    version = at.catalog.versions.get(model.map_id, model.map_version)
-    device = resolve_device(at.settings.device).type
+def _asked(context: Context) -> tuple[ModelRecord, VersionRecord]:
+    model = context.catalog.models.of_job(context.job.job_id)
+    return model, context.catalog.versions.get(model.map_id, model.map_version)
+
+
+def _card(context: Context, model: ModelRecord, version: VersionRecord) -> Card:
+    """Return the card of the model that is trained further, or of the one that the map was built for."""
+    return card_that_fits(context, model.base or version.model, version.model)
+
+
+def _detector_key(model: ModelRecord, card: Card) -> str:
+    """Return the detector that is trained: the card's, or where that cannot be and no base is asked for, the default.
+
+    Raises TrainingFailed.
+    """
+    if card.detector in NETWORKS:
+        return card.detector
+    if model.base is None:
+        return SITE.detector
+    raise TrainingFailed(
+        f"model {model.base} cannot be trained further: nothing of a detector {card.detector!r} is trained; "
+        f"name a base of {' or '.join(sorted(NETWORKS))}, or none"
+    )
+
+
+def _settings(context: Context, model: ModelRecord, version: VersionRecord, tiles: Path) -> TrainSettings:
+    device = resolve_device(context.settings.device).type
     share = held_out_share(load_tiles(tiles), min_separation=SITE.pairs.min_separation)
-    needs = _needs(at, model, version)
+    card = _card(context, model, version)
+    key = _detector_key(model, card)
+    # else the network would be used on another input than it was trained on
+    own = settings_of(card) if key == card.detector else {}
+    pairs = {name: own[name] for name in ("patch_points", "chamfer_points") if name in own}
     return replace(
         SITE,
+        detector=key,
+        seed=own.get("seed", SITE.seed),
         epochs=model.epochs or SITE.epochs,
         minutes=model.minutes,
         held_out=share,
@@ -112,74 +144,54 @@ def _settings(at: Context, model: ModelRecord, tiles: Path) -> TrainSettings:
         learning_rate=SITE.learning_rate if model.base is None else FURTHER,
         device=device,
         coarse_search=device == "cpu",
-        pairs=replace(
-            SITE.pairs, patch_points=needs.patch_points, chamfer_points=needs.chamfer_points
-        ),  # else the network would be used on another input than it was trained on
+        pairs=replace(SITE.pairs, **pairs),
     )
 
 
-def _published(at: Context, model: ModelRecord, version: VersionRecord, best: Path, tiles: Path) -> Path:
-    """The folder of the model; beside its figures stand those of the model that it would replace.
+def _published(context: Context, model: ModelRecord, version: VersionRecord, best: Path, tiles: Path) -> Path:
+    """Return the folder of the model; beside its figures stand those of the model that it would replace.
 
     A base that ranks the held-out tiles no worse keeps its weights, and gets the threshold of this place.
     """
     other = model.base or version.model
+    card = _card(context, model, version)
+    key = _detector_key(model, card)
+    title = replace(SITE, detector=key).network.title
     asked = {"base": model.base, "minutes": model.minutes, "epochs": model.epochs}
     about: dict[str, Any] = {"map_id": model.map_id, "map_version": model.map_version, "base": model.base}
-    detector = kept_detector(at, other)
     return publish(
         best,
         tiles,
-        at.scratch / "models",
+        context.scratch / "models",
         name=model.name,
         version=str(model.version),
-        summary=f"SPICD-Net trained on version {model.map_version} of map {model.map_id}"
+        summary=f"{title} trained on version {model.map_version} of map {model.map_id}"
         + ("" if model.base is None else f", from {model.base}"),
         command=f"POST /maps/{model.map_id}/models {json.dumps(asked)}",
         about=about,
-        beside={other: detector} if isinstance(detector, SpicdNet) else {},
+        beside={other: kept_detector(context, other)},
         base=model.base,
-        preprocessing=_needs(at, model, version),
+        preprocessing=card.preprocessing,
     )
 
 
-def _describe(at: Context, detector: Detector, model: ModelRecord, version: VersionRecord) -> None:
-    """So that the first survey has half of the work, as with the map's own model."""
-    with at.catalog.blobs.local(blob_keys.map_tiles(version.job_id)) as path:
-        tiles = archive.load_tiles(path)
-    description = detector.describe(tiles, progress=lambda _, share: at.report("encoding", share))
-    key = blob_keys.map_embedding(version.job_id, model.model, detector.card.sha256)
-    put(at, key, lambda path: archive.save_arrays(path, description))
-
-
-def _needs(at: Context, model: ModelRecord, version: VersionRecord) -> Preprocessing:
-    return card_that_fits(at, model.base or version.model, version.model).preprocessing
-
-
-def _spicd_net(at: Context, model: str) -> SpicdNet:
-    found = kept_detector(at, model)
-    if not isinstance(found, SpicdNet):
-        raise TrainingFailed(f"model {model} is no SPICD-Net, and only such a one can be trained further")
-    return found
-
-
-def _scans(at: Context, version: VersionRecord) -> Iterator[RegisteredScan]:
+def _scans(context: Context, version: VersionRecord) -> Iterator[RegisteredScan]:
     accepted = [scan for scan in version.scans if scan.accepted]
     for done, scan in enumerate(accepted):
-        at.report("packing", done / len(accepted))
-        yield kept_scan(at, blob_keys.map_scan(version.job_id, scan.scan_id))
+        context.report("packing", done / len(accepted))
+        yield kept_scan(context, blob_keys.map_scan(version.job_id, scan.scan_id))
 
 
-def _keep(at: Context, folder: Path) -> None:
+def _keep(context: Context, folder: Path) -> None:
     for name in KEPT:
-        at.catalog.blobs.put_file(blob_keys.model_checkpoint(at.job.job_id, name), folder / name)
+        context.catalog.blobs.put_file(blob_keys.model_checkpoint(context.job.job_id, name), folder / name)
 
 
-def _fetch(at: Context, folder: Path) -> None:
+def _fetch(context: Context, folder: Path) -> None:
     """What an earlier attempt kept; copies, for a log is written to."""
     folder.mkdir(parents=True, exist_ok=True)
     for name in KEPT:
-        key = blob_keys.model_checkpoint(at.job.job_id, name)
-        if at.catalog.blobs.exists(key):
-            with at.catalog.blobs.local(key) as path:
+        key = blob_keys.model_checkpoint(context.job.job_id, name)
+        if context.catalog.blobs.exists(key):
+            with context.catalog.blobs.local(key) as path:
                 shutil.copyfile(path, folder / name)

@@ -12,13 +12,16 @@ import numpy as np
 
 from service.catalog import blob_keys
 from service.catalog.records import ScanOutcome, VersionRecord
+from worker.cloud import npz
 from worker.cloud.types import Indices
-from worker.jobs.pair_cache import KeptPairs
-from worker.jobs.scans import kept_scan, save_scans, scan_files, scan_outcomes
+from worker.jobs.pair_cache import StoredPairCache
+from worker.jobs.scans import kept_scans, save_scans, scan_files, scan_outcomes
 from worker.jobs.step import Context, put
 from worker.pipeline import archive
-from worker.pipeline.flow import BuiltMap, NoScanAccepted, NothingToTile, PipelineSettings, build_map
+from worker.pipeline.flow import BuiltMap, NoScanAccepted, NothingToTile, build_map
 from worker.pipeline.map_update import KeptMap, extend_map, renew_map, without
+from worker.pipeline.mapping.fusion import ReferenceMap
+from worker.pipeline.settings import PipelineSettings
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -29,74 +32,79 @@ class Made:
     outcomes: tuple[ScanOutcome, ...]  #: of every scan of the version
 
     def registration(self) -> dict[str, Any] | None:
-        """The totals of the registration, with the reference scan by its id; None where there was none."""
+        """Return the totals of the registration, with the reference scan by its id; None where there was none."""
         if self.built.report is None:
             return None
-        found = self.built.report.document()
-        reference = found["reference"]
-        return {**found, "reference": None if reference is None else self.outcomes[reference].scan_id}
+        totals = self.built.report.document()
+        reference = totals["reference"]
+        return {**totals, "reference": None if reference is None else self.outcomes[reference].scan_id}
 
 
-def make_version(at: Context, version: VersionRecord, settings: PipelineSettings) -> Made:
+def kept_reference(context: Context, version: VersionRecord) -> ReferenceMap:
+    """Return the map of a version, also one that release 0.1 built."""
+    blobs, tiles_of_0_1 = context.catalog.blobs, blob_keys.map_tiles(version.job_id)
+    with ExitStack() as stack:
+        path = stack.enter_context(blobs.local(blob_keys.map_reference(version.job_id)))
+        grid = stack.enter_context(blobs.local(tiles_of_0_1)) if blobs.exists(tiles_of_0_1) else None
+        return archive.load_reference(path, tiles_of_0_1=grid)
+
+
+def make_version(context: Context, version: VersionRecord, settings: PipelineSettings) -> Made:
     """Build a version. What became of its scans is recorded also where that fails."""
     if version.base_version is None:
-        return _first(at, version, settings)
-    base = at.catalog.versions.get(version.map_id, version.base_version)
+        return _first(context, version, settings)
+    base = context.catalog.versions.get(version.map_id, version.base_version)
     if version.survey_id is None:
-        return _extended(at, version, base, settings)
-    return _renewed(at, version, base, version.survey_id, settings)
+        return _extended(context, version, base, settings)
+    return _renewed(context, version, base, version.survey_id, settings)
 
 
-def _first(at: Context, version: VersionRecord, settings: PipelineSettings) -> Made:
+def _first(context: Context, version: VersionRecord, settings: PipelineSettings) -> Made:
     with ExitStack() as stack:
-        files = scan_files(at, version.scans, stack)
-        with _recorded_anyway(at, version.scans):
-            pairs = KeptPairs(at.catalog.blobs, at.job.job_id)
-            built = build_map(files, settings=settings, pairs=pairs, progress=at.report)
-        save_scans(at, version.scans, files, built.outcomes, _key_of(at))
+        files = scan_files(context, version.scans, stack)
+        with _recorded_anyway(context, version.scans):
+            pairs = StoredPairCache(context.catalog.blobs, context.job.job_id)
+            built = build_map(files, settings=settings, pairs=pairs, progress=context.report)
+        save_scans(context, version.scans, files, built.outcomes, _key_of(context))
     return Made(built=built, outcomes=scan_outcomes(version.scans, built.outcomes))
 
 
-def _extended(at: Context, version: VersionRecord, base: VersionRecord, settings: PipelineSettings) -> Made:
+def _extended(
+    context: Context, version: VersionRecord, base: VersionRecord, settings: PipelineSettings
+) -> Made:
     older, further = _kept(base), _further(version, base)
     with ExitStack() as stack:
-        files = scan_files(at, further, stack)
-        with _recorded_anyway(at, further):
-            built = extend_map(_kept_map(at, base), files, settings=settings, progress=at.report)
+        files = scan_files(context, further, stack)
+        with _recorded_anyway(context, further):
+            built = extend_map(_kept_map(context, base), files, settings=settings, progress=context.report)
         for scan in older:
-            at.catalog.blobs.copy(blob_keys.map_scan(base.job_id, scan.scan_id), _key_of(at)(scan.scan_id))
-        save_scans(at, further, files, built.outcomes, _key_of(at))
+            context.catalog.blobs.copy(
+                blob_keys.map_scan(base.job_id, scan.scan_id), _key_of(context)(scan.scan_id)
+            )
+        save_scans(context, further, files, built.outcomes, _key_of(context))
     return Made(built=built, outcomes=(*older, *scan_outcomes(further, built.outcomes)))
 
 
 def _renewed(
-    at: Context, version: VersionRecord, base: VersionRecord, survey_id: str, settings: PipelineSettings
+    context: Context, version: VersionRecord, base: VersionRecord, survey_id: str, settings: PipelineSettings
 ) -> Made:
     older, seen = _kept(base), _further(version, base)
-    kept, replaced = _kept_map(at, base), _changed(at, survey_id)
-    survey_keys = [blob_keys.survey_scan(survey_id, scan.scan_id) for scan in seen]
-    loads = [functools.partial(kept_scan, at, key) for key in survey_keys]
-    built = renew_map(kept, loads, replaced=replaced, settings=settings, progress=at.report)
+    kept, replaced = _kept_map(context, base), _changed(context, survey_id)
+    survey_key = functools.partial(blob_keys.survey_scan, survey_id)
+    loads = kept_scans(context, seen, survey_key)
+    built = renew_map(kept, loads, replaced=replaced, settings=settings, progress=context.report)
     for done, (scan, load) in enumerate(zip(older, kept.scans, strict=True)):
-        at.report("saving", done / len(older))
-        rest = without(load(), kept.grid, replaced)
-        put(at, _key_of(at)(scan.scan_id), functools.partial(archive.save_scan, scan=rest))
-    for scan, key in zip(seen, survey_keys, strict=True):
-        at.catalog.blobs.copy(key, _key_of(at)(scan.scan_id))
+        context.report("saving", done / len(older))
+        rest = without(load(), kept.reference.grid, replaced)
+        put(context, _key_of(context)(scan.scan_id), functools.partial(npz.save, value=rest))
+    for scan in seen:
+        context.catalog.blobs.copy(survey_key(scan.scan_id), _key_of(context)(scan.scan_id))
     return Made(built=built, outcomes=(*older, *seen))
 
 
-def _kept_map(at: Context, base: VersionRecord) -> KeptMap:
-    blobs = at.catalog.blobs
-    with blobs.local(blob_keys.map_reference(base.job_id)) as path:
-        reference = archive.load_reference(path)
-    with blobs.local(blob_keys.map_tiles(base.job_id)) as path:
-        grid = archive.load_tiles(path).grid
-    scans = [
-        functools.partial(kept_scan, at, blob_keys.map_scan(base.job_id, scan.scan_id))
-        for scan in _kept(base)
-    ]
-    return KeptMap(reference=reference, grid=grid, scans=scans)
+def _kept_map(context: Context, base: VersionRecord) -> KeptMap:
+    key_of = functools.partial(blob_keys.map_scan, base.job_id)
+    return KeptMap(reference=kept_reference(context, base), scans=kept_scans(context, base.scans, key_of))
 
 
 def _kept(base: VersionRecord) -> list[ScanOutcome]:
@@ -104,27 +112,27 @@ def _kept(base: VersionRecord) -> list[ScanOutcome]:
 
 
 def _further(version: VersionRecord, base: VersionRecord) -> list[ScanOutcome]:
-    """What the version has beside its base; an earlier run of the step may have recorded outcomes of these."""
+    """Return what the version has beside its base; an earlier run of the step may have recorded outcomes of these."""
     older = {scan.scan_id for scan in _kept(base)}
     return [scan for scan in version.scans if scan.scan_id not in older]
 
 
-def _changed(at: Context, survey_id: str) -> Indices:
-    """(T, 3) the tiles that the survey found changed."""
-    found = at.catalog.changes.of_survey(survey_id)
-    changed = [each.tile.tile_index for each in found if each.tile.state == "changed"]
+def _changed(context: Context, survey_id: str) -> Indices:
+    """Return (T, 3) the tiles that the survey found changed."""
+    changes = context.catalog.changes.of_survey(survey_id)
+    changed = [change.tile.tile_index for change in changes if change.tile.state == "changed"]
     return np.array(changed, np.int32).reshape(-1, 3)
 
 
-def _key_of(at: Context) -> functools.partial[str]:
-    return functools.partial(blob_keys.map_scan, at.job.job_id)
+def _key_of(context: Context) -> functools.partial[str]:
+    return functools.partial(blob_keys.map_scan, context.job.job_id)
 
 
 @contextmanager
-def _recorded_anyway(at: Context, scans: Sequence[ScanOutcome]) -> Iterator[None]:
+def _recorded_anyway(context: Context, scans: Sequence[ScanOutcome]) -> Iterator[None]:
     """Record what became of the scans where no map comes of them."""
     try:
         yield
     except (NoScanAccepted, NothingToTile) as error:
-        at.catalog.versions.save_outcomes(at.job.job_id, scan_outcomes(scans, error.outcomes))
+        context.catalog.versions.save_outcomes(context.job.job_id, scan_outcomes(scans, error.outcomes))
         raise

@@ -2,64 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
-from pydantic import BaseModel, ConfigDict, Field
-
-from worker.cloud.tiling import (
-    TileGrid,
-    TilePairs,
-    Tiles,
-    TilingSettings,
-    cut,
-    grid_over,
-    grown,
-    pair_tiles,
-)
+from worker.cloud.tiling import TileGrid, Tiles, grid_over, grown, pair_tiles
 from worker.cloud.types import Arrays
 from worker.cloud.voxels import Voxels
-from worker.detectors.card import Preprocessing
+from worker.detectors.comparison import Comparison, SeenScan, Side
 from worker.detectors.detector import Detector
 from worker.errors import MapFailed, RegistrationFailed
 from worker.pipeline.mapping.fusion import CurrentMap, ReferenceMap, current_map, fuse, reference_map
 from worker.pipeline.mapping.map_registration import MapReport, register_map_scans
 from worker.pipeline.mapping.pair_registration import PairCache
-from worker.pipeline.mapping.settings import JointRegistrationSettings, MapSettings
 from worker.pipeline.mapping.survey_registration import register_survey_scans
 from worker.pipeline.registration.results import RegisteredScan, ScanFile, ScanResult, read_registered
 from worker.pipeline.registration.scan_to_scan import PairResult
-from worker.pipeline.registration.settings import RegistrationSettings, with_values
 from worker.pipeline.results.changes import ChangeSet, decide
+from worker.pipeline.settings import PipelineSettings
 from worker.progress import Progress, no_progress
 
-
-class PipelineSettings(BaseModel):
-    """One settings class a stage."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    registration: RegistrationSettings = Field(default_factory=RegistrationSettings)
-    mapping: MapSettings = Field(default_factory=MapSettings)
-    tiling: TilingSettings = Field(default_factory=TilingSettings)
-    max_scan_points: int = Field(50_000_000, gt=0)
-
-    def for_model(self, needs: Preprocessing) -> PipelineSettings:
-        """The same settings with what is tied to a model's weights put in its place."""
-        voxels = {"voxel_size": needs.voxel_size}
-        tiles = {"tile_size": needs.tile_size, "min_points": needs.min_points}
-        return with_values(
-            self,
-            registration=with_values(self.registration, **voxels),
-            tiling=with_values(self.tiling, **tiles),
-        )
-
-    @property
-    def joint_registration(self) -> JointRegistrationSettings:
-        """What the registration of many scans needs of these."""
-        return JointRegistrationSettings(
-            registration=self.registration, mapping=self.mapping, max_points=self.max_scan_points
-        )
+Scans = Sequence[Callable[[], SeenScan]]  #: each call loads one
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -76,10 +38,10 @@ class BuiltMap:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class LocatedSurvey:
-    """A survey in the map's frame, cut along the map's tiles."""
+    """A survey in the map's frame, beside the map."""
 
     current: CurrentMap
-    pairs: TilePairs
+    comparison: Comparison
     outcomes: tuple[ScanResult, ...]
 
 
@@ -110,7 +72,7 @@ def build_map(
     processes: int | None = None,
     progress: Progress = no_progress,
 ) -> BuiltMap:
-    """Stage 1: place the scans in one frame, fuse them, cut the map into tiles.
+    """Stage 1: register the scans in one frame, fuse them, cut the map into tiles.
 
     `pairs` keeps registered pairs, so that a build that was killed goes on; `processes` is one a core if None.
     Raises ScanError where no file can be read, MapFailed where no scan holds a pose, and NothingToTile.
@@ -133,12 +95,11 @@ def build_map(
 def locate_survey(
     files: Sequence[ScanFile],
     reference: ReferenceMap,
-    tiles: Tiles,
     *,
     settings: PipelineSettings,
     progress: Progress = no_progress,
 ) -> LocatedSurvey:
-    """Stage 3, first half: place the scans on the map, fuse those accepted, pair the tiles.
+    """Stage 3, first half: register the scans to the map, fuse those accepted, set both side by side.
 
     Raises ScanError where no file can be read, NoScanAccepted where none is left to compare.
     """
@@ -150,28 +111,46 @@ def locate_survey(
     progress("tiling", 0.0)
     accepted = accepted_scans(files, outcomes, settings)
     current = current_map(accepted, voxel_size=reference.voxel_size)
-    pairs = pair_tiles(tiles, current.points, settings=settings.tiling)
+    comparison = compare(reference, current, settings=settings)
     progress("tiling", 1.0)
-    return LocatedSurvey(current=current, pairs=pairs, outcomes=outcomes)
+    return LocatedSurvey(current=current, comparison=comparison, outcomes=outcomes)
+
+
+def compare(
+    reference: ReferenceMap,
+    current: CurrentMap,
+    *,
+    settings: PipelineSettings,
+    reference_scans: Scans = (),
+    current_scans: Scans = (),
+) -> Comparison:
+    """Set the map and a survey side by side for a detector, cut along the map's tiles (about 50 ms)."""
+    tiles = reference.tiles(min_points=settings.tiling.min_points)
+    return Comparison(
+        reference=Side(points=reference.points, normals=reference.normals, scans=reference_scans),
+        current=Side(points=current.points, scans=current_scans),
+        tile_pairs=pair_tiles(tiles, current.points, settings=settings.tiling),
+    )
 
 
 def detect(
-    pairs: TilePairs,
+    comparison: Comparison,
     detector: Detector,
     *,
-    description: Arrays | None = None,
+    embedding: Arrays | None = None,
     threshold: float | None = None,
     progress: Progress = no_progress,
 ) -> ChangeSet:
     """Stage 3, second half: score the tiles, then decide; the threshold is the card's if None is given."""
-    scores = detector.score(pairs, description=description, progress=progress)
-    return decide(pairs, scores, threshold=detector.card.threshold if threshold is None else threshold)
+    detection = detector.detect(comparison, embedding=embedding, progress=progress)
+    threshold = detector.card.threshold if threshold is None else threshold
+    return decide(comparison.tile_pairs, detection, threshold=threshold)
 
 
 def accepted_scans(
     files: Sequence[ScanFile], outcomes: Sequence[ScanResult], settings: PipelineSettings
 ) -> Iterator[RegisteredScan]:
-    """The points of each accepted scan, read again: no two scans are held at once."""
+    """Read the points of each accepted scan again: no two scans are held at once."""
     for file, outcome in zip(files, outcomes, strict=True):
         if outcome.registration is not None:
             yield read_registered(file, outcome.registration, max_points=settings.max_scan_points)
@@ -180,13 +159,15 @@ def accepted_scans(
 def fused_scans(
     scans: Iterable[RegisteredScan], count: int, settings: PipelineSettings, progress: Progress
 ) -> Voxels:
-    def told() -> Iterator[RegisteredScan]:
+    """Fuse the scans, of which there are about `count`."""
+
+    def reported() -> Iterator[RegisteredScan]:
         for done, scan in enumerate(scans):
             progress("fusing", done / max(count, 1))
             yield scan
         progress("fusing", 1.0)
 
-    return fuse(told(), voxel_size=settings.registration.voxel_size)
+    return fuse(reported(), voxel_size=settings.registration.voxel_size)
 
 
 def tiled_map(
@@ -196,12 +177,13 @@ def tiled_map(
     settings: PipelineSettings,
     progress: Progress,
 ) -> tuple[ReferenceMap, Tiles]:
-    """The map with its normals, cut along a grid of its own or along one that there was."""
+    """Return the map with its normals, cut along a grid of its own or along one that there was."""
     progress("tiling", 0.0)
-    reference = reference_map(fused, settings=settings.registration)
     if grid is None:
-        grid = grid_over(reference.points, tile_size=settings.tiling.tile_size, voxel_size=fused.size)
-    tiles = cut(reference.points, grown(grid, reference.points), min_points=settings.tiling.min_points)
+        grid = grid_over(fused.points, tile_size=settings.tiling.tile_size, voxel_size=fused.size)
+    grid = grown(grid, fused.points)
+    reference = reference_map(fused, grid=grid, settings=settings.registration)
+    tiles = reference.tiles(min_points=settings.tiling.min_points)
     if not tiles.points:
         raise NothingToTile(outcomes, points=len(reference.points), min_points=settings.tiling.min_points)
     progress("tiling", 1.0)

@@ -1,4 +1,4 @@
-"""A map that goes on: further scans extend it, an accepted survey renews it; frame, grid and ids of tiles stay."""
+"""New versions of a map: further scans extend it, an accepted survey renews it; frame, grid and ids of tiles stay."""
 
 from __future__ import annotations
 
@@ -6,20 +6,14 @@ import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-from worker.cloud.tiling import TileGrid, inside_tiles
+from worker.cloud.tiling import TileGrid
 from worker.cloud.types import Indices
-from worker.pipeline.flow import (
-    BuiltMap,
-    NoScanAccepted,
-    PipelineSettings,
-    accepted_scans,
-    fused_scans,
-    tiled_map,
-)
+from worker.pipeline.flow import BuiltMap, NoScanAccepted, accepted_scans, fused_scans, tiled_map
 from worker.pipeline.mapping.fusion import ReferenceMap
 from worker.pipeline.mapping.map_registration import MapReport
 from worker.pipeline.mapping.survey_registration import register_survey_scans
 from worker.pipeline.registration.results import RegisteredScan, ScanFile
+from worker.pipeline.settings import PipelineSettings
 from worker.progress import Progress, no_progress
 
 
@@ -28,14 +22,13 @@ class KeptMap:
     """A map as an earlier build left it; its scans are loaded one at a time."""
 
     reference: ReferenceMap
-    grid: TileGrid
     scans: Sequence[Callable[[], RegisteredScan]]
 
 
 def extend_map(
     base: KeptMap, files: Sequence[ScanFile], *, settings: PipelineSettings, progress: Progress = no_progress
 ) -> BuiltMap:
-    """A new version: further scans placed on the map and fused with what it was made of; tiles keep their ids.
+    """Extend a map: register further scans to it and fuse them with what it was made of; tiles keep their ids.
 
     The outcomes are those of the new files. Raises ScanError where no file can be read, NoScanAccepted where none
     finds a place, and NothingToTile.
@@ -47,7 +40,7 @@ def extend_map(
         raise NoScanAccepted(outcomes)
     scans = itertools.chain((load() for load in base.scans), accepted_scans(files, outcomes, settings))
     fused = fused_scans(scans, len(base.scans) + len(files), settings, progress)
-    reference, tiles = tiled_map(fused, base.grid, outcomes, settings, progress)
+    reference, tiles = tiled_map(fused, base.reference.grid, outcomes, settings, progress)
     return BuiltMap(reference=reference, tiles=tiles, outcomes=outcomes, report=MapReport.of(outcomes))
 
 
@@ -59,20 +52,20 @@ def renew_map(
     settings: PipelineSettings,
     progress: Progress = no_progress,
 ) -> BuiltMap:
-    """A new version: a survey that was accepted as the new state of things; tiles keep their ids.
+    """Renew a map by a survey that was accepted as the new state of things; tiles keep their ids.
 
     In the tiles `replaced` (T, 3) the survey's points take the place of the older ones, elsewhere they join them.
     Raises NothingToTile.
     """
-    older = (without(load(), base.grid, replaced) for load in base.scans)
+    older = (without(load(), base.reference.grid, replaced) for load in base.scans)
     scans = itertools.chain(older, (load() for load in seen))
     fused = fused_scans(scans, len(base.scans) + len(seen), settings, progress)
-    reference, tiles = tiled_map(fused, base.grid, (), settings, progress)
+    reference, tiles = tiled_map(fused, base.reference.grid, (), settings, progress)
     return BuiltMap(reference=reference, tiles=tiles, outcomes=(), report=None)
 
 
 def without(scan: RegisteredScan, grid: TileGrid, tiles: Indices) -> RegisteredScan:
-    """The scan less its points in these tiles (T, 3)."""
-    stays = ~inside_tiles(scan.points, grid, tiles)
+    """Return the scan less its points in these tiles (T, 3)."""
+    stays = grid.locate_among(scan.points, tiles) < 0
     colors = None if scan.colors is None else scan.colors[stays]
     return replace(scan, points=scan.points[stays], colors=colors)

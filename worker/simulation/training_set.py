@@ -21,7 +21,7 @@ from worker.simulation.sensor import SimulatedScan
 from worker.simulation.truth import TileTruth, true_changes
 from worker.simulation.visits import edited, visit
 from worker.training.anomalies import OPERATIONS, Change
-from worker.training.dataset import Look, TileSet, joined
+from worker.training.dataset import Observation, TileSet, joined
 
 MARGIN = 1e-4  #: metres that a synthetic change keeps from the tile's border, which belongs to the next tile
 
@@ -158,7 +158,7 @@ def _voxels(scans: Sequence[SimulatedScan], map_from_world: Matrix4, settings: W
     return [Voxels.of(points, size=settings.voxel_size) for points in moved]
 
 
-def _after_edits(walk: _Walk) -> Iterator[Look]:
+def _after_edits(walk: _Walk) -> Iterator[Observation]:
     """Visit after whole things were added, removed and moved: tiles that changed in sight, and those around them.
 
     A tile in which something changed out of sight, or too little to count, is neither changed nor unchanged.
@@ -170,7 +170,9 @@ def _after_edits(walk: _Walk) -> Iterator[Look]:
         scans, pairs = walk.again(after, seed)
         changed, still = _truth(walk, after, scans)
         for tile in np.flatnonzero(pairs.observed & (changed | still)).tolist():
-            yield Look(tile=tile, points=pairs.current[tile], changed=bool(changed[tile]), rebuilt=False)
+            yield Observation(
+                tile=tile, points=pairs.current[tile], changed=bool(changed[tile]), rebuilt=False
+            )
 
 
 def _truth(walk: _Walk, after: Scene, scans: Sequence[SimulatedScan]) -> tuple[Bools, Bools]:
@@ -188,7 +190,7 @@ def _truth(walk: _Walk, after: Scene, scans: Sequence[SimulatedScan]) -> tuple[B
     return visible.of(indices), beside
 
 
-def _rebuilt(walk: _Walk) -> Iterator[Look]:
+def _rebuilt(walk: _Walk) -> Iterator[Observation]:
     """Fuse the same visit anew, a few scans registered again and changed at a few tiles (paper, Section 4.2).
 
     Tiles that come out as they were are left out: that pair every tile makes with itself.
@@ -206,7 +208,9 @@ def _rebuilt(walk: _Walk) -> Iterator[Look]:
         pairs = pair_tiles(tiles, merged_in_order(rebuilt).points, settings=settings.tiling)
         for tile in np.flatnonzero(pairs.observed).tolist():
             if not np.array_equal(pairs.current[tile], tiles.points[tile]):
-                yield Look(tile=tile, points=pairs.current[tile], changed=bool(injected[tile]), rebuilt=True)
+                yield Observation(
+                    tile=tile, points=pairs.current[tile], changed=bool(injected[tile]), rebuilt=True
+                )
 
 
 def _registered_again(
@@ -247,7 +251,7 @@ def _injected(
     return np.concatenate([points[~inside], (after + centre).astype(np.float32)])
 
 
-def _tile_set(matched: TilePairs, observations: Sequence[Look], settings: WalkSettings) -> TileSet:
+def _tile_set(matched: TilePairs, observations: Sequence[Observation], settings: WalkSettings) -> TileSet:
     """Keep the tiles that the second visit saw well, each about its centre."""
     tiles = matched.reference
     centres = tiles.grid.centers(tiles.indices)
@@ -259,7 +263,7 @@ def _tile_set(matched: TilePairs, observations: Sequence[Look], settings: WalkSe
     return TileSet(
         points_a=tuple(centred(points, tile) for tile, points in enumerate(tiles.points)),
         points_b=tuple(centred(points, tile) for tile, points in enumerate(matched.current)),
-        looks=tuple(replace(look, points=centred(look.points, look.tile)) for look in observations),
+        observations=tuple(replace(look, points=centred(look.points, look.tile)) for look in observations),
         centres=centres,
         buildings=np.zeros(len(centres), np.int32),
         tile_size=settings.tiling.tile_size,

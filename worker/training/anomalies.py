@@ -38,7 +38,7 @@ Operation = Callable[[Points, Change, Half, np.random.Generator], Changed]
 
 
 def add_object(points: Points, change: Change, half: Half, rng: np.random.Generator) -> Changed:
-    """(n, 3) -> (n + k, 3): the k points around a random one again, shifted and jittered, kept in the tile."""
+    """Add to (n, 3) the k points around a random one again, shifted and jittered, kept in the tile."""
     chosen = _cluster(points, change.density, rng)
     spread = rng.normal(scale=nuisance_sigma(change.magnitude), size=(len(chosen), 3))
     shifted = points[chosen] + _shift(change.magnitude, ADD_VERTICAL, rng) + spread
@@ -47,7 +47,7 @@ def add_object(points: Points, change: Change, half: Half, rng: np.random.Genera
 
 
 def remove_object(points: Points, change: Change, half: Half, rng: np.random.Generator) -> Changed:  # noqa: ARG001
-    """(n, 3) -> (n - k, 3): the k points around a random one are gone, but never below 64 points."""
+    """Remove from (n, 3) the k points around a random one, but leave 64 points."""
     chosen = _cluster(points, change.density, rng)
     chosen = chosen[: max(len(points) - MIN_RETAINED, 0)]
     kept = np.delete(points, chosen, axis=0)
@@ -55,7 +55,7 @@ def remove_object(points: Points, change: Change, half: Half, rng: np.random.Gen
 
 
 def move_object(points: Points, change: Change, half: Half, rng: np.random.Generator) -> Changed:
-    """(n, 3) -> (n, 3): the k points around a random one are shifted as one, kept in the tile."""
+    """Shift the k points of (n, 3) around a random one as one, kept in the tile."""
     chosen = _cluster(points, change.density, rng)
     moved = points.copy()
     shifted = points[chosen] + _shift(change.magnitude, MOVE_VERTICAL, rng)
@@ -67,7 +67,7 @@ OPERATIONS: dict[str, Operation] = {"add": add_object, "remove": remove_object, 
 
 
 def shown(before: Points, after: Changed, distance: float) -> int:
-    """How many points of a change lie farther than `distance` (metres) from every point of the other cloud.
+    """Return how many points of a change lie farther than `distance` (metres) from every point of the other cloud.
 
     A piece of floor doubled a little beside itself is floor as before: of such a change, nothing shows.
     """
@@ -75,7 +75,7 @@ def shown(before: Points, after: Changed, distance: float) -> int:
 
 
 def nuisance_sigma(magnitude: float) -> float:
-    """Metres; 0.001 + 0.05 m (paper, Sections 3.5.1 and 3.5.3)."""
+    """Return metres, 0.001 + 0.05 m (paper, Sections 3.5.1 and 3.5.3)."""
     return 0.001 + 0.05 * magnitude
 
 
@@ -86,7 +86,7 @@ def _far(points: Points, others: Points, distance: float) -> int:
 
 
 def _cluster(points: Points, density: float, rng: np.random.Generator) -> NDArray[np.intp]:
-    """Indices (k,) of the k = d N points nearest to a random one, nearest first."""
+    """Return indices (k,) of the k = d N points nearest to a random one, nearest first."""
     k = max(1, round(density * len(points)))
     centre = points[rng.integers(len(points))]
     distance = ((points - centre) ** 2).sum(axis=1)
@@ -94,7 +94,7 @@ def _cluster(points: Points, density: float, rng: np.random.Generator) -> NDArra
 
 
 def _shift(magnitude: float, vertical: float, rng: np.random.Generator) -> NDArray[np.float64]:
-    """(3,) metres: a random direction of the given length, then flattened."""
+    """Return (3,) metres: a random direction of the given length, then flattened."""
     direction = rng.normal(size=3)
     shift: NDArray[np.float64] = magnitude * direction / np.linalg.norm(direction)
     shift[2] *= vertical

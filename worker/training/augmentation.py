@@ -24,19 +24,19 @@ class Augmentation:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Nuisance:
-    """Differences of a second look (paper, Section 3.5.3), at full intensity.
+    """Differences of a second observation (paper, Section 3.5.3), at full intensity.
 
     The paper names no range for the yaw and the translation that both patches share; these are ours.
     """
 
     yaw: float = math.radians(15.0)  #: radians, either way, of both patches together
     shift: float = 0.05  #: metres, either way along each axis, of both patches together
-    dropout: tuple[float, float] = (0.10, 0.50)  #: share of the second look's points that are lost
+    dropout: tuple[float, float] = (0.10, 0.50)  #: share of the second observation's points that are lost
     magnitude: tuple[float, float] = (0.10, 0.50)  #: metres, m in the residual shift's sigma 0.001 + 0.05 m
 
 
 def augmented(patch: Points, settings: Augmentation, rng: np.random.Generator) -> Points:
-    """(N, 3) -> (N, 3): one branch with sensor noise, lost points and a residual of registration."""
+    """Augment one branch, (N, 3) -> (N, 3), with sensor noise, lost points and a residual of registration."""
     thinned = replenished(patch, settings, rng)
     noisy = (thinned + rng.normal(scale=settings.jitter, size=thinned.shape)).astype(np.float32)
     turned = rotated(noisy, rng.normal(scale=settings.yaw))
@@ -44,7 +44,7 @@ def augmented(patch: Points, settings: Augmentation, rng: np.random.Generator) -
 
 
 def replenished(patch: Points, settings: Augmentation, rng: np.random.Generator) -> Points:
-    """(N, 3) -> (N, 3): a share of the points lost, each replaced by its nearest neighbour's jittered copy."""
+    """Replace a share of the points (N, 3) by jittered copies of their nearest neighbours."""
     lost = rng.permutation(len(patch))[: round(settings.dropout * len(patch))]
     kept = np.delete(patch, lost, axis=0)
     if len(lost) == 0 or len(kept) == 0:
@@ -56,10 +56,10 @@ def replenished(patch: Points, settings: Augmentation, rng: np.random.Generator)
     return filled
 
 
-def second_look(
+def second_observation(
     reference: Points, current: Points, settings: Nuisance, intensity: float, rng: np.random.Generator
 ) -> tuple[Points, Points]:
-    """Both dense tiles turned and shifted alike; the current one thinned and a little off.
+    """Turn and shift both dense tiles alike; the current one is thinned and a little off.
 
     The current tile keeps 64 points at least.
     """
@@ -75,7 +75,7 @@ def second_look(
 
 
 def turned_alike(reference: Points, current: Points, rng: np.random.Generator) -> tuple[Points, Points]:
-    """Both patches under one of the eight symmetries of a square tile: a room has no preferred corner."""
+    """Put both patches under one of the eight symmetries of a square tile: a room has no preferred corner."""
     turns, mirror = rng.integers(4), rng.integers(2)
 
     def turned(points: Points) -> Points:
@@ -88,7 +88,7 @@ def turned_alike(reference: Points, current: Points, rng: np.random.Generator) -
 
 
 def rotated(points: Points, yaw: float) -> Points:
-    """(n, 3) about the vertical through the tile's centre, radians."""
+    """Return (n, 3) about the vertical through the tile's centre, radians."""
     c, s = np.cos(yaw), np.sin(yaw)
     R = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]], dtype=np.float32)
     return points @ R.T

@@ -8,12 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from worker.cloud.types import Points
+from worker.metrics import confusion, roc
 from worker.training.anomalies import OPERATIONS
 from worker.training.dataset import TileSet
 from worker.training.pairs import PairSettings, altered
 
-#: Share of changed tiles that the threshold is chosen for: of the simulated revisits 4% changed. The paper's experiments
-#: change 24 of 172, but nobody patrols a building of which a seventh changes between two rounds.
+#: Share of changed tiles that the threshold is chosen for: of the simulated revisits 4% changed. The paper's
+#: experiments change 24 of 172, but nobody patrols a building of which a seventh changes between two rounds.
 PREVALENCE = 0.05
 SWEEP = np.round(np.arange(0.02, 0.99, 0.01), 2)
 UNCHANGED, WHOLE = "unchanged", "whole"
@@ -36,14 +37,14 @@ class SurveyPairs:
         return np.array([kind != UNCHANGED for kind in self.kinds])
 
     @property
-    def told(self) -> NDArray[np.bool_]:
+    def decisive(self) -> NDArray[np.bool_]:
         """(P,) pairs that a threshold is chosen by: unchanged, and whole things where there are any."""
         kinds = np.array(self.kinds)
         return (kinds == UNCHANGED) | (kinds == WHOLE) if WHOLE in self.kinds else np.ones(len(kinds), bool)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Operating:
+class SurveyFigures:
     """How a threshold does; precision and F1 are for PREVALENCE, whatever the set's own share is."""
 
     threshold: float
@@ -55,7 +56,7 @@ class Operating:
 
 
 def survey_pairs(tiles: TileSet, settings: PairSettings, *, seed: int) -> SurveyPairs:
-    """Both ways round, every tile with two visits: unchanged and under each operation; and every look of another visit."""
+    """Pair both ways round every tile of two visits, unchanged and changed, and every observation of another visit."""
     rng = np.random.default_rng((seed, 3))
     half = (np.asarray(tiles.tile_size) / 2).astype(np.float32)
     reference: list[Points] = []
@@ -70,49 +71,45 @@ def survey_pairs(tiles: TileSet, settings: PairSettings, *, seed: int) -> Survey
                 reference.append(first)
                 current.append(altered(second, operation, settings, half, rng) if operation else second)
                 kinds.append(kind)
-    for look in tiles.looks:
-        if not look.rebuilt:
-            a = tiles.points_a[look.tile]
-            reference += [a, look.points]
-            current += [look.points, a]
-            kinds += 2 * [WHOLE if look.changed else UNCHANGED]
+    for observation in tiles.observations:
+        if not observation.rebuilt:
+            a = tiles.points_a[observation.tile]
+            reference += [a, observation.points]
+            current += [observation.points, a]
+            kinds += 2 * [WHOLE if observation.changed else UNCHANGED]
     return SurveyPairs(reference=tuple(reference), current=tuple(current), kinds=tuple(kinds))
 
 
-def best_threshold(scores: NDArray[np.float32], pairs: SurveyPairs) -> Operating:
-    """The threshold with the highest F1; the middle one of equals."""
-    found = [operating(float(threshold), scores, pairs) for threshold in SWEEP]
-    best = max(point.f1 for point in found)
-    equals = [point for point in found if point.f1 >= best - 1e-9]
+def best_threshold(scores: NDArray[np.float32], pairs: SurveyPairs) -> SurveyFigures:
+    """Return the threshold with the highest F1; the middle one of equals."""
+    every = [figures_at(float(threshold), scores, pairs) for threshold in SWEEP]
+    best = max(point.f1 for point in every)
+    equals = [point for point in every if point.f1 >= best - 1e-9]
     return equals[len(equals) // 2]
 
 
-def operating(threshold: float, scores: NDArray[np.float32], pairs: SurveyPairs) -> Operating:
-    """What `scores` (P,), the probability of change, reach above a threshold; recall is of the pairs it is chosen by."""
-    flagged, changed = scores > threshold, pairs.changed
-    recall = float(flagged[changed & pairs.told].mean())
-    false = float(flagged[~changed].mean())
-    hits, alarms = PREVALENCE * recall, (1 - PREVALENCE) * false
-    precision = hits / (hits + alarms) if hits + alarms > 0 else 0.0
-    kinds = np.array(pairs.kinds)
-    return Operating(
+def figures_at(threshold: float, scores: NDArray[np.float32], pairs: SurveyPairs) -> SurveyFigures:
+    """Return what `scores` (P,), the probability of change, reach above a threshold.
+
+    Recall is of the pairs that the threshold is chosen by.
+    """
+    kinds, changed = np.array(pairs.kinds), pairs.changed
+    counts = confusion(scores, changed, threshold, observed=pairs.decisive | ~changed)
+    precision, recall = counts.precision_at(PREVALENCE), counts.recall
+    return SurveyFigures(
         threshold=threshold,
         precision=precision,
         recall=recall,
         f1=2 * precision * recall / (precision + recall) if precision + recall > 0 else 0.0,
-        false_positive_rate=false,
+        false_positive_rate=counts.false_positive_rate,
         recall_by_kind={
-            kind: float(flagged[kinds == kind].mean())
+            kind: float((scores > threshold)[kinds == kind].mean())
             for kind in (*OPERATIONS, WHOLE)
             if (kinds == kind).any()
         },
     )
 
 
-def area_under_roc(scores: NDArray[np.float32], changed: NDArray[np.bool_]) -> float:
-    """Chance that a changed pair scores above an unchanged one (ties count half)."""
-    order = np.unique(scores, return_inverse=True)[1]
-    below = np.bincount(order[~changed], minlength=order.max() + 1)
-    lower = np.cumsum(below) - below
-    wins = (lower[order[changed]] + 0.5 * below[order[changed]]).sum()
-    return float(wins / (changed.sum() * (~changed).sum()))
+def area_under_roc(scores: NDArray[np.float32], pairs: SurveyPairs) -> float:
+    """Return the chance that a changed pair scores above an unchanged one; `pairs.decisive` alone count."""
+    return roc(scores[pairs.decisive], pairs.changed[pairs.decisive]).area

@@ -6,56 +6,58 @@ import copy
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
+from torch import nn
 
-from worker.detectors.spicd_net.network import PairHead, SpicdNetwork
+from worker.detectors.trainable import TrainableNetwork
+from worker.metrics import ClassFigures, class_figures
 from worker.progress import Progress, no_progress
 from worker.training.dataset import TileSet
 from worker.training.kept_pairs import Drawn, PairPool, keep_pairs
-from worker.training.log import HEAD_LOG, EpochRow, append_row, by_class
-from worker.training.losses import focal_loss
-from worker.training.metrics import Measured, measured
-from worker.training.schedule import Schedule
-from worker.training.settings import TrainSettings
+from worker.training.log import HEAD_LOG, EpochRow, append_row, row_of
+from worker.training.settings import Schedule, TrainSettings
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class HeadResult:
     """What came of it."""
 
-    measured: Measured
+    measured: ClassFigures
     best_epoch: int  #: 0 where no epoch was better than the head that it began with
     epochs: int
     seconds: float
 
 
 def train_head(
-    network: SpicdNetwork,
+    network: nn.Module,
     training: TileSet,
     validation: TileSet,
     settings: TrainSettings,
     out: Path,
     progress: Progress = no_progress,
 ) -> HeadResult:
-    """Train `network.head` in place for `settings.head_epochs`, and leave the best one; a log goes to the folder `out`.
+    """Train the network's head in place for `settings.head_epochs`, leave the best one, and log to the folder `out`.
 
-    Loss, rate and choice of the best are those of the whole training (paper, Sections 3.7 and 3.8); an epoch has as many pairs.
+    Loss, rate, choice of the best and pairs an epoch are those of the whole training (paper, Sections 3.7 and 3.8).
     """
     begun = time.monotonic()
     network.eval()
+    kind = settings.network
     pools = [
-        keep_pairs(network.encoder, tiles, settings.pairs, seed=settings.seed, progress=progress)
+        keep_pairs(kind, network, tiles, settings.pairs, seed=settings.seed, progress=progress)
         for tiles in (training, validation)
     ]
     held_out = pools[1].draw(settings.head_validation_pairs, np.random.default_rng((settings.seed, 6)))
-    run = _HeadRun(network.head, pools[0], held_out, settings)
+    head = kind.head(network)
+    run = _HeadRun(kind, head, pools[0], held_out, settings)
     (out / HEAD_LOG).unlink(missing_ok=True)
     for epoch in range(1, settings.head_epochs + 1):
         progress("train the head", epoch / settings.head_epochs)
         append_row(out, run.epoch(epoch, time.monotonic() - begun), HEAD_LOG)
-    network.head.load_state_dict(run.best)
+    head.load_state_dict(run.best)
     return HeadResult(
         measured=run.measured,
         best_epoch=run.best_epoch,
@@ -67,10 +69,23 @@ def train_head(
 class _HeadRun:
     """The state of one such training."""
 
-    def __init__(self, head: PairHead, pool: PairPool, held_out: Drawn, settings: TrainSettings) -> None:
+    def __init__(
+        self,
+        kind: TrainableNetwork[Any],
+        head: nn.Module,
+        pool: PairPool,
+        held_out: Drawn,
+        settings: TrainSettings,
+    ) -> None:
         torch.manual_seed(settings.seed)
         self._device = next(head.parameters()).device
-        self._head, self._pool, self._held_out, self._settings = head, pool, held_out, settings
+        self._kind, self._head, self._pool, self._held_out, self._settings = (
+            kind,
+            head,
+            pool,
+            held_out,
+            settings,
+        )
         self._schedule = Schedule(
             epochs=settings.head_epochs, start=settings.head_learning_rate, end=settings.final_learning_rate
         )
@@ -81,7 +96,7 @@ class _HeadRun:
         self.best, self.best_epoch = copy.deepcopy(head.state_dict()), 0
 
     def epoch(self, number: int, seconds: float) -> EpochRow:
-        """One pass over newly drawn pairs, and the same held-out ones."""
+        """Train on newly drawn pairs, and validate on the same held-out ones."""
         settings = self._settings
         rate = self._schedule.rate((number - 1) / settings.head_epochs)
         for group in self._optimizer.param_groups:
@@ -91,38 +106,35 @@ class _HeadRun:
         losses, hits = [], []
         for rows in torch.split(torch.arange(len(drawn.labels)), settings.head_batch):
             logits, labels = self._answers(drawn, rows)
-            loss = focal_loss(logits, labels)
+            loss = self._kind.class_loss(logits, labels)
             self._optimizer.zero_grad(set_to_none=True)
             loss.backward()  # type: ignore[no-untyped-call]
             self._optimizer.step()
             losses.append(loss.item())
             hits.append(float((logits.detach().argmax(dim=1) == labels).float().mean()))
-        found = self._validate()
-        if found.rank > self.measured.rank:
-            self.measured, self.best_epoch = found, number
+        figures = self._validate()
+        if figures.rank > self.measured.rank:
+            self.measured, self.best_epoch = figures, number
             self.best = copy.deepcopy(self._head.state_dict())
-        return EpochRow(
+        return row_of(
+            figures,
             epoch=number,
             seconds=round(seconds, 1),
             learning_rate=rate,
             train_loss=float(np.mean(losses)),
             train_accuracy=float(np.mean(hits)),
-            validation_loss=found.loss,
-            accuracy=found.accuracy,
-            **by_class("precision", found.precision),
-            **by_class("recall", found.recall),
         )
 
     @torch.no_grad()
-    def _validate(self) -> Measured:
+    def _validate(self) -> ClassFigures:
         self._head.eval()
         logits, labels = self._answers(self._held_out, torch.arange(len(self._held_out.labels)))
-        loss = float(focal_loss(logits, labels))
-        return measured(logits.softmax(dim=1).cpu().numpy(), labels.cpu().numpy(), loss)
+        loss = float(self._kind.class_loss(logits, labels))
+        return class_figures(logits.softmax(dim=1).cpu().numpy(), labels.cpu().numpy(), loss)
 
     def _answers(self, drawn: Drawn, rows: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         reference, current, statistics, labels = (
-            each[rows].to(self._device)
-            for each in (drawn.reference, drawn.current, drawn.statistics, drawn.labels)
+            part[rows].to(self._device)
+            for part in (drawn.reference, drawn.current, drawn.statistics, drawn.labels)
         )
         return self._head(reference, current, statistics), labels

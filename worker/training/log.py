@@ -6,6 +6,9 @@ import csv
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
+from worker.files import write_atomically
+from worker.metrics import ClassFigures
+
 LOG = "epochs.csv"
 HEAD_LOG = "head_epochs.csv"  #: of what the head was trained on its own
 
@@ -47,15 +50,19 @@ def cut_log(folder: Path, epochs: int) -> None:
         return
     with path.open(newline="") as file:
         rows = [row for row in csv.DictReader(file) if None not in row.values()]
-    partial = path.with_name(f"{LOG}.partial")
-    with partial.open("w", newline="") as file:
-        writer = csv.DictWriter(file, [field.name for field in fields(EpochRow)], extrasaction="ignore")
-        writer.writeheader()
-        writer.writerows(row for row in rows if int(row["epoch"]) <= epochs)
-    partial.replace(path)
+
+    def write(aside: Path) -> None:
+        with aside.open("w", newline="") as file:
+            writer = csv.DictWriter(file, [field.name for field in fields(EpochRow)], extrasaction="ignore")
+            writer.writeheader()
+            writer.writerows(row for row in rows if int(row["epoch"]) <= epochs)
+
+    write_atomically(path, write)
 
 
-def by_class(name: str, values: tuple[float, float, float]) -> dict[str, float]:
-    """The columns of a figure that every class has."""
+def row_of(figures: ClassFigures, **others: float) -> EpochRow:
+    """Return a row with the figures of the validation pairs."""
     classes = ("unchanged", "changed", "different")
-    return {f"{name}_{of}": value for of, value in zip(classes, values, strict=True)}
+    by_class = {f"precision_{name}": value for name, value in zip(classes, figures.precision, strict=True)}
+    by_class |= {f"recall_{name}": value for name, value in zip(classes, figures.recall, strict=True)}
+    return EpochRow(validation_loss=figures.loss, accuracy=figures.accuracy, **by_class, **others)  # type: ignore[arg-type]

@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from worker.cloud.patches import patch
 from worker.cloud.types import Points
+from worker.detectors.trainable import CHANGED, DIFFERENT, UNCHANGED, Pair
 from worker.training.anomalies import OPERATIONS, Change, Half, Operation, shown
-from worker.training.augmentation import Augmentation, Nuisance, augmented, second_look, turned_alike
-from worker.training.dataset import Look, TileSet
+from worker.training.augmentation import Augmentation, Nuisance, augmented, second_observation, turned_alike
+from worker.training.dataset import Observation, TileSet
 
-UNCHANGED, CHANGED, DIFFERENT = 0, 1, 2
 SAMPLE_POINTS = 128  #: of the Chamfer branch in the paper (Section 3.6.3)
 STORED_JITTER = 0.0001  #: metres, where the stored reference patch itself comes back
 
@@ -24,25 +24,19 @@ class PairSettings:
     """How pairs are made; the defaults are the paper's but for those that say so."""
 
     patch_points: int = 4096  #: points of a padded patch
-    chamfer_points: int | None = (
-        None  #: ours: the Chamfer branch compares all points of both patches; the paper's is 128 of each
-    )
+    #: Ours: the Chamfer branch compares all points of both patches; the paper's is 128 of each.
+    chamfer_points: int | None = None
     shares: tuple[float, float, float] = (0.50, 0.35, 0.15)  #: of the three classes
-    rerun_share: float = (
-        0.7  #: of unchanged pairs of one observation: sampled anew, the rest are stored patches
-    )
-    stored_still: bool = (
-        True  #: ours: a stored patch that comes back is not augmented either, nor a change of one
-    )
-    edited_share: float = (
-        0.65  #: ours: of changed pairs, those of whole things added, removed or moved, where there are any
-    )
-    rebuilt_share: float = (
-        0.35  #: ours: of changed pairs, those changed in some of the scans that the map is fused of
-    )
-    beside_share: float = (
-        0.5  #: ours: of unchanged pairs without a twin, those beside a change, where there are any
-    )
+    #: Of unchanged pairs of one observation: sampled anew, the rest are stored patches.
+    rerun_share: float = 0.7
+    #: Ours: a stored patch that comes back is not augmented either, nor a change of one.
+    stored_still: bool = True
+    #: Ours: of changed pairs, those of whole things added, removed or moved, where there are any.
+    edited_share: float = 0.65
+    #: Ours: of changed pairs, those changed in some of the scans that the map is fused of.
+    rebuilt_share: float = 0.35
+    #: Ours: of unchanged pairs that match no changed one, those beside a change, where there are any.
+    beside_share: float = 0.5
     revisit_share: float = 0.7  #: ours: pairs of both visits, where there are two; 0 is the paper's protocol
     revisit_intensity: float = 0.0  #: ours: of the nuisance on such pairs, which have an honest one
     changed_intensity: float = 0.5  #: of the nuisance on changed pairs
@@ -52,7 +46,8 @@ class PairSettings:
     shown_distance: float = 0.075  #: metres; with `min_shown` what the simulator's truth calls a change
     min_separation: float = 3.0  #: metres between different tiles of one building
     symmetries: bool = True  #: ours: both patches under one of the square's eight symmetries
-    twins: bool = True  #: ours: a changed pair comes with an unchanged one of the same tile and looks
+    #: Ours: a changed pair comes with an unchanged one of the same tile and observations.
+    matched_pairs: bool = True
     augmentation: Augmentation = field(default_factory=Augmentation)
     nuisance: Nuisance = field(default_factory=Nuisance)
 
@@ -67,40 +62,19 @@ PAPER_PAIRS = PairSettings(
     revisit_share=0.0,
     min_shown=0,
     symmetries=False,
-    twins=False,
+    matched_pairs=False,
 )
 
 
-@dataclass(frozen=True, slots=True)
-class Pair:
-    """One example."""
-
-    reference: Points  #: (n, 3) float32, metres, tile-centre frame: a patch's distinct points
-    current: Points  #: (m, 3)
-    label: int  #: 0 unchanged, 1 changed, 2 different place
-
-
-@dataclass(frozen=True, slots=True)
-class Batch:
-    """B examples as the network takes them."""
-
-    points: Points  #: (P, 3) float32: 2 B clouds end to end, references first, each with its centroid at 0
-    sizes: list[int]  #: of the clouds
-    chamfer_points: Points  #: (Q, 3) in the same order, tile-centre frame: what the Chamfer branch compares
-    chamfer_sizes: list[int]
-    labels: NDArray[np.int64]  #: (B,)
-
-
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Looks:
-    """Two dense looks at one tile, (n, 3) each, between which nothing changed, and two between which something did."""
+class Observations:
+    """Two dense observations of one tile, (n, 3) each, with nothing changed in between, and two with a change."""
 
     unchanged: tuple[Points, Points]
     changed: tuple[Points, Points] | None = None  #: None: a synthetic change is due
     revisit: bool = False  #: of two visits, not one tile twice
-    still: bool = (
-        False  #: of the very same scans, so that nothing differs but the change: no nuisance, no noise
-    )
+    #: Of the very same scans, so that nothing differs but the change: no nuisance, no noise.
+    still: bool = False
 
 
 class PairMaker:
@@ -113,63 +87,67 @@ class PairMaker:
         self._settings = settings
         self._half = (np.asarray(tiles.tile_size) / 2).astype(np.float32)
         self._edited, self._rebuilt, self._beside, self._untouched = (
-            [look for look in tiles.looks if (look.changed, look.rebuilt) == kind]
+            [
+                observation
+                for observation in tiles.observations
+                if (observation.changed, observation.rebuilt) == kind
+            ]
             for kind in ((True, False), (True, True), (False, False), (False, True))
         )
 
-    def batches(self, count: int, size: int, rng: np.random.Generator) -> Iterator[Batch]:
-        """`count` pairs in the classes' exact shares, `size` at a time; a last few are left out.
+    def batches(self, count: int, size: int, rng: np.random.Generator) -> Iterator[list[Pair]]:
+        """Draw `count` pairs in the classes' exact shares, `size` at a time; a last few are left out.
 
-        With `twins` each changed pair comes with an unchanged one of the same tile and looks, so that nothing but
-        the change tells them apart.
+        With `matched_pairs` each changed pair comes with an unchanged one of the same tile and observations, so that
+        nothing but the change tells them apart.
         """
         ready: list[Pair] = []
-        groups = composition(count, self._settings.shares, twins=self._settings.twins)
+        groups = composition(count, self._settings.shares, matched_pairs=self._settings.matched_pairs)
         for place in rng.permutation(len(groups)):
-            looks = self._looks(groups[place], rng)
-            ready += [self.pair(label, rng, looks) for label in groups[place]]
+            observations = self._observations(groups[place], rng)
+            ready += [self.pair(label, rng, observations) for label in groups[place]]
             if len(ready) >= size:
-                yield self._batched(ready[:size], rng)
+                yield ready[:size]
                 ready = ready[size:]
 
-    def pair(self, label: int, rng: np.random.Generator, looks: Looks | None = None) -> Pair:
-        """One example of a class, of the given looks where the class is of one tile."""
-        looks = looks or self._looks((label,), rng)
+    def pair(self, label: int, rng: np.random.Generator, observations: Observations | None = None) -> Pair:
+        """Draw one example of a class, of the given observations where the class is of one tile."""
+        observations = observations or self._observations((label,), rng)
         settings = self._settings
         if label == DIFFERENT:
             reference, current = self._different(rng)
         elif label == CHANGED:
-            reference, current = self._changed(looks, rng)
+            reference, current = self._changed(observations, rng)
         else:
-            reference, current = self._unchanged(looks, rng)
+            reference, current = self._unchanged(observations, rng)
         if settings.symmetries:
             reference, current = turned_alike(reference, current, rng)
-        if label == DIFFERENT or not (looks.still and settings.stored_still):
+        if label == DIFFERENT or not (observations.still and settings.stored_still):
             reference = augmented(reference, settings.augmentation, rng)
             current = augmented(current, settings.augmentation, rng)
         return Pair(reference, current, label)
 
-    def _unchanged(self, looks: Looks, rng: np.random.Generator) -> tuple[Points, Points]:
-        if looks.still and self._settings.stored_still:
-            return self._sampled(*looks.unchanged, 0.0, rng)
-        if looks.still:
-            stored = self._patch(looks.unchanged[0], rng)
+    def _unchanged(self, observations: Observations, rng: np.random.Generator) -> tuple[Points, Points]:
+        if observations.still and self._settings.stored_still:
+            return self._sampled(*observations.unchanged, 0.0, rng)
+        if observations.still:
+            stored = self._patch(observations.unchanged[0], rng)
             return stored, _stored_again(stored, rng)
-        intensity = self._settings.revisit_intensity if looks.revisit else 1.0
-        return self._sampled(*looks.unchanged, intensity, rng)
+        intensity = self._settings.revisit_intensity if observations.revisit else 1.0
+        return self._sampled(*observations.unchanged, intensity, rng)
 
-    def _changed(self, looks: Looks, rng: np.random.Generator) -> tuple[Points, Points]:
+    def _changed(self, observations: Observations, rng: np.random.Generator) -> tuple[Points, Points]:
         settings = self._settings
-        intensity = settings.revisit_intensity if looks.revisit else settings.changed_intensity
-        if looks.still and settings.stored_still:
+        intensity = settings.revisit_intensity if observations.revisit else settings.changed_intensity
+        if observations.still and settings.stored_still:
             intensity = 0.0
-        if looks.changed is not None:
-            return self._sampled(*looks.changed, intensity, rng)
-        first, second = looks.unchanged
+        if observations.changed is not None:
+            return self._sampled(*observations.changed, intensity, rng)
+        first, second = observations.unchanged
         return self._sampled(first, changed(second, settings, self._half, rng), intensity, rng)
 
     def _different(self, rng: np.random.Generator) -> tuple[Points, Points]:
-        """Tiles of two buildings, or at least `min_separation` apart in one. Raises ValueError where no two are."""
+        """Draw tiles of two buildings, or `min_separation` apart in one. Raises ValueError where no two are."""
         points = self._tiles.points_a
         i = int(rng.integers(len(points)))
         others = self._apart(i)
@@ -182,13 +160,13 @@ class PairMaker:
         return self._patch(points[i], rng), self._patch(points[int(rng.choice(others))], rng)
 
     def _apart(self, i: int) -> NDArray[np.intp]:
-        """The tiles that are no part of tile i's surroundings."""
+        """Return the tiles that are no part of tile i's surroundings."""
         tiles = self._tiles
         away = np.linalg.norm(tiles.centres - tiles.centres[i], axis=1) >= self._settings.min_separation
         return np.flatnonzero(away | (tiles.buildings != tiles.buildings[i]))
 
-    def _looks(self, labels: tuple[int, ...], rng: np.random.Generator) -> Looks:
-        """At a random tile, for pairs of these labels; visits in either order."""
+    def _observations(self, labels: tuple[int, ...], rng: np.random.Generator) -> Observations:
+        """Draw a tile for pairs of these labels; visits in either order."""
         settings, draw = self._settings, rng.random()
         if CHANGED in labels:
             if draw < settings.edited_share and self._edited:
@@ -197,75 +175,58 @@ class PairMaker:
                 settings.edited_share <= draw < settings.edited_share + settings.rebuilt_share
                 and self._rebuilt
             ):
-                return self._rebuilt_looks(rng)
+                return self._rebuilt_observations(rng)
         elif UNCHANGED in labels and draw < settings.beside_share and self._beside:
             return self._revisited(self._beside[int(rng.integers(len(self._beside)))], rng)
-        return self._two_looks(rng)
+        return self._two_observations(rng)
 
-    def _two_looks(self, rng: np.random.Generator) -> Looks:
+    def _two_observations(self, rng: np.random.Generator) -> Observations:
         tiles, settings = self._tiles, self._settings
         i = int(rng.integers(len(tiles)))
         a, b = tiles.points_a[i], tiles.points_b[i]
         if len(b) == 0 or rng.random() >= settings.revisit_share:
             still = rng.random() >= settings.rerun_share
-            return Looks(unchanged=(a, _stored_again(a, rng) if still else a), still=still)
-        return Looks(unchanged=(a, b) if rng.random() < 0.5 else (b, a), revisit=True)
+            return Observations(unchanged=(a, _stored_again(a, rng) if still else a), still=still)
+        return Observations(unchanged=(a, b) if rng.random() < 0.5 else (b, a), revisit=True)
 
-    def _revisited(self, look: Look, rng: np.random.Generator) -> Looks:
-        """The look beside the first visit's, and in a changed pair's twin the second visit's."""
-        a, b = self._tiles.points_a[look.tile], self._tiles.points_b[look.tile]
+    def _revisited(self, observation: Observation, rng: np.random.Generator) -> Observations:
+        """Pair the observation with the first visit's; the unchanged pair that matches is of both honest visits."""
+        a, b = self._tiles.points_a[observation.tile], self._tiles.points_b[observation.tile]
         forth = rng.random() < 0.5
-        found = (a, look.points) if forth else (look.points, a)
-        if not look.changed:
-            return Looks(unchanged=found, revisit=True)
-        return Looks(unchanged=(a, b) if forth else (b, a), changed=found, revisit=True)
+        both = (a, observation.points) if forth else (observation.points, a)
+        if not observation.changed:
+            return Observations(unchanged=both, revisit=True)
+        return Observations(unchanged=(a, b) if forth else (b, a), changed=both, revisit=True)
 
-    def _rebuilt_looks(self, rng: np.random.Generator) -> Looks:
-        """A rebuilt map against the map: a tile that a synthetic change was made in, and one that none was."""
+    def _rebuilt_observations(self, rng: np.random.Generator) -> Observations:
+        """Pair a rebuilt map with the map: a tile that a synthetic change was made in, and one that none was."""
         changed = self._rebuilt[int(rng.integers(len(self._rebuilt)))]
         pair = (self._tiles.points_a[changed.tile], changed.points)
         if not self._untouched:
-            return Looks(unchanged=(pair[0], pair[0]), changed=pair, still=True)
+            return Observations(unchanged=(pair[0], pair[0]), changed=pair, still=True)
         other = self._untouched[int(rng.integers(len(self._untouched)))]
-        return Looks(unchanged=(self._tiles.points_a[other.tile], other.points), changed=pair, still=True)
+        return Observations(
+            unchanged=(self._tiles.points_a[other.tile], other.points), changed=pair, still=True
+        )
 
     def _sampled(
         self, first: Points, second: Points, intensity: float, rng: np.random.Generator
     ) -> tuple[Points, Points]:
-        reference, current = second_look(first, second, self._settings.nuisance, intensity, rng)
+        reference, current = second_observation(first, second, self._settings.nuisance, intensity, rng)
         return self._patch(reference, rng), self._patch(current, rng)
 
     def _patch(self, points: Points, rng: np.random.Generator) -> Points:
-        """The distinct points of a patch: what repeats would add, a max-pool does not see."""
+        """Return the distinct points of a patch: what repeats would add, a max-pool does not see."""
         return patch(points, size=self._settings.patch_points, seed=int(rng.integers(2**31))).distinct
-
-    def _batched(self, pairs: list[Pair], rng: np.random.Generator) -> Batch:
-        """References before currents, every cloud about its centroid."""
-        clouds = [pair.reference for pair in pairs] + [pair.current for pair in pairs]
-        compared = [self._compared(cloud, rng) for cloud in clouds]
-        return Batch(
-            np.concatenate([cloud - cloud.mean(axis=0) for cloud in clouds]),
-            [len(cloud) for cloud in clouds],
-            np.concatenate(compared),
-            [len(cloud) for cloud in compared],
-            np.array([pair.label for pair in pairs], dtype=np.int64),
-        )
-
-    def _compared(self, distinct: Points, rng: np.random.Generator) -> Points:
-        """All points, or so many of the padded patch without replacement, drawn anew each time (paper, Section 3.6.3)."""
-        count = self._settings.chamfer_points
-        if count is None:
-            return distinct
-        return distinct[rng.choice(self._settings.patch_points, count, replace=False) % len(distinct)]
 
 
 def _stored_again(points: Points, rng: np.random.Generator) -> Points:
-    """(n, 3) a stored patch as it comes from the disk (paper, Section 3.5.3)."""
+    """Return (n, 3) a stored patch as it comes from the disk (paper, Section 3.5.3)."""
     return (points + rng.normal(scale=STORED_JITTER, size=points.shape)).astype(np.float32)
 
 
 def changed(points: Points, settings: PairSettings, half: Half, rng: np.random.Generator) -> Points:
-    """(n, 3) -> (m, 3): the tile under one of the operations, each as likely.
+    """Change a tile (n, 3) by one of the operations, each as likely.
 
     A change of which too little shows is drawn again, a dozen times at most: a tile may have no place for one.
     """
@@ -276,7 +237,7 @@ def changed(points: Points, settings: PairSettings, half: Half, rng: np.random.G
 def altered(
     points: Points, operation: Operation, settings: PairSettings, half: Half, rng: np.random.Generator
 ) -> Points:
-    """As `changed`, under the given operation."""
+    """Change a tile as `changed` does, by the given operation."""
     for _ in range(12):
         change = Change(magnitude=rng.uniform(*settings.magnitude), density=rng.uniform(*settings.density))
         result = operation(points, change, half, rng)
@@ -286,12 +247,12 @@ def altered(
 
 
 def composition(
-    count: int, shares: tuple[float, float, float], *, twins: bool = True
+    count: int, shares: tuple[float, float, float], *, matched_pairs: bool = True
 ) -> list[tuple[int, ...]]:
-    """`count` labels in exact shares, as groups of one tile each; what rounding leaves is unchanged."""
+    """Return `count` labels in exact shares, as groups of one tile each; what rounding leaves is unchanged."""
     changed_count, different = (round(count * share) for share in shares[1:])
     unchanged = count - changed_count - different
-    both = min(unchanged, changed_count) if twins else 0
+    both = min(unchanged, changed_count) if matched_pairs else 0
     return [
         *[(UNCHANGED, CHANGED)] * both,
         *[(UNCHANGED,)] * (unchanged - both),

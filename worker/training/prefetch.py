@@ -2,53 +2,26 @@
 
 from __future__ import annotations
 
-import queue
-import threading
+from collections import deque
 from collections.abc import Iterable, Iterator
-from typing import TypeVar
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, TypeVar
 
 T = TypeVar("T")
-_END = object()
+_END: Any = object()
 
 
 def prefetched(items: Iterable[T], ahead: int = 4) -> Iterator[T]:
-    """The same items in the same order, made by one thread up to `ahead` in advance.
+    """Yield the same items in the same order, made by one thread up to `ahead` in advance.
 
     An exception in the making is raised here. Leaving the loop early ends the thread.
     """
-    ready: queue.Queue[object] = queue.Queue(maxsize=ahead)
-    stopped = threading.Event()
-
-    def offer(item: object) -> None:
-        while not stopped.is_set():
-            try:
-                ready.put(item, timeout=0.1)
-            except queue.Full:
-                continue
-            return
-
-    def make() -> None:
-        try:
-            for item in items:
-                offer(item)
-                if stopped.is_set():
-                    return
-            offer(_END)
-        except BaseException as failure:
-            offer(_Failure(failure))
-
-    maker = threading.Thread(target=make, name="prefetch", daemon=True)
-    maker.start()
+    source = iter(items)
+    maker = ThreadPoolExecutor(1, thread_name_prefix="prefetch")
+    waiting = deque(maker.submit(next, source, _END) for _ in range(ahead))
     try:
-        while (item := ready.get()) is not _END:
-            if isinstance(item, _Failure):
-                raise item.cause
-            yield item  # type: ignore[misc]
+        while (item := waiting.popleft().result()) is not _END:
+            waiting.append(maker.submit(next, source, _END))
+            yield item
     finally:
-        stopped.set()
-        maker.join()
-
-
-class _Failure:
-    def __init__(self, cause: BaseException) -> None:
-        self.cause = cause
+        maker.shutdown(cancel_futures=True)

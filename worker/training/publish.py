@@ -19,21 +19,23 @@ import torch
 from numpy.typing import NDArray
 
 from worker.cloud.tiling import TileGrid, TilePairs, Tiles
-from worker.cloud.types import Points
+from worker.cloud.types import Arrays
 from worker.detectors.card import MODEL_STORE, Card, Preprocessing
-from worker.detectors.spicd_net.detector import SpicdNet
-from worker.detectors.store import WEIGHTS, write_model
+from worker.detectors.comparison import Comparison
+from worker.detectors.detector import Detector
+from worker.detectors.store import DETECTORS, WEIGHTS, weights_of, write_model
 from worker.training.calibration import (
     PREVALENCE,
     SurveyPairs,
     area_under_roc,
     best_threshold,
-    operating,
+    figures_at,
     survey_pairs,
 )
 from worker.training.dataset import TileSet, load_tiles, split_tiles
 from worker.training.log import LOG
 from worker.training.pairs import PairSettings
+from worker.training.settings import detector_settings, whole
 
 VOXEL_SIZE, MIN_POINTS = 0.05, 512  #: paper, Table 3; the training tiles are made with the same
 
@@ -48,6 +50,27 @@ DEVIATIONS = (
 )
 PAPER_DENSITY = (0.075, 0.075)
 
+#: By the setting that says whether.
+OURS = {
+    "revisit_share": "revisit_share of the pairs are two independent visits, not one tile sampled twice",
+    "edited_share": (
+        "edited_share of the changed pairs are visits after whole things were added, removed and moved"
+    ),
+    "rebuilt_share": (
+        "rebuilt_share of the changed pairs were changed in some of the scans that the map is fused of"
+    ),
+    "chamfer_points": "the Chamfer statistics are of all points of both patches, not of 128 of each",
+    "stored_still": "a stored patch that comes back is not augmented, nor a change of one",
+    "matched_pairs": "a changed pair comes with an unchanged one of the same tile",
+    "min_shown": "changes that hardly show are drawn again",
+    "symmetries": "pairs are turned by the square's symmetries",
+    "density": "change density is the range given in settings",
+    "initialize_head": (
+        "the head's first layers are initialised from data, so that the Chamfer statistics are heard from the start"
+    ),
+    "head_epochs": "after the last epoch the head was trained on alone, on descriptors computed once",
+}
+
 
 def publish(
     checkpoint: Path,
@@ -58,62 +81,56 @@ def publish(
     version: str = "1",
     summary: str,
     command: str = "",
-    name: str = "spicd-net",
+    name: str | None = None,
     about: Mapping[str, Any] | None = None,
-    beside: Mapping[str, SpicdNet] | None = None,
+    beside: Mapping[str, Detector] | None = None,
     base: str | None = None,
     preprocessing: Preprocessing | None = None,
 ) -> Path:
     """Write `model_store/<name>/<version>/`, its threshold chosen on the validation tiles; returns the folder.
 
-    `unseen` is a training set of other buildings, on which the card's evaluation is measured; without one
-    the validation tiles serve for that too, and the card says so. `about` adds to what the card says of the
-    training; `beside` are other detectors by name, measured on the validation pairs at their own thresholds.
-    `base` names the one of them that was trained further: where that ranks the validation pairs no worse, its weights are published, with the
-    threshold that is best here. `preprocessing` is the paper's where it is left out.
-    The training's log, where it lies beside the checkpoint, comes along.
+    `name` is the detector's where it is left out. `unseen` is a training set of other buildings, on which the card's
+    evaluation is measured; without one the validation tiles serve for that too, and the card says so. `about` adds to
+    what the card says of the training; `beside` are other detectors by name, measured on the validation pairs at their
+    own thresholds. `base` names the one of them that was trained further: where that ranks the validation pairs no
+    worse, its weights are published, with the threshold that is best here. `preprocessing` is the paper's where it is
+    left out. The training's log, where it lies beside the checkpoint, comes along.
     """
     state = torch.load(checkpoint, map_location="cpu", weights_only=True)
-    settings, training_set = state["settings"], load_tiles(tiles)
-    validation = split_tiles(training_set, share=settings["held_out"])[1]
+    state["settings"] = settings = whole(state["settings"])
+    training_set = load_tiles(tiles)
     card = Card(
-        name=name,
+        name=name or settings["detector"],
         version=version,
-        detector="spicd-net",
+        detector=settings["detector"],
         summary=summary,
         threshold=0.5,
         preprocessing=preprocessing
-        or Preprocessing(
-            voxel_size=VOXEL_SIZE,
-            tile_size=training_set.tile_size,
-            patch_points=settings["pairs"]["patch_points"],
-            chamfer_points=settings["pairs"]["chamfer_points"],
-            min_points=MIN_POINTS,
-            seed=settings["seed"],
-        ),
+        or Preprocessing(voxel_size=VOXEL_SIZE, tile_size=training_set.tile_size, min_points=MIN_POINTS),
+        detector_settings=detector_settings(settings),
         weights=WEIGHTS,
         training={**_training(state, training_set, command), **(about or {})},
         licence="MIT",
         sources=("method: AI 2026, 7(4), 141, https://doi.org/10.3390/ai7040141",),
     )
-    detector = SpicdNet.load(card, state["network"], torch.device("cpu"))
-    pair_settings = _pair_settings(settings)
-    pairs = survey_pairs(validation, pair_settings, seed=settings["seed"])
-    network, scores = state["network"], change_scores(detector, pairs)
+    pairs = _pairs(split_tiles(training_set, share=settings["held_out"])[1], settings)
+    detector, network = _detector(card, state["network"]), state["network"]
+    scores = change_scores(detector, pairs)
     others = {other: change_scores(one, pairs) for other, one in (beside or {}).items()}
-    if beside and base in others and _area(others[base], pairs) >= _area(scores, pairs):
+    if beside and base in others and area_under_roc(others[base], pairs) >= area_under_roc(scores, pairs):
         kept = {
             "kept": f"the weights of {base}: the training ranked the validation pairs no better",
-            "trained": _area(scores, pairs),
+            "trained": area_under_roc(scores, pairs),
         }
         card = card.model_copy(update={"training": {**card.training, **kept}})
-        detector, network, scores = beside[base], beside[base].weights(), others[base]
+        detector, scores = beside[base], others[base]
+        network = weights_of(detector)
     chosen = best_threshold(scores, pairs)
     evaluation: dict[str, Any] = {"validation": _measured(chosen.threshold, scores, pairs)}
-    for other, found in others.items():
-        evaluation[other] = _measured((beside or {})[other].card.threshold, found, pairs)
+    for other, its_scores in others.items():
+        evaluation[other] = _measured((beside or {})[other].card.threshold, its_scores, pairs)
     if unseen is not None:
-        unknown = survey_pairs(load_tiles(unseen), pair_settings, seed=settings["seed"])
+        unknown = _pairs(load_tiles(unseen), settings)
         evaluation["unseen buildings"] = _measured(
             chosen.threshold, change_scores(detector, unknown), unknown
         )
@@ -123,7 +140,7 @@ def publish(
         f"for {PREVALENCE:.0%} changed tiles; threshold of the highest F1 on the validation tiles"
     )
     folder = write_model(
-        model_store / name / version,
+        model_store / card.name / version,
         card.model_copy(update={"threshold": chosen.threshold, "evaluation": evaluation}),
         network,
     )
@@ -131,38 +148,40 @@ def publish(
     return folder
 
 
-def change_scores(detector: SpicdNet, pairs: SurveyPairs) -> NDArray[np.float32]:
-    """(P,) probability of change, by the path that a survey takes; a reference that comes again is described once."""
+def change_scores(detector: Detector, pairs: SurveyPairs) -> NDArray[np.float32]:
+    """Return the probability of change of each pair (P,), by the path that a survey takes.
+
+    Each pair is a map of one tile and a survey of it; a reference that comes again is encoded once.
+    """
     size = np.array(detector.card.preprocessing.tile_size)
     grid = TileGrid(origin=-size / 2, size=size, shape=(1, 1, 1))  # its one tile is centred at the origin
-
-    def tiles(points: tuple[Points, ...]) -> Tiles:
-        return Tiles(grid=grid, indices=np.zeros((len(points), 3), np.int32), points=points)
-
-    place: dict[int, int] = {}
-    rows = np.array([place.setdefault(id(points), len(place)) for points in pairs.reference], np.int64)
-    firsts = np.unique(rows, return_index=True)[1]
-    known = detector.describe(tiles(tuple(pairs.reference[first] for first in firsts)))
-    return detector.score(
-        TilePairs(
-            reference=tiles(pairs.reference),
-            current=pairs.current,
-            observed=np.ones(len(rows), dtype=np.bool_),
-        ),
-        description={name: values[rows] for name, values in known.items()},
-    ).change
+    embeddings: dict[int, Arrays] = {}
+    scores = []
+    for reference, current in zip(pairs.reference, pairs.current, strict=True):
+        tiles = Tiles(grid=grid, indices=np.zeros((1, 3), np.int32), points=(reference,))
+        comparison = Comparison.of_tiles(
+            TilePairs(reference=tiles, current=(current,), observed=np.ones(1, np.bool_))
+        )
+        if id(reference) not in embeddings:
+            embeddings[id(reference)] = detector.encode_reference(comparison.reference, tiles)
+        scores.append(detector.detect(comparison, embedding=embeddings[id(reference)]).change)
+    return np.concatenate(scores)
 
 
-def _area(scores: NDArray[np.float32], pairs: SurveyPairs) -> float:
-    """Under ROC, over the pairs that the threshold is chosen by."""
-    return area_under_roc(scores[pairs.told], pairs.changed[pairs.told])
+def _detector(card: Card, weights: dict[str, torch.Tensor]) -> Detector:
+    return DETECTORS[card.detector].load(card, weights, torch.device("cpu"))
+
+
+def _pairs(tiles: TileSet, settings: dict[str, Any]) -> SurveyPairs:
+    kept = {name: value for name, value in settings["pairs"].items() if name in KEPT}
+    return survey_pairs(tiles, PairSettings(**kept), seed=settings["seed"])
 
 
 def _measured(threshold: float, scores: NDArray[np.float32], pairs: SurveyPairs) -> dict[str, Any]:
     return {
         "pairs": len(pairs.kinds),
-        "area_under_roc": _area(scores, pairs),
-        **asdict(operating(threshold, scores, pairs)),
+        "area_under_roc": area_under_roc(scores, pairs),
+        **asdict(figures_at(threshold, scores, pairs)),
     }
 
 
@@ -184,46 +203,19 @@ def _training(state: dict[str, Any], tiles: TileSet, command: str) -> dict[str, 
 
 
 def deviations(settings: dict[str, Any]) -> list[str]:
-    """Where a training with these settings departs from the paper, in words. An older checkpoint has ours."""
+    """Return where a training with these settings, as `whole` returns them, departs from the paper, in words."""
     pairs = settings["pairs"]
     ours = {
-        "revisit_share of the pairs are two independent visits, not one tile sampled twice": pairs[
-            "revisit_share"
-        ]
-        > 0,
-        "edited_share of the changed pairs are visits after whole things were added, removed and moved": (
-            pairs.get("edited_share", 0.0) > 0
-        ),
-        "rebuilt_share of the changed pairs were changed in some of the scans that the map is fused of": (
-            pairs.get("rebuilt_share", 0.0) > 0
-        ),
-        "the Chamfer statistics are of all points of both patches, not of 128 of each": (
-            pairs.get("chamfer_points", 128) is None
-        ),
-        "a stored patch that comes back is not augmented, nor a change of one": pairs.get(
-            "stored_still", False
-        ),
-        "a changed pair comes with an unchanged one of the same tile": pairs.get("twins", True),
-        "changes that hardly show are drawn again": pairs["min_shown"] > 0,
-        "pairs are turned by the square's symmetries": pairs["symmetries"],
-        "change density is the range given in settings": tuple(pairs["density"]) != PAPER_DENSITY,
-        "the head's first layers are initialised from data, so that the Chamfer statistics are heard from the start": (
-            settings.get("settle_head", True)
-        ),
-        "after the last epoch the head was trained on alone, on descriptors computed once": (
-            settings.get("head_epochs", 0) > 0
-        ),
+        **settings,
+        **pairs,
+        "chamfer_points": pairs["chamfer_points"] is None,
+        "density": tuple(pairs["density"]) != PAPER_DENSITY,
     }
-    return [*DEVIATIONS, *(words for words, true in ours.items() if true)]
-
-
-def _pair_settings(settings: dict[str, Any]) -> PairSettings:
-    kept = {name: value for name, value in settings["pairs"].items() if name in KEPT}
-    return PairSettings(**kept)
+    return [*DEVIATIONS, *(words for name, words in OURS.items() if ours[name])]
 
 
 def _take_log(log: Path, place: Path) -> None:
-    """None rather than that of an earlier training."""
+    """Copy the log; without one, take away that of an earlier training."""
     if log.exists():
         shutil.copyfile(log, place)
     else:
@@ -236,21 +228,11 @@ def main() -> None:
     parser.add_argument("checkpoint", type=Path)
     parser.add_argument("tiles", type=Path, help="the training set that it was made with")
     parser.add_argument("--unseen", type=Path, help="tiles of other buildings, to measure on")
-    parser.add_argument("--store", type=Path, default=MODEL_STORE)
+    parser.add_argument("--store", type=Path, default=MODEL_STORE, dest="model_store")
     parser.add_argument("--version", default="1")
     parser.add_argument("--summary", default="SPICD-Net as the paper describes it")
     parser.add_argument("--command", default="", help="how the training was started, for the card")
-    given = parser.parse_args()
-    folder = publish(
-        given.checkpoint,
-        given.tiles,
-        given.store,
-        unseen=given.unseen,
-        version=given.version,
-        summary=given.summary,
-        command=given.command,
-    )
-    sys.stdout.write(f"{folder}\n")
+    sys.stdout.write(f"{publish(**vars(parser.parse_args()))}\n")
 
 
 if __name__ == "__main__":

@@ -1,10 +1,11 @@
-"""Trains SPICD-Net (paper, Section 3.8) and can be stopped and taken up again."""
+"""Trains a network on pairs of tiles (paper, Section 3.8) and can be stopped and taken up again."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,20 +13,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from worker.detectors.spicd_net.chamfer import chamfer_statistics
-from worker.detectors.spicd_net.layers import PooledLinear
-from worker.detectors.spicd_net.network import PairOutput, SpicdNetwork
+from worker.detectors.trainable import Labelled
+from worker.files import write_atomically
+from worker.metrics import ClassFigures, class_figures
 from worker.progress import Progress, no_progress
 from worker.training.dataset import TileSet, load_tiles, split_tiles
 from worker.training.head import train_head
-from worker.training.log import EpochRow, append_row, by_class, cut_log
-from worker.training.losses import total_loss
-from worker.training.metrics import Measured, measured
-from worker.training.pairs import DIFFERENT, Batch, PairMaker
+from worker.training.log import EpochRow, append_row, cut_log, row_of
+from worker.training.pairs import PairMaker
 from worker.training.prefetch import prefetched
 from worker.training.settings import TrainSettings, whole
 
-SETTLING_PAIRS = 128  #: that the head is initialised by
+INITIALIZATION_PAIRS = 128  #: that the head is initialised by
 CHECKPOINT, BEST = "last.pt", "best.pt"
 
 
@@ -75,10 +74,8 @@ class Run:
         self._settings = settings
         self._out = out
         self._device = torch.device(settings.device)
-        self._network = SpicdNetwork().to(self._device)
-        for module in self._network.modules():
-            if isinstance(module, PooledLinear):
-                module.coarse_search = settings.coarse_search
+        self._kind = settings.network
+        self._network = self._kind.build(coarse_search=settings.coarse_search).to(self._device)
         self._optimizer = torch.optim.Adam(
             self._network.parameters(),
             lr=settings.learning_rate,
@@ -88,12 +85,12 @@ class Run:
         self._makers = PairMaker(training, settings.pairs), PairMaker(validation, settings.pairs)
         if start is None and settings.start_from is not None:
             start = torch.load(settings.start_from, map_location=self._device, weights_only=True)["network"]
-        if start is not None and settings.fresh_head:
-            self._network.encoder.load_state_dict(_encoder(start))
-        elif start is not None:
-            self._network.load_state_dict(start)
-        if settings.settle_head and (start is None or settings.fresh_head):
-            self._settle()
+        if start is not None:
+            self._kind.start_from(self._network, start, fresh_head=settings.fresh_head)
+        if settings.initialize_head and (start is None or settings.fresh_head):
+            rng = np.random.default_rng((settings.seed, 0))
+            batches = self._batches(self._makers[0], INITIALIZATION_PAIRS, rng)
+            self._kind.initialize_from_data(self._network, batches)
         self._epochs = 0
         self._seconds = 0.0
         self._best = (-1.0, -1.0)
@@ -109,13 +106,13 @@ class Run:
         """Train on one epoch's pairs, validate, and keep both checkpoints and the log."""
         began = time.monotonic() - self._seconds
         trained = self._train_pass(began, progress)
-        found = self._validate(began, progress)
+        figures = self._validate(began, progress)
         self._epochs += 1
         self._seconds = time.monotonic() - began
-        if found.rank > self._best:
-            self._best, self._best_epoch = found.rank, self._epochs
-            self._save(BEST, {"measured": asdict(found)})
-        row = self._log(trained, found)
+        if figures.rank > self._best:
+            self._best, self._best_epoch = figures.rank, self._epochs
+            self._save(BEST, {"measured": asdict(figures)})
+        row = self._log(trained, figures)
         self._save(
             CHECKPOINT, {"optimizer": self._optimizer.state_dict(), "torch_rng": torch.get_rng_state()}
         )
@@ -129,16 +126,16 @@ class Run:
         state = torch.load(path, map_location=self._device, weights_only=True)
         if "head" in state:
             return
-        network = SpicdNetwork().to(self._device)
+        network = self._kind.build().to(self._device)
         network.load_state_dict(state["network"])
-        found = train_head(network, training, validation, self._settings, self._out, progress)
+        result = train_head(network, training, validation, self._settings, self._out, progress)
         more = {
             "network": network.state_dict(),
-            "measured": asdict(found.measured),
-            "head": asdict(found),
+            "measured": asdict(result.measured),
+            "head": asdict(result),
             "settings": asdict(self._settings),
         }
-        write_aside(path, {**state, **more})
+        write_atomically(path, partial(torch.save, {**state, **more}))
 
     def resume(self) -> None:
         """Take up the last checkpoint, if the folder has one."""
@@ -158,12 +155,12 @@ class Run:
         self._best, self._best_epoch = tuple(state["best"]), state["best_epoch"]
 
     def _train_pass(self, began: float, progress: Progress) -> _Trained:
-        """One epoch's steps. Ends early when the time is up."""
+        """Take one epoch's steps; ends early when the time is up."""
         settings, schedule = self._settings, self._settings.schedule
         steps = max(settings.train_pairs // settings.batch, 1)
         # Each epoch has its own stream, so that a resumed run sees the pairs that an unbroken one sees.
         rng = np.random.default_rng((settings.seed, 1, self._epochs))
-        batches = self._makers[0].batches(settings.train_pairs, settings.batch, rng)
+        batches = self._batches(self._makers[0], settings.train_pairs, rng)
         self._network.train()
         losses, hits, rate = [], [], schedule.start
         for step, batch in enumerate(prefetched(batches)):
@@ -179,12 +176,11 @@ class Run:
             return _Trained(loss=float("nan"), accuracy=float("nan"), rate=rate)
         return _Trained(loss=float(np.mean(losses)), accuracy=float(np.mean(hits)), rate=rate)
 
-    def _step(self, batch: Batch, rate: float) -> tuple[float, float]:
-        """The loss before the step, and the share of pairs that the network had right."""
+    def _step(self, batch: Labelled, rate: float) -> tuple[float, float]:
+        """Return the loss before the step, and the share of pairs that the network had right."""
         for group in self._optimizer.param_groups:
             group["lr"] = rate
-        output, labels = self._forward(batch), torch.from_numpy(batch.labels).to(self._device)
-        loss = total_loss(output.logits, labels, output.transforms)
+        logits, loss = self._kind.answer(self._network, batch)
         value = loss.item()
         if not np.isfinite(value):
             raise FloatingPointError(
@@ -193,49 +189,30 @@ class Run:
         self._optimizer.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]
         self._optimizer.step()
-        return value, float((output.logits.detach().argmax(dim=1) == labels).float().mean())
+        return value, float(
+            (logits.detach().argmax(dim=1).cpu() == torch.from_numpy(batch.labels)).float().mean()
+        )
 
     @torch.no_grad()
-    def _validate(self, began: float, progress: Progress) -> Measured:
-        """On the same pairs after every epoch."""
+    def _validate(self, began: float, progress: Progress) -> ClassFigures:
+        """Validate on the same pairs after every epoch."""
         settings = self._settings
         rng = np.random.default_rng((settings.seed, 2))
-        batches = prefetched(self._makers[1].batches(settings.validation_pairs, settings.batch, rng))
+        batches = prefetched(self._batches(self._makers[1], settings.validation_pairs, rng))
         self._network.eval()
         logits, labels = [], []
         for batch in batches:
             progress("train", settings.schedule.done(self._epochs + 1, time.monotonic() - began))
-            logits.append(self._forward(batch).logits.cpu())
+            logits.append(self._kind.answer(self._network, batch)[0].cpu())
             labels.append(torch.from_numpy(batch.labels))
         answers, truth = torch.cat(logits), torch.cat(labels)
-        loss = float(total_loss(answers, truth, (torch.eye(3)[None],)))
-        return measured(answers.softmax(dim=1).numpy(), truth.numpy(), loss)
+        loss = float(self._kind.class_loss(answers, truth))
+        return class_figures(answers.softmax(dim=1).numpy(), truth.numpy(), loss)
 
-    @torch.no_grad()
-    def _settle(self) -> None:
-        """Initialise the head by the data of a few batches: pairs of one place, whose distances are the fine ones."""
-        rng = np.random.default_rng((self._settings.seed, 0))
-        sides, statistics = [], []
-        for batch in self._makers[0].batches(SETTLING_PAIRS, self._settings.batch, rng):
-            points, compared = self._tensors(batch)
-            same_place = torch.from_numpy(batch.labels) != DIFFERENT
-            sides.append(
-                [side[same_place] for side in self._network.encoder(points, batch.sizes)[0].chunk(2)]
-            )
-            clouds = torch.split(compared, batch.chamfer_sizes)
-            found = chamfer_statistics(clouds[: len(clouds) // 2], clouds[len(clouds) // 2 :])
-            statistics.append(found[same_place])
-        reference, current = (torch.cat(side) for side in zip(*sides, strict=True))
-        self._network.head.settle(reference, current, torch.cat(statistics))
-
-    def _forward(self, batch: Batch) -> PairOutput:
-        points, compared = self._tensors(batch)
-        output: PairOutput = self._network(points, batch.sizes, compared, batch.chamfer_sizes)
-        return output
-
-    def _tensors(self, batch: Batch) -> list[Tensor]:
-        arrays = (batch.points, batch.chamfer_points)
-        return [torch.from_numpy(array).to(self._device) for array in arrays]
+    def _batches(self, maker: PairMaker, count: int, rng: np.random.Generator) -> Iterator[Labelled]:
+        """Draw `count` pairs; both they and what their collation draws come from `rng`."""
+        for pairs in maker.batches(count, self._settings.batch, rng):
+            yield self._kind.collate(pairs, rng)
 
     def _save(self, name: str, more: dict[str, Any]) -> None:
         state = {
@@ -247,40 +224,24 @@ class Run:
             "best_epoch": self._best_epoch,
             **more,
         }
-        write_aside(self._out / name, state)
+        write_atomically(self._out / name, partial(torch.save, state))
 
-    def _log(self, trained: _Trained, found: Measured) -> EpochRow:
-        row = EpochRow(
+    def _log(self, trained: _Trained, figures: ClassFigures) -> EpochRow:
+        row = row_of(
+            figures,
             epoch=self._epochs,
             seconds=round(self._seconds, 1),
             learning_rate=trained.rate,
             train_loss=trained.loss,
             train_accuracy=trained.accuracy,
-            validation_loss=found.loss,
-            accuracy=found.accuracy,
-            **by_class("precision", found.precision),
-            **by_class("recall", found.recall),
         )
         append_row(self._out, row)
         return row
 
 
 def _of_epochs(settings: dict[str, Any]) -> dict[str, Any]:
-    """Without what only comes after the last epoch, and may be asked for then."""
+    """Leave out what only comes after the last epoch, and may be asked for then."""
     return {name: value for name, value in settings.items() if not name.startswith("head_")}
-
-
-def write_aside(path: Path, state: Mapping[str, Any]) -> None:
-    """Written beside and moved, so that a stop in between leaves the old file whole."""
-    partial = path.with_name(f"{path.name}.partial")
-    torch.save(dict(state), partial)
-    partial.replace(path)
-
-
-def _encoder(network: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Of a whole network's state."""
-    inner = "encoder."
-    return {name.removeprefix(inner): value for name, value in network.items() if name.startswith(inner)}
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

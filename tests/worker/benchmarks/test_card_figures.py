@@ -75,9 +75,7 @@ def revisit_told() -> dict[str, Any]:
 @pytest.fixture
 def store(tmp_path: Path) -> Path:
     """One model, spicd-net/7, that was measured on something already."""
-    needs = Preprocessing(
-        voxel_size=0.05, tile_size=(1.5, 1.5, 1.0), patch_points=4096, min_points=512, seed=42
-    )
+    needs = Preprocessing(voxel_size=0.05, tile_size=(1.5, 1.5, 1.0), min_points=512)
     card = Card(
         name="spicd-net",
         version="7",
@@ -85,6 +83,7 @@ def store(tmp_path: Path) -> Path:
         summary="for tests",
         threshold=0.5,
         preprocessing=needs,
+        detector_settings={"patch_points": 4096, "seed": 42},
         sha256=OURS,
         evaluation={"validation": {"f1": 0.5}},
     )

@@ -73,7 +73,7 @@ def test_a_checkpoint_brings_its_weights_patch_size_and_seed(tmp_path: Path) -> 
     torch.save({"settings": SOUND, "network": SpicdNetwork().state_dict()}, tmp_path / "fresh.pt")
     card = open_model(MODEL_STORE, MODEL, tmp_path / "fresh.pt").card
     shipped = open_card(MODEL_STORE, MODEL)
-    assert (card.preprocessing.patch_points, card.preprocessing.seed) == (1024, 7)
+    assert (card.detector_settings["patch_points"], card.detector_settings["seed"]) == (1024, 7)
     assert (card.name, card.version) == ("spicd-net", "fresh")
     assert card.preprocessing.tile_size == shipped.preprocessing.tile_size
     assert card.threshold == shipped.threshold
@@ -141,7 +141,7 @@ def test_a_map_is_encoded_once_and_another_map_anew(pairs: TilePairs) -> None:
     cached = CachedDetector(detector=detector)
     for reference in (pairs.reference, same, moved):
         assert np.isnan(cached.score(replace(pairs, reference=reference))).tolist() == [False, True, False]
-    assert detector.described == 2
+    assert detector.encoded == 2
     assert detector.asked == [2, 2]  # the second time every tile was known
 
 

@@ -2,12 +2,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from tests.support.detectors import CountingDetector
-from tests.worker.benchmarks.test_tiles import made_pairs
 from worker.benchmarks.methods import open_model
-from worker.benchmarks.speed import BenchSettings, bench, scoring_bench, tables
+from worker.benchmarks.speed import BenchSettings, bench, resized, scoring_bench, tables
+from worker.cloud.tiling import TileGrid, TilePairs, Tiles
 from worker.detectors import store
 from worker.detectors.card import Card, Preprocessing
 from worker.detectors.spicd_net.network import SpicdNetwork
@@ -17,9 +18,7 @@ from worker.detectors.store import write_card, write_model
 @pytest.fixture
 def model_store(tmp_path: Path) -> Path:
     """Untrained weights: the bench asks how long, not how well."""
-    needs = Preprocessing(
-        voxel_size=0.05, tile_size=(1.5, 1.5, 1.0), patch_points=4096, min_points=512, seed=42
-    )
+    needs = Preprocessing(voxel_size=0.05, tile_size=(1.5, 1.5, 1.0), min_points=512)
     card = Card(
         name="spicd-net",
         version="1",
@@ -27,6 +26,7 @@ def model_store(tmp_path: Path) -> Path:
         summary="untrained",
         threshold=0.5,
         preprocessing=needs,
+        detector_settings={"patch_points": 4096, "seed": 42},
         weights="weights.safetensors",
     )
     write_model(tmp_path / "spicd-net" / "1", card, SpicdNetwork().state_dict())
@@ -59,5 +59,29 @@ def test_any_detector_of_the_store_can_be_timed(tmp_path: Path, monkeypatch: pyt
     figures = scoring_bench(made_pairs(), detector, repeats=2)
     assert list(figures["seconds"]) == ["c2c", "uncached", "cached"]
     assert isinstance(detector, CountingDetector)
-    assert detector.described == 3  # once for the map, and with each of the two uncached scores
+    assert detector.encoded == 3  # once for the map, and with each of the two uncached scores
     assert detector.asked == [2] * 4
+
+
+GRID = TileGrid(origin=np.array([70.0, 20.0, 0.0]), size=np.array([1.5, 1.5, 1.0]), shape=(3, 1, 1))
+INDICES = np.array([[i, 0, 0] for i in range(3)], np.int32)
+
+
+def made_pairs() -> TilePairs:
+    """Three tiles whose clouds are told apart by their sizes; the second was not observed."""
+
+    def clouds(*counts: int) -> tuple[np.ndarray, ...]:
+        return tuple(np.zeros((count, 3), np.float32) for count in counts)
+
+    return TilePairs(
+        reference=Tiles(grid=GRID, indices=INDICES, points=clouds(100, 200, 500)),
+        current=clouds(300, 0, 90),
+        observed=np.array([True, False, True]),
+    )
+
+
+def test_pairs_are_taken_again_until_there_are_as_many_as_asked_for():
+    more = resized(made_pairs(), 5)
+    assert [len(points) for points in more.current] == [300, 90, 300, 90, 300]
+    assert more.reference.indices[:, 0].tolist() == [0, 2, 0, 2, 0]
+    assert more.observed.all()

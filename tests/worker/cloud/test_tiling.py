@@ -4,7 +4,17 @@ import numpy as np
 import pytest
 
 from tests.support.tilings import ORIGIN, SIZE, grid_of, in_tile
-from worker.cloud.tiling import TilingSettings, cut, grid_over, grown, inside_tiles, pair_tiles, tile_id
+from worker.cloud.tiling import (
+    TileGrid,
+    TilePairs,
+    Tiles,
+    TilingSettings,
+    cut,
+    grid_over,
+    grown,
+    pair_tiles,
+    tile_id,
+)
 from worker.errors import MapFailed
 
 SETTINGS = TilingSettings()
@@ -185,10 +195,27 @@ def test_pairs_of_a_grid_below_zero_hold_the_points_of_the_same_box() -> None:
     assert [part.tolist() for part in pairs.current] == [seen[-2].tolist(), [], seen[1].tolist()]
 
 
-def test_points_inside_of_tiles_are_told_from_those_beside_and_beyond_the_grid() -> None:
+def test_a_point_is_located_in_one_of_the_tiles_beside_them_or_beyond_the_grid() -> None:
     cells = [(-1, 0, 0), (0, 0, 0), (1, 0, 0), (0, 3, 0)]
     points = np.concatenate([in_tile(*cell, 5) for cell in cells])
     grid = grown(grid_of(2, 1, 1), points[:15])
-    wanted = np.array([[-1, 0, 0], [1, 0, 0], [7, 7, 7]], np.int32)
-    assert inside_tiles(points, grid, wanted).tolist() == [True] * 5 + [False] * 5 + [True] * 5 + [False] * 5
-    assert not inside_tiles(points, grid, np.empty((0, 3), np.int32)).any()
+    assert grid.locate(points).tolist() == [0] * 5 + [1] * 5 + [2] * 5 + [-1] * 5
+    assert grid.cells(np.array(cells, np.int32)).tolist() == [0, 1, 2, -1]
+    wanted = np.array([[1, 0, 0], [7, 7, 7], [-1, 0, 0]], np.int32)
+    rows = grid.locate_among(points, wanted)
+    assert rows.tolist() == [2] * 5 + [-1] * 5 + [0] * 5 + [-1] * 5
+    assert (grid.locate_among(points, np.empty((0, 3), np.int32)) == -1).all()
+    assert grid.locate_among(points[:0], wanted).shape == (0,)
+
+
+def test_chosen_pairs_keep_their_two_sides_together() -> None:
+    grid = TileGrid(origin=np.zeros(3), size=np.array([1.5, 1.5, 1.0]), shape=(3, 1, 1))
+    clouds = tuple(np.zeros((count, 3), np.float32) for count in (100, 200, 500, 300, 0, 90))
+    indices = np.array([[i, 0, 0] for i in range(3)], np.int32)
+    reference = Tiles(grid=grid, indices=indices, points=clouds[:3])
+    pairs = TilePairs(reference=reference, current=clouds[3:], observed=np.array([True, False, True]))
+    chosen = pairs.subset(np.array([2, 1]))
+    assert [len(points) for points in chosen.reference.points] == [500, 200]
+    assert [len(points) for points in chosen.current] == [90, 0]
+    assert chosen.reference.indices[:, 0].tolist() == [2, 1]
+    assert chosen.observed.tolist() == [True, False]

@@ -35,9 +35,8 @@ def card() -> Card:
         detector="spicd-net",
         summary="for tests",
         threshold=0.5,
-        preprocessing=Preprocessing(
-            voxel_size=0.05, tile_size=(1.5, 1.5, 1.0), patch_points=1024, min_points=64, seed=42
-        ),
+        preprocessing=Preprocessing(voxel_size=0.05, tile_size=(1.5, 1.5, 1.0), min_points=64),
+        detector_settings={"patch_points": 1024, "seed": 42},
         weights="weights.safetensors",
     )
 

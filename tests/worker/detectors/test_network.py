@@ -161,13 +161,13 @@ def test_the_chamfer_feature_is_gated_in_training_only():
     assert 0.12 < gated.float().mean() < 0.28  # 0.2 of 400, four sigmas either way
 
 
-def test_a_settled_head_hears_every_block_of_its_input_alike():
+def test_a_head_initialised_from_data_hears_every_block_of_its_input_alike():
     torch.manual_seed(0)
     head = PairHead().eval()
     base = 5 * torch.randn(600, 1024)
     reference, current = base, base + 0.1 * torch.randn(600, 1024)
     statistics = 0.1 + 0.02 * torch.rand(600, 8)
-    head.settle(reference, current, statistics)
+    head.initialize_from_data(reference, current, statistics)
     first = head.classifier[0]
     blocks = fused(reference, current, head.chamfer(statistics)).split([1024, 1024, 32], dim=1)
     weights = first.weight.split([1024, 1024, 32], dim=1)

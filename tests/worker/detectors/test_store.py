@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 import torch
 
+from worker.detectors.card import MODEL_STORE
+from worker.detectors.comparison import Comparison
 from worker.detectors.spicd_net.detector import SpicdNet
 from worker.detectors.store import open_detector
 from worker.errors import DetectorUnavailable
@@ -20,8 +22,10 @@ def edit(card_path, **fields) -> None:
 def test_an_opened_model_scores_as_the_network_it_was_saved_from(model_store, network, card, pairs):
     opened = open_detector(model_store, "spicd-net/7", device="cpu")
     assert opened.card.version == "7"
-    expected = SpicdNet(card, network, torch.device("cpu")).score(pairs)
-    assert np.array_equal(opened.score(pairs).probabilities, expected.probabilities, equal_nan=True)
+    expected = SpicdNet(card, network, torch.device("cpu")).detect(Comparison.of_tiles(pairs))
+    assert np.array_equal(
+        opened.detect(Comparison.of_tiles(pairs)).probabilities, expected.probabilities, equal_nan=True
+    )
 
 
 def test_weights_that_are_not_the_cards_are_refused(model_store):
@@ -67,3 +71,41 @@ def test_an_unsound_card_is_refused(model_store):
 def test_a_missing_gpu_is_said(model_store):
     with pytest.raises(DetectorUnavailable, match="cuda"):
         open_detector(model_store, "spicd-net/7", device="cuda")
+
+
+@pytest.mark.parametrize(
+    ("settings", "reason"),
+    [
+        ({"patch_points": 0}, r"detector_settings\.patch_points: Input should be greater than 0"),
+        ({"patch_pints": 5}, r"detector_settings\.patch_pints: Extra inputs"),
+        ({"chamfer_points": 4096}, r"the Chamfer sample takes 4096 of a patch's 1024 points"),
+    ],
+)
+def test_a_setting_that_the_detector_does_not_take_is_refused_by_its_name(
+    model_store, card, settings, reason
+):
+    edit(
+        model_store / "spicd-net" / "7" / "card.json",
+        detector_settings={**card.detector_settings, **settings},
+    )
+    with pytest.raises(DetectorUnavailable, match=rf"^model spicd-net/7: .*{reason}"):
+        open_detector(model_store, "spicd-net/7", device="cpu")
+
+
+def test_a_card_of_release_0_1_opens_with_its_settings_in_their_place(model_store, card, pairs):
+    """It kept what SPICD-Net alone needs beside what the map is built with, in the store as in the database."""
+    now = open_detector(model_store, "spicd-net/7", device="cpu").detect(Comparison.of_tiles(pairs))
+    path = model_store / "spicd-net" / "7" / "card.json"
+    written = json.loads(path.read_text())
+    preprocessing = {**written["preprocessing"], **written.pop("detector_settings")}
+    path.write_text(json.dumps({**written, "preprocessing": preprocessing}))
+    opened = open_detector(model_store, "spicd-net/7", device="cpu")
+    assert opened.card.preprocessing == card.preprocessing
+    assert opened.card.detector_settings == card.detector_settings
+    scores = opened.detect(Comparison.of_tiles(pairs)).probabilities
+    assert np.array_equal(scores, now.probabilities, equal_nan=True)
+
+
+def test_the_shipped_models_open():
+    for name in ("spicd-net/1", "c2c/1"):
+        assert open_detector(MODEL_STORE, name, device="cpu").card.model == name

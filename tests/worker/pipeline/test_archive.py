@@ -1,57 +1,64 @@
+"""Stage values come back from disk as they were, and those that release 0.1 wrote too."""
+
 from __future__ import annotations
 
-from dataclasses import fields, is_dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
+from tests.support.release_0_1 import current_of_0_1, reference_of_0_1, scan_of_0_1, tiles_of_0_1
 from tests.support.rooms import scores_of
 from tests.support.tilings import grid_of, in_tile, row_of
+from tests.worker.cloud.test_npz import assert_same
+from worker.cloud import npz
 from worker.cloud.poses import exponential
-from worker.cloud.tiling import TilingSettings, cut, grown, pair_tiles
+from worker.cloud.tiling import TilePairs, grown
+from worker.detectors.detector import Detection, VoxelScores
 from worker.pipeline import archive
 from worker.pipeline.mapping.fusion import CurrentMap, ReferenceMap
 from worker.pipeline.registration.results import RegisteredScan
-from worker.pipeline.results.manifest import manifest, padded_patches
 
 RNG = np.random.default_rng(0)
 POINTS = RNG.normal(size=(7, 3)).astype(np.float32)
 COLORS = RNG.integers(0, 256, (7, 3)).astype(np.uint8)
+NAN = (float("nan"),) * 3
 
 
-def assert_same(a: Any, b: Any) -> None:
-    """Equal to the bit and in type, through values, tuples and arrays; NaN equals NaN."""
-    if is_dataclass(a):
-        assert type(a) is type(b)
-        for field in fields(a):
-            assert_same(getattr(a, field.name), getattr(b, field.name))
-    elif isinstance(a, tuple):
-        assert len(a) == len(b)
-        for one, other in zip(a, b, strict=True):
-            assert_same(one, other)
-    elif isinstance(a, np.ndarray):
-        assert a.dtype == b.dtype
-        np.testing.assert_array_equal(a, b)
-    else:
-        assert type(a) is type(b)
-        assert a == b
+def reference_of(colors: np.ndarray | None) -> ReferenceMap:
+    """A map whose grid grew below zero."""
+    return ReferenceMap(
+        points=POINTS,
+        normals=-POINTS,
+        oriented=POINTS[:, 0] > 0,
+        colors=colors,
+        voxel_size=0.05,
+        grid=grown(grid_of(1, 1, 1), np.concatenate([in_tile(-2, 0, 0, 9), in_tile(0, 0, 0, 9)])),
+    )
+
+
+def scan_of(colors: np.ndarray | None, origin: np.ndarray | None) -> RegisteredScan:
+    return RegisteredScan(
+        name="now.pcd",
+        points=POINTS,
+        colors=colors,
+        map_from_scan=exponential(np.array([0, 0, 1, 2, 3, 4.0])),
+        sensor_origin=origin,
+    )
 
 
 @pytest.mark.parametrize("colors", [COLORS, None])
 def test_a_reference_comes_back_equal(tmp_path: Path, colors: np.ndarray | None) -> None:
-    reference = ReferenceMap(
-        points=POINTS, normals=-POINTS, oriented=POINTS[:, 0] > 0, colors=colors, voxel_size=0.05
-    )
-    archive.save_reference(tmp_path / "r.npz", reference)
+    reference = reference_of(colors)
+    assert reference.grid.lowest == (-2, 0, 0)
+    npz.save(tmp_path / "r.npz", reference)
     assert_same(reference, archive.load_reference(tmp_path / "r.npz"))
 
 
 @pytest.mark.parametrize("colors", [COLORS, None])
 def test_a_current_map_comes_back_equal(tmp_path: Path, colors: np.ndarray | None) -> None:
-    archive.save_current(tmp_path / "c.npz", CurrentMap(points=POINTS, colors=colors))
-    assert_same(CurrentMap(points=POINTS, colors=colors), archive.load_current(tmp_path / "c.npz"))
+    npz.save(tmp_path / "c.npz", CurrentMap(points=POINTS, colors=colors))
+    assert_same(CurrentMap(points=POINTS, colors=colors), npz.load(tmp_path / "c.npz", CurrentMap))
 
 
 @pytest.mark.parametrize("current", [(5, 0, 9), (0, 0, 0), (1, 2, 0)])
@@ -59,38 +66,19 @@ def test_pairs_come_back_equal_with_empty_tiles_in_any_place(
     tmp_path: Path, current: tuple[int, ...]
 ) -> None:
     pairs = row_of([6, 1, 8], current, observed=[True, False, True])
-    archive.save_pairs(tmp_path / "p.npz", pairs)
-    assert_same(pairs, archive.load_pairs(tmp_path / "p.npz"))
+    npz.save(tmp_path / "p.npz", pairs)
+    assert_same(pairs, npz.load(tmp_path / "p.npz", TilePairs))
 
 
-@pytest.mark.parametrize("counts", [(6, 1, 8), (3,), ()])
-def test_tiles_come_back_equal(tmp_path: Path, counts: tuple[int, ...]) -> None:
-    tiles = row_of(counts, counts, observed=[True] * len(counts)).reference
-    patches = padded_patches(tiles, size=10, seed=42)
-    archive.save_tiles(tmp_path / "t.npz", tiles, patches=patches)
-    assert_same(tiles, archive.load_tiles(tmp_path / "t.npz"))
-
-
-def test_dense_tiles_and_patches_lie_where_the_manifest_says(tmp_path: Path) -> None:
-    tiles = row_of([6, 12], [6, 12], observed=[True, True]).reference
-    patches = padded_patches(tiles, size=10, seed=42)
-    archive.save_tiles(tmp_path / "tiles.npz", tiles, patches=patches)
-    cloud = np.concatenate(tiles.points)
-    listing = manifest(cloud, tiles, patch_size=10, min_points=1, voxel_size=0.05)
-    kept = archive.load_arrays(tmp_path / "tiles.npz")
-    for entry, dense in zip(listing["patches"], tiles.points, strict=True):
-        (file, patch), (dense_file, whole) = (entry[key].split("#") for key in ("file", "dense_file"))
-        assert file == dense_file == "tiles.npz"
-        assert_same(dense, kept[whole])
-        assert kept[patch].shape == (entry["n_sampled_points"], 3)
-        there = kept[patch] + np.array(entry["tile_center"], np.float32)
-        assert np.linalg.norm(there[:, None] - dense[None], axis=2).min(axis=1).max() < 1e-5
-
-
-def test_scores_come_back_equal_with_nan(tmp_path: Path) -> None:
-    scores = scores_of((0.1, 0.2, 0.7), (float("nan"),) * 3)
-    archive.save_scores(tmp_path / "s.npz", scores)
-    assert_same(scores, archive.load_scores(tmp_path / "s.npz"))
+@pytest.mark.parametrize(
+    "voxels", [None, VoxelScores(keys=np.arange(2), appeared=POINTS[0, :2], disappeared=POINTS[1, :2])]
+)
+def test_scores_come_back_equal_with_nan_and_with_voxels_where_there_are_any(
+    tmp_path: Path, voxels: VoxelScores | None
+) -> None:
+    detection = Detection(probabilities=scores_of((0.1, 0.2, 0.7), NAN).probabilities, voxels=voxels)
+    npz.save(tmp_path / "s.npz", detection)
+    assert_same(detection, npz.load(tmp_path / "s.npz", Detection))
 
 
 @pytest.mark.parametrize("colors", [COLORS, None])
@@ -98,71 +86,36 @@ def test_scores_come_back_equal_with_nan(tmp_path: Path) -> None:
 def test_a_scan_comes_back_with_its_pose_and_its_sensors_place_where_known(
     tmp_path: Path, origin: np.ndarray | None, colors: np.ndarray | None
 ) -> None:
-    scan = RegisteredScan(
-        name="now.npz",
-        points=POINTS,
-        colors=colors,
-        map_from_scan=exponential(np.array([0, 0, 1, 2, 3, 4.0])),
-        sensor_origin=origin,
-    )
-    archive.save_scan(tmp_path / "now.npz", scan)
-    assert_same(scan, archive.load_scan(tmp_path / "now.npz"))
+    npz.save(tmp_path / "a.npz", scan_of(colors, origin))
+    assert_same(scan_of(colors, origin), archive.load_scan(tmp_path / "a.npz"))
 
 
-def test_a_grid_keeps_the_indices_below_zero_that_it_grew(tmp_path: Path) -> None:
-    points = np.concatenate([in_tile(-2, 0, 0, 9), in_tile(0, 0, 0, 9)])
-    tiles = cut(points, grown(grid_of(1, 1, 1), points), min_points=1)
-    assert tiles.grid.lowest == (-2, 0, 0)
-    archive.save_tiles(tmp_path / "t.npz", tiles, patches=padded_patches(tiles, size=10, seed=42))
-    assert_same(tiles, archive.load_tiles(tmp_path / "t.npz"))
-    pairs = pair_tiles(tiles, points, settings=TilingSettings(min_points=1))
-    archive.save_pairs(tmp_path / "p.npz", pairs)
-    assert_same(pairs, archive.load_pairs(tmp_path / "p.npz"))
-
-
-def test_tiles_that_say_nothing_of_a_lowest_index_begin_at_0(tmp_path: Path) -> None:
-    """Maps that were written before a map could grow."""
-    tiles = row_of([6, 1], [6, 1], observed=[True, True]).reference
-    archive.save_tiles(tmp_path / "new.npz", tiles, patches=padded_patches(tiles, size=10, seed=42))
-    arrays = archive.load_arrays(tmp_path / "new.npz")
-    del arrays["lowest"]
-    archive.save_arrays(tmp_path / "old.npz", arrays)
-    assert_same(tiles, archive.load_tiles(tmp_path / "old.npz"))
-
-
-def test_the_same_values_give_the_same_bytes(tmp_path: Path) -> None:
-    pairs = row_of([6, 1], [2, 3], observed=[True, True])
-    for name in "ab":
-        archive.save_pairs(tmp_path / name, pairs)
-    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
-
-
-def test_a_failed_write_leaves_the_earlier_file_as_it_was(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("colors", [COLORS, None])
+@pytest.mark.parametrize("lowest", [(-2, 0, 0), None])
+def test_a_map_of_release_0_1_has_its_grid_from_the_file_of_its_tiles(
+    tmp_path: Path, colors: np.ndarray | None, lowest: tuple[int, int, int] | None
 ) -> None:
-    path = tmp_path / "s.npz"
-    archive.save_arrays(path, {"a": POINTS})
-
-    def disk_full(file: Any, **arrays: Any) -> None:
-        file.write(b"PK half a file")
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(np, "savez", disk_full)
-    with pytest.raises(OSError, match="No space"):
-        archive.save_arrays(path, {"a": POINTS * 2})
-    with pytest.raises(OSError, match="No space"):
-        archive.save_arrays(tmp_path / "new.npz", {"a": POINTS})
-    assert_same({"a": POINTS}["a"], archive.load_arrays(path)["a"])
-    assert not (tmp_path / "new.npz").exists()
+    """The grid of a map that never grew says nothing of a lowest index."""
+    now = reference_of(colors)
+    reference_of_0_1(tmp_path / "reference.npz", now)
+    tiles_of_0_1(tmp_path / "tiles.npz", now.tiles(min_points=1), lowest=lowest is not None)
+    found = archive.load_reference(tmp_path / "reference.npz", tiles_of_0_1=tmp_path / "tiles.npz")
+    if lowest is not None:
+        assert_same(now, found)
+    assert found.grid.lowest == (lowest or (0, 0, 0))
+    with pytest.raises(
+        ValueError, match=r"reference\.npz is no file of a ReferenceMap: it has no 'grid\.origin'"
+    ):
+        archive.load_reference(tmp_path / "reference.npz")
 
 
-def test_anything_else_than_an_archive_of_arrays_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "text.npz").write_text("tiles, but not as arrays")
-    with pytest.raises(ValueError, match="pickle"):
-        archive.load_arrays(tmp_path / "text.npz")
-
-
-def test_an_archive_with_a_pickle_is_refused(tmp_path: Path) -> None:
-    np.savez(tmp_path / "p.npz", evil=np.array([{"run": "this"}], dtype=object))
-    with pytest.raises(ValueError, match="allow_pickle"):
-        archive.load_arrays(tmp_path / "p.npz")
+@pytest.mark.parametrize("colors", [COLORS, None])
+def test_a_survey_and_a_scan_of_release_0_1_come_back(tmp_path: Path, colors: np.ndarray | None) -> None:
+    current, scan = CurrentMap(points=POINTS, colors=colors), scan_of(colors, np.ones(3))
+    current_of_0_1(tmp_path / "current.npz", current)
+    assert_same(current, npz.load(tmp_path / "current.npz", CurrentMap))
+    scan_of_0_1(tmp_path / "now.pcd", scan)
+    assert_same(scan, archive.load_scan(tmp_path / "now.pcd"))
+    probabilities = scores_of((0.1, 0.2, 0.7), NAN).probabilities
+    np.savez(tmp_path / "scores.npz", probabilities=probabilities)
+    assert_same(Detection(probabilities=probabilities), npz.load(tmp_path / "scores.npz", Detection))

@@ -13,29 +13,31 @@ from tests.support.tilings import row_of
 from tests.support.walks import registered
 from worker.cloud.formats.pcd import write_pcd
 from worker.cloud.poses import difference, inverse, transformed
-from worker.cloud.tiling import TilePairs, Tiles
+from worker.cloud.tiling import Tiles
 from worker.cloud.types import Arrays, Floats
 from worker.detectors.card import Card, Preprocessing
-from worker.detectors.detector import TileScores
+from worker.detectors.comparison import Comparison, Side
+from worker.detectors.detector import Detection
 from worker.errors import Cancelled, ScanError
 from worker.pipeline.flow import (
     BuiltMap,
     LocatedSurvey,
     NoScanAccepted,
     NothingToTile,
-    PipelineSettings,
     build_map,
+    compare,
     detect,
     locate_survey,
 )
-from worker.pipeline.registration.results import ScanFile
+from worker.pipeline.registration.results import RegisteredScan, ScanFile
 from worker.pipeline.registration.settings import RegistrationSettings
 from worker.pipeline.results.changes import TileState
+from worker.pipeline.settings import PipelineSettings
 from worker.progress import Progress, no_progress
 from worker.simulation.scenes import random_room
 from worker.simulation.visits import visit
 
-NEEDS = Preprocessing(voxel_size=0.05, tile_size=(1.5, 1.5, 1.0), patch_points=4096, min_points=512, seed=42)
+NEEDS = Preprocessing(voxel_size=0.05, tile_size=(1.5, 1.5, 1.0), min_points=512)
 SETTINGS = PipelineSettings(
     registration=RegistrationSettings(search_resolutions=(), max_iterations=10)
 ).for_model(NEEDS)
@@ -55,22 +57,21 @@ class Counting:
     )
 
     def __init__(self) -> None:
-        self.descriptions: list[Arrays | None] = []
+        self.embeddings: list[Arrays | None] = []
 
-    def describe(self, tiles: Tiles, *, progress: Progress = no_progress) -> Arrays:
+    def encode_reference(self, reference: Side, tiles: Tiles, *, progress: Progress = no_progress) -> Arrays:
         return {}
 
-    def score(
-        self, pairs: TilePairs, *, description: Arrays | None = None, progress: Progress = no_progress
-    ) -> TileScores:
-        self.descriptions.append(description)
-        progress("score", 1.0)
+    def detect(
+        self, comparison: Comparison, *, embedding: Arrays | None = None, progress: Progress = no_progress
+    ) -> Detection:
+        self.embeddings.append(embedding)
+        progress("scoring", 1.0)
+        pairs = comparison.tile_pairs
         before = np.array([len(points) for points in pairs.reference.points])
         now = np.array([len(points) for points in pairs.current])
         gain = np.clip((now - before) / before, 0, 1)
-        probabilities = np.stack([1 - gain, gain, np.zeros(len(gain))], axis=1).astype(np.float32)
-        probabilities[~pairs.observed] = np.nan
-        return TileScores(probabilities=probabilities)
+        return Detection.of_scores(np.where(pairs.observed, gain, np.nan))
 
 
 @dataclass(frozen=True)
@@ -101,7 +102,7 @@ def told(files: list[ScanFile]) -> Told:
     of_survey: list[tuple[str, float]] = []
     built = build_map(files, settings=SETTINGS, processes=1, progress=lambda *at: of_map.append(at))
     survey = locate_survey(
-        files, built.reference, built.tiles, settings=SETTINGS, progress=lambda *at: of_survey.append(at)
+        files, built.reference, settings=SETTINGS, progress=lambda *at: of_survey.append(at)
     )
     return Told(built=built, survey=survey, of_map=of_map, of_survey=of_survey)
 
@@ -118,7 +119,7 @@ def boxed(
     seen = np.concatenate([scan.points, transformed(box, inverse(scan.world_from_sensor))])
     write_pcd(path, seen.astype(np.float32))
     survey = [files[0], ScanFile(name=path.name, path=path, pose=scan.world_from_sensor)]
-    return locate_survey(survey, told.built.reference, told.built.tiles, settings=SETTINGS), row
+    return locate_survey(survey, told.built.reference, settings=SETTINGS), row
 
 
 def _free_place(told: Told) -> tuple[int, Floats]:
@@ -143,7 +144,7 @@ def _box_surface() -> Floats:
 
 
 def test_voxel_and_tile_sizes_come_from_the_card() -> None:
-    needs = Preprocessing(voxel_size=0.08, tile_size=(2.0, 2.5, 3.0), patch_points=128, min_points=77, seed=1)
+    needs = Preprocessing(voxel_size=0.08, tile_size=(2.0, 2.5, 3.0), min_points=77)
     asked = PipelineSettings.model_validate(
         {"registration": {"min_fitness": 0.6, "voxel_size": 0.01}, "tiling": {"min_observed_share": 0.25}}
     )
@@ -170,7 +171,7 @@ def test_the_map_is_cut_into_tiles_of_512_points_and_more(told: Told) -> None:
 
 
 def test_the_same_scans_again_change_nothing(told: Told) -> None:
-    counts = detect(told.survey.pairs, Counting()).counts()
+    counts = detect(told.survey.comparison, Counting()).counts()
     assert counts["changed"] == counts["inconsistent"] == 0
     assert counts["unchanged"] > 15
 
@@ -184,7 +185,9 @@ def test_a_box_moves_no_scan(told: Told, boxed: tuple[LocatedSurvey, int]) -> No
 
 def test_a_box_adds_its_voxels_to_its_own_tile(told: Told, boxed: tuple[LocatedSurvey, int]) -> None:
     survey, row = boxed
-    now, before = ([len(part) for part in each.pairs.current] for each in (survey, told.survey))
+    now, before = (
+        [len(part) for part in each.comparison.tile_pairs.current] for each in (survey, told.survey)
+    )
     gain = np.array(now) - np.array(before)
     voxels = (EDGE / 0.05) ** 2 * 6
     assert 0.8 * voxels < gain[row] < 1.5 * voxels
@@ -193,12 +196,12 @@ def test_a_box_adds_its_voxels_to_its_own_tile(told: Told, boxed: tuple[LocatedS
 
 def test_a_box_changes_exactly_its_tile(boxed: tuple[LocatedSurvey, int]) -> None:
     survey, row = boxed
-    changes = detect(survey.pairs, Counting())
+    changes = detect(survey.comparison, Counting())
     assert np.flatnonzero(changes.states == TileState.CHANGED).tolist() == [row]
 
 
 def test_the_threshold_is_the_cards_unless_one_is_given() -> None:
-    pairs = row_of([1000], [1250], observed=[True])
+    pairs = Comparison.of_tiles(row_of([1000], [1250], observed=[True]))
     assert detect(pairs, Counting()).threshold == 0.2
     assert detect(pairs, Counting()).counts()["changed"] == 1
     assert detect(pairs, Counting(), threshold=0.5).counts()["changed"] == 0
@@ -207,8 +210,26 @@ def test_the_threshold_is_the_cards_unless_one_is_given() -> None:
 
 def test_the_detector_is_given_what_the_map_kept_for_it() -> None:
     detector, kept = Counting(), {"descriptors": np.zeros(3)}
-    detect(row_of([600], [600], observed=[True]), detector, description=kept)
-    assert detector.descriptions == [kept]
+    detect(Comparison.of_tiles(row_of([600], [600], observed=[True])), detector, embedding=kept)
+    assert detector.embeddings == [kept]
+
+
+def test_a_detector_gets_both_clouds_and_the_scans_behind_them_but_loads_none(told: Told) -> None:
+    def never() -> RegisteredScan:
+        raise AssertionError("nobody asked for this scan")
+
+    reference, current = told.built.reference, told.survey.current
+    comparison = compare(
+        reference, current, settings=SETTINGS, reference_scans=[never] * 3, current_scans=[never]
+    )
+    assert comparison.reference.points is reference.points
+    assert comparison.reference.normals is reference.normals
+    assert comparison.current.points is current.points
+    assert (len(comparison.reference.scans), len(comparison.current.scans)) == (3, 1)
+    assert comparison.grid == reference.grid
+    assert comparison.tiles.tolist() == told.built.tiles.indices.tolist()
+    assert comparison.observed.tolist() == told.survey.comparison.observed.tolist()
+    assert comparison.reference.evidence is None
 
 
 def test_a_survey_of_another_place_is_refused_with_every_scans_numbers(told: Told, tmp_path: Path) -> None:
@@ -217,7 +238,7 @@ def test_a_survey_of_another_place_is_refused_with_every_scans_numbers(told: Tol
         write_pcd(tmp_path / f"foreign-{number}.pcd", scan.points[::3])
         files.append(ScanFile(name=f"foreign-{number}.pcd", path=tmp_path / f"foreign-{number}.pcd"))
     with pytest.raises(NoScanAccepted, match=r"foreign-0\.pcd: .*; scan foreign-1\.pcd: ") as error:
-        locate_survey(files, told.built.reference, told.built.tiles, settings=SETTINGS)
+        locate_survey(files, told.built.reference, settings=SETTINGS)
     assert error.value.code == "registration_failed"
     assert [outcome.name for outcome in error.value.outcomes] == ["foreign-0.pcd", "foreign-1.pcd"]
     for outcome in error.value.outcomes:
@@ -232,9 +253,7 @@ def test_a_foreign_scan_leaves_the_survey_as_it_is_without_it(
     scan = visit(random_room(11), 1, seed=5)[0]
     write_pcd(tmp_path / "foreign.pcd", scan.points[::3])
     foreign = ScanFile(name="foreign.pcd", path=tmp_path / "foreign.pcd")
-    found = locate_survey(
-        [files[0], foreign, files[1]], told.built.reference, told.built.tiles, settings=SETTINGS
-    )
+    found = locate_survey([files[0], foreign, files[1]], told.built.reference, settings=SETTINGS)
     assert [outcome.registration is not None for outcome in found.outcomes] == [True, False, True]
     assert found.current.points.tolist() == told.survey.current.points.tolist()
 
@@ -243,7 +262,7 @@ def test_a_survey_with_a_file_that_is_no_scan_goes_on_with_the_others_and_names_
     told: Told, files: list[ScanFile], tmp_path: Path
 ) -> None:
     broken = _broken(tmp_path)
-    found = locate_survey([broken, *files], told.built.reference, told.built.tiles, settings=SETTINGS)
+    found = locate_survey([broken, *files], told.built.reference, settings=SETTINGS)
     assert [outcome.registration is not None for outcome in found.outcomes] == [False, True, True]
     assert str(found.outcomes[0].reason).startswith("hall 3.ply: ")
     assert found.current.points.tolist() == told.survey.current.points.tolist()
@@ -264,7 +283,7 @@ def test_where_no_file_is_a_scan_neither_a_map_nor_a_survey_is_made(told: Told, 
     with pytest.raises(ScanError, match=r"^hall 3\.ply: "):
         build_map(broken, settings=SETTINGS, processes=1)
     with pytest.raises(ScanError, match=r"^hall 3\.ply: "):
-        locate_survey(broken, told.built.reference, told.built.tiles, settings=SETTINGS)
+        locate_survey(broken, told.built.reference, settings=SETTINGS)
 
 
 def _broken(folder: Path) -> ScanFile:
@@ -314,7 +333,6 @@ def test_a_survey_of_one_scan_has_nothing_to_refine(told: Told, files: list[Scan
     locate_survey(
         files[:1],
         told.built.reference,
-        told.built.tiles,
         settings=SETTINGS,
         progress=lambda stage, share: stages.append(stage),
     )
@@ -330,5 +348,5 @@ def test_a_dismissal_stops_a_survey_within_one_iteration(told: Told, files: list
             raise Cancelled("the job was dismissed")
 
     with pytest.raises(Cancelled):
-        locate_survey(files, told.built.reference, told.built.tiles, settings=SETTINGS, progress=dismissed)
+        locate_survey(files, told.built.reference, settings=SETTINGS, progress=dismissed)
     assert reports == ["registering"] * 4

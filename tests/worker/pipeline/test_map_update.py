@@ -14,10 +14,11 @@ from tests.support.walks import MANY, QUICK, registered, written
 from worker.cloud.poses import difference
 from worker.cloud.tiling import TileGrid
 from worker.cloud.types import Floats
-from worker.pipeline.flow import BuiltMap, NoScanAccepted, PipelineSettings, build_map
+from worker.pipeline.flow import BuiltMap, NoScanAccepted, build_map
 from worker.pipeline.map_update import KeptMap, extend_map, renew_map, without
 from worker.pipeline.mapping.fusion import fuse, reference_map
 from worker.pipeline.registration.results import RegisteredScan, ScanFile, ScanResult, read_registered
+from worker.pipeline.settings import PipelineSettings
 from worker.simulation.scenes import random_room
 from worker.simulation.visits import visit
 
@@ -72,7 +73,7 @@ def _kept(built: BuiltMap, files: Sequence[ScanFile]) -> KeptMap:
         return lambda: read_registered(file, registered(outcome), max_points=MANY)
 
     scans = [loader(*each) for each in zip(files, built.outcomes, strict=True)]
-    return KeptMap(reference=built.reference, grid=built.tiles.grid, scans=scans)
+    return KeptMap(reference=built.reference, scans=scans)
 
 
 def _scan_of(*parts: Floats) -> RegisteredScan:
@@ -96,8 +97,8 @@ def test_a_renewed_map_has_the_surveys_points_where_they_replace_and_both_elsewh
 
     older, seen = (_scan_of(*(part(tile, corner) for tile in (0, 1))) for corner in (lower, upper))
     grid = TileGrid(origin=np.zeros(3), size=np.array([1.5, 1.5, 1.0]), shape=(2, 1, 1))
-    reference = reference_map(fuse([older], voxel_size=0.05), settings=SETTINGS.registration)
-    base = KeptMap(reference=reference, grid=grid, scans=[lambda: older])
+    reference = reference_map(fuse([older], voxel_size=0.05), grid=grid, settings=SETTINGS.registration)
+    base = KeptMap(reference=reference, scans=[lambda: older])
     stages: list[str] = []
     renewed = renew_map(
         base,

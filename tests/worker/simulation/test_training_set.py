@@ -7,7 +7,7 @@ import pytest
 
 from worker.cloud.tiling import TilingSettings
 from worker.simulation.training_set import TrainingSetSettings, WalkSettings, build_training_set
-from worker.training.dataset import Look, TileSet
+from worker.training.dataset import Observation, TileSet
 
 WALKS = WalkSettings(
     stops={"room": 4},
@@ -29,8 +29,12 @@ def nearest(points: np.ndarray, others: np.ndarray) -> np.ndarray:
     return np.linalg.norm(points[:, None] - others, axis=2).min(axis=1)
 
 
-def observations(room: TileSet, *, changed: bool, rebuilt: bool) -> list[Look]:
-    return [look for look in room.looks if (look.changed, look.rebuilt) == (changed, rebuilt)]
+def observations(room: TileSet, *, changed: bool, rebuilt: bool) -> list[Observation]:
+    return [
+        observation
+        for observation in room.observations
+        if (observation.changed, observation.rebuilt) == (changed, rebuilt)
+    ]
 
 
 def test_every_tile_was_seen_well_on_both_visits_and_lies_about_its_centre(room):
@@ -38,7 +42,7 @@ def test_every_tile_was_seen_well_on_both_visits_and_lies_about_its_centre(room)
     for a, b in zip(room.points_a, room.points_b, strict=True):
         assert len(a) >= 400
         assert len(b) >= max(400, len(a) / 2)
-        for points in (a, b, *(look.points for look in room.looks)):
+        for points in (a, b, *(observation.points for observation in room.observations)):
             assert (np.abs(points) <= np.array([0.75, 0.75, 0.5]) + 1e-3).all()
 
 
@@ -54,7 +58,10 @@ def test_an_observation_after_edits_shows_a_surface_that_the_map_has_not_or_miss
     changed, beside = (observations(room, changed=which, rebuilt=False) for which in (True, False))
     assert changed
     assert beside
-    far = {which: [_far(room, look) for look in found] for which, found in ((1, changed), (0, beside))}
+    far = {
+        which: [_far(room, observation) for observation in found]
+        for which, found in ((1, changed), (0, beside))
+    }
     assert np.median(far[1]) > 2 * np.median(far[0])
 
 
@@ -62,18 +69,18 @@ def test_a_rebuilt_map_keeps_most_points_to_the_bit_and_differs_where_a_change_w
     changed, untouched = (observations(room, changed=which, rebuilt=True) for which in (True, False))
     assert changed
     assert untouched
-    for look in (*changed, *untouched):
-        a = room.points_a[look.tile]
-        assert not np.array_equal(look.points, a)
-        assert np.median(nearest(look.points[::5], a)) < 0.01  # another visit's is some 2 cm
+    for observation in (*changed, *untouched):
+        a = room.points_a[observation.tile]
+        assert not np.array_equal(observation.points, a)
+        assert np.median(nearest(observation.points[::5], a)) < 0.01  # another visit's is some 2 cm
     # A second registration moves a scan by millimetres, a change by centimetres.
-    assert max(_far(room, look) for look in changed) > 20
-    assert np.median([_far(room, look) for look in untouched]) < 5
+    assert max(_far(room, observation) for observation in changed) > 20
+    assert np.median([_far(room, observation) for observation in untouched]) < 5
 
 
 def test_without_further_visits_there_are_no_further_observations():
     bare = WALKS.model_copy(update={"edited_visits": 0, "rebuilds": 0})
-    assert build_training_set(ONE_ROOM.model_copy(update={"walks": bare}), processes=1).looks == ()
+    assert build_training_set(ONE_ROOM.model_copy(update={"walks": bare}), processes=1).observations == ()
 
 
 def test_the_same_seed_builds_the_same_set_in_two_processes_and_its_source_says_which(room):
@@ -82,14 +89,14 @@ def test_the_same_seed_builds_the_same_set_in_two_processes_and_its_source_says_
     assert again.buildings.tolist() == sorted(again.buildings.tolist())
     first = again.subset(again.buildings == 0)
     assert np.array_equal(np.concatenate(room.points_b), np.concatenate(first.points_b))
-    assert [(look.tile, look.changed) for look in first.looks] == [
-        (look.tile, look.changed) for look in room.looks
+    assert [(observation.tile, observation.changed) for observation in first.observations] == [
+        (observation.tile, observation.changed) for observation in room.observations
     ]
     assert len(again) > len(room)
     assert '"rooms":1' in room.source
 
 
-def _far(room: TileSet, look: Look) -> int:
-    """Points of either look that lie over 10 cm off the other."""
-    a = room.points_a[look.tile]
-    return int((nearest(look.points, a) > 0.1).sum() + (nearest(a, look.points) > 0.1).sum())
+def _far(room: TileSet, observation: Observation) -> int:
+    """Points of either observation that lie over 10 cm off the other."""
+    a = room.points_a[observation.tile]
+    return int((nearest(observation.points, a) > 0.1).sum() + (nearest(a, observation.points) > 0.1).sum())

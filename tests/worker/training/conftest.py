@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from worker.training.dataset import Look, TileSet
+from worker.training.dataset import Observation, TileSet
 
 HALF = np.array([0.75, 0.75, 0.5], dtype=np.float32)
 
@@ -33,13 +33,13 @@ def seen(kind: int, rng: np.random.Generator) -> np.ndarray:
     return np.clip(points, -HALF, HALF).astype(np.float32)
 
 
-def further(count: int, rng: np.random.Generator) -> Iterator[Look]:
+def further(count: int, rng: np.random.Generator) -> Iterator[Observation]:
     """Of every other tile one with a second box in it, of the rest another honest one; rebuilt ones of each kind."""
     for kind in range(count):
         box = np.array([-0.3, 0.3, -0.2]) + rng.uniform(-0.15, 0.15, (60, 3))
         changed = kind % 2 == 0
         points = np.concatenate([seen(kind, rng), box.astype(np.float32)]) if changed else seen(kind, rng)
-        yield Look(tile=kind, points=points, changed=changed, rebuilt=kind % 4 >= 2)
+        yield Observation(tile=kind, points=points, changed=changed, rebuilt=kind % 4 >= 2)
 
 
 @pytest.fixture(scope="session")
@@ -51,7 +51,7 @@ def tiles() -> TileSet:
     return TileSet(
         points_a=tuple(seen(kind, rng) for kind in range(count)),
         points_b=tuple(seen(kind, rng) for kind in range(count)),
-        looks=tuple(further(count, rng)),
+        observations=tuple(further(count, rng)),
         centres=np.c_[1.5 * (place % 5), 1.5 * (place // 5), np.full(count, 0.5)],
         buildings=(np.arange(count) // 20).astype(np.int32),
         tile_size=(1.5, 1.5, 1.0),

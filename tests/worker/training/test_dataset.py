@@ -1,4 +1,4 @@
-"""The training set: kept in one file, parted and joined with every look at its own tile."""
+"""The training set: kept in one file, parted and joined with every observation at its own tile."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ def test_a_saved_set_comes_back_within_half_a_millimetre(tiles, tmp_path):
     save_tiles(tiles, tmp_path / "tiles.npz")
     loaded = load_tiles(tmp_path / "tiles.npz")
     for before, after in zip(
-        (*tiles.points_a, *tiles.points_b, *(look.points for look in tiles.looks)),
-        (*loaded.points_a, *loaded.points_b, *(look.points for look in loaded.looks)),
+        (*tiles.points_a, *tiles.points_b, *(observation.points for observation in tiles.observations)),
+        (*loaded.points_a, *loaded.points_b, *(observation.points for observation in loaded.observations)),
         strict=True,
     ):
         assert after == pytest.approx(before, abs=5e-4)
-    assert [(look.tile, look.changed, look.rebuilt) for look in loaded.looks] == [
-        (look.tile, look.changed, look.rebuilt) for look in tiles.looks
-    ]
+    assert [
+        (observation.tile, observation.changed, observation.rebuilt) for observation in loaded.observations
+    ] == [(observation.tile, observation.changed, observation.rebuilt) for observation in tiles.observations]
     assert np.array_equal(loaded.centres, tiles.centres)
     assert np.array_equal(loaded.buildings, tiles.buildings)
     assert (loaded.tile_size, loaded.source) == (tiles.tile_size, tiles.source)
@@ -40,18 +40,18 @@ def test_the_split_holds_out_one_region_of_every_building(tiles):
         assert np.ptp(region, axis=0).max() <= 3.0 + 1e-9  # four of twenty tiles, side by side
 
 
-def test_looks_stay_with_their_tiles_in_a_part_and_in_a_whole(tiles):
+def test_observations_stay_with_their_tiles_in_a_part_and_in_a_whole(tiles):
     chosen = np.arange(len(tiles)) % 3 == 1
     part = tiles.subset(chosen)
-    assert len(part.looks) == chosen.sum()
+    assert len(part.observations) == chosen.sum()
     whole = joined([part, tiles], source="both")
     assert len(whole) == len(part) + len(tiles)
     assert np.bincount(whole.buildings).tolist() == [len(part), len(tiles)]
     for one, origin in ((part, part), (whole, whole)):
-        for look in one.looks:
-            floor = {tuple(point) for point in origin.points_a[look.tile].round(1)}
-            assert len({tuple(point) for point in look.points.round(1)} & floor) > 20
-    first, later = whole.looks[0], whole.looks[len(part.looks)]
+        for observation in one.observations:
+            floor = {tuple(point) for point in origin.points_a[observation.tile].round(1)}
+            assert len({tuple(point) for point in observation.points.round(1)} & floor) > 20
+    first, later = whole.observations[0], whole.observations[len(part.observations)]
     assert (first.tile, later.tile) == (0, len(part))
-    assert np.array_equal(first.points, tiles.looks[1].points)
-    assert np.array_equal(later.points, tiles.looks[0].points)
+    assert np.array_equal(first.points, tiles.observations[1].points)
+    assert np.array_equal(later.points, tiles.observations[0].points)

@@ -30,6 +30,9 @@ SETTINGS = TrainSettings(
 )
 
 
+KIND = SETTINGS.network
+
+
 @pytest.fixture(scope="module")
 def network() -> SpicdNetwork:
     torch.manual_seed(3)
@@ -38,7 +41,7 @@ def network() -> SpicdNetwork:
 
 @pytest.fixture(scope="module")
 def pool(tiles, network) -> PairPool:
-    return keep_pairs(network.encoder, tiles, SETTINGS.pairs, seed=1)
+    return keep_pairs(KIND, network, tiles, SETTINGS.pairs, seed=1)
 
 
 def test_every_kind_of_pair_is_there_with_its_class(pool, tiles):
@@ -47,7 +50,7 @@ def test_every_kind_of_pair_is_there_with_its_class(pool, tiles):
     assert counts == {
         "stored": (0, 40),
         "revisit": (0, 40),
-        "beside": (0, 20),  # ten looks, each against both honest visits
+        "beside": (0, 20),  # ten observations, each against both honest visits
         "untouched": (0, 10),
         "whole": (1, 20),
         "rebuilt": (1, 10),
@@ -60,8 +63,8 @@ def test_classes_are_drawn_in_their_shares(pool):
     assert labels.tolist() == pytest.approx([1000, 700, 300], abs=5)
 
 
-def test_a_set_without_further_looks_makes_up_each_class_of_what_it_has(tiles, network):
-    bare = keep_pairs(network.encoder, replace(tiles, looks=()), SETTINGS.pairs, seed=1)
+def test_a_set_without_further_observations_makes_up_each_class_of_what_it_has(tiles, network):
+    bare = keep_pairs(KIND, network, replace(tiles, observations=()), SETTINGS.pairs, seed=1)
     assert set(bare.kinds) == {"stored", "revisit", "synthetic", "different"}
     labels = np.bincount(bare.draw(2000, np.random.default_rng(0)).labels.numpy())
     assert labels.tolist() == pytest.approx([1000, 700, 300], abs=5)
@@ -72,7 +75,7 @@ def test_different_places_are_3_m_apart_or_of_two_buildings(pool, tiles):
     for i, j in zip(pairs.reference.tolist(), pairs.current.tolist(), strict=True):
         apart = np.linalg.norm(
             tiles.centres[i] - tiles.centres[j]
-        )  # the first rows are the tiles' first looks
+        )  # the first rows are the tiles' first observations
         assert apart >= 3.0 or tiles.buildings[i] != tiles.buildings[j]
 
 
@@ -86,7 +89,7 @@ def test_kept_statistics_are_those_of_the_two_tiles_in_either_order(pool, tiles)
 
 def test_a_pair_that_is_drawn_turned_has_its_statistics_turned_too(tiles, network):
     visits = keep_pairs(
-        network.encoder, replace(tiles, looks=()), replace(SETTINGS.pairs, shares=(1, 0, 0)), seed=1
+        KIND, network, replace(tiles, observations=()), replace(SETTINGS.pairs, shares=(1, 0, 0)), seed=1
     )
     drawn = visits.draw(400, np.random.default_rng(2))
     kept = visits.kinds["revisit"]

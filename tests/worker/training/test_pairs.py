@@ -8,25 +8,27 @@ import numpy as np
 import pytest
 
 from tests.worker.training.conftest import HALF
+from worker.detectors.spicd_net.training import Batch
 from worker.training.anomalies import move_object
 from worker.training.augmentation import (
     Augmentation,
     Nuisance,
     augmented,
     replenished,
-    second_look,
+    second_observation,
     turned_alike,
 )
 from worker.training.dataset import TileSet
 from worker.training.pairs import PAPER_PAIRS, PairMaker, PairSettings, altered, composition
+from worker.training.settings import TrainSettings
 
 STILL = Augmentation(jitter=0, dropout=0, shift=0, yaw=0)
-SAME_LOOK = Nuisance(yaw=0, shift=0, dropout=(0, 0), magnitude=(-0.02, -0.02))  # 0.001 + 0.05 m is 0
+SAME_OBSERVATION = Nuisance(yaw=0, shift=0, dropout=(0, 0), magnitude=(-0.02, -0.02))  # 0.001 + 0.05 m is 0
 PLAIN = PairSettings(
     patch_points=512,
     min_shown=0,
     augmentation=STILL,
-    nuisance=SAME_LOOK,
+    nuisance=SAME_OBSERVATION,
     symmetries=False,
     rerun_share=1.0,
     edited_share=0.0,
@@ -50,7 +52,7 @@ def test_every_changed_pair_has_an_unchanged_one_of_its_tile_while_there_are_any
 
 
 def test_the_papers_pairs_are_drawn_one_by_one():
-    assert composition(20, (0.50, 0.35, 0.15), twins=False) == [(0,)] * 10 + [(1,)] * 7 + [(2,)] * 3
+    assert composition(20, (0.50, 0.35, 0.15), matched_pairs=False) == [(0,)] * 10 + [(1,)] * 7 + [(2,)] * 3
 
 
 def test_the_papers_preset_is_section_3_5():
@@ -60,7 +62,12 @@ def test_the_papers_preset_is_section_3_5():
     assert (preset.changed_intensity, preset.min_separation) == (0.5, 3.0)
     assert preset.nuisance.dropout == (0.10, 0.50)
     # and nothing of ours
-    assert (preset.revisit_share, preset.min_shown, preset.symmetries, preset.twins) == (0.0, 0, False, False)
+    assert (preset.revisit_share, preset.min_shown, preset.symmetries, preset.matched_pairs) == (
+        0.0,
+        0,
+        False,
+        False,
+    )
     assert (preset.chamfer_points, preset.stored_still) == (128, False)
     assert (preset.edited_share, preset.rebuilt_share, preset.beside_share) == (0.0, 0.0, 0.0)
 
@@ -72,7 +79,9 @@ def test_the_papers_pairs_are_of_one_dense_tile_seven_in_ten_sampled_anew(tiles)
     maker, anew = PairMaker(tiles, preset), 0
     for seed in range(200):
         pair = maker.pair(0, np.random.default_rng(seed))
-        if len(pair.current) < len(pair.reference):  # the second look lost a tenth of its points and more
+        if len(pair.current) < len(
+            pair.reference
+        ):  # the second observation lost a tenth of its points and more
             anew += 1
         else:
             assert np.abs(pair.current - pair.reference).max() < 6 * 0.0001
@@ -111,10 +120,9 @@ def test_where_no_two_tiles_are_3_m_apart_there_is_no_different_pair(tiles):
 
 def test_a_changed_pair_and_its_unchanged_one_look_at_the_same_tile(tiles):
     maker = PairMaker(tiles, replace(PLAIN, shares=(0.5, 0.5, 0.0), revisit_share=1.0))
-    batch = next(maker.batches(2, 2, np.random.default_rng(0)))
-    first, second = np.split(batch.chamfer_points, np.cumsum(batch.chamfer_sizes)[:-1])[:2]
-    assert sorted(batch.labels) == [0, 1]
-    assert rows(first) == rows(second)  # the references
+    first, second = next(maker.batches(2, 2, np.random.default_rng(0)))
+    assert sorted([first.label, second.label]) == [0, 1]
+    assert rows(first.reference) == rows(second.reference)
 
 
 def test_a_change_that_would_not_show_is_drawn_again(tiles):
@@ -131,8 +139,15 @@ def test_a_change_that_would_not_show_is_drawn_again(tiles):
         assert sum(far) >= 15
 
 
+def batches(tiles: TileSet, settings: PairSettings, *, count: int) -> list[Batch]:
+    """So many pairs, eight at a time, as the network takes them."""
+    rng = np.random.default_rng(0)
+    network = TrainSettings(pairs=settings).network
+    return [network.collate(pairs, rng) for pairs in PairMaker(tiles, settings).batches(count, 8, rng)]
+
+
 def test_a_batch_holds_both_branches_end_to_end_about_their_centroids(tiles):
-    (batch, *rest) = PairMaker(tiles, PairSettings()).batches(20, 8, np.random.default_rng(0))
+    (batch, *rest) = batches(tiles, PairSettings(), count=20)
     assert len(rest) == 1  # 20 pairs are two batches of 8
     assert len(batch.sizes) == 16
     assert sum(batch.sizes) == len(batch.points)
@@ -145,29 +160,31 @@ def test_a_batch_holds_both_branches_end_to_end_about_their_centroids(tiles):
 
 
 def test_the_papers_chamfer_branch_gets_128_points_of_each_patch(tiles):
-    batch = next(PairMaker(tiles, PAPER_PAIRS).batches(16, 8, np.random.default_rng(0)))
+    batch = batches(tiles, PAPER_PAIRS, count=16)[0]
     assert batch.chamfer_sizes == [128] * 16
     for sample, size in zip(batch.chamfer_points.reshape(16, 128, 3), batch.sizes, strict=True):
         assert len(rows(sample)) > 0.5 * min(size, 128)  # of a padded patch, so a few points come twice
 
 
 def drawn(maker: PairMaker, label_counts: int, seed: int) -> dict[int, tuple[np.ndarray, np.ndarray]]:
-    """A changed pair and its twin, (reference, current) by label."""
-    batch = next(maker.batches(label_counts, label_counts, np.random.default_rng(seed)))
-    clouds = np.split(batch.chamfer_points, np.cumsum(batch.chamfer_sizes)[:-1])
-    half = len(clouds) // 2
-    return {label: (clouds[i], clouds[i + half]) for i, label in enumerate(batch.labels.tolist())}
+    """A changed pair and the unchanged one that matches it, (reference, current) by label."""
+    pairs = next(maker.batches(label_counts, label_counts, np.random.default_rng(seed)))
+    return {pair.label: (pair.reference, pair.current) for pair in pairs}
 
 
-def looks_of(tiles: TileSet, *, changed: bool, rebuilt: bool) -> set[frozenset[tuple[float, ...]]]:
+def observations_of(tiles: TileSet, *, changed: bool, rebuilt: bool) -> set[frozenset[tuple[float, ...]]]:
     kind = (changed, rebuilt)
-    return {frozenset(rows(look.points)) for look in tiles.looks if (look.changed, look.rebuilt) == kind}
+    return {
+        frozenset(rows(observation.points))
+        for observation in tiles.observations
+        if (observation.changed, observation.rebuilt) == kind
+    }
 
 
 def test_of_changed_pairs_the_given_share_is_of_whole_things_beside_an_honest_unchanged_pair(tiles):
     settings = replace(PLAIN, shares=(0.5, 0.5, 0.0), edited_share=0.6, revisit_share=1.0)
     maker, found = PairMaker(tiles, settings), 0
-    real = looks_of(tiles, changed=True, rebuilt=False)
+    real = observations_of(tiles, changed=True, rebuilt=False)
     assert len(real) == len(tiles) / 4
     for seed in range(100):
         pairs = drawn(maker, 2, seed)
@@ -176,7 +193,7 @@ def test_of_changed_pairs_the_given_share_is_of_whole_things_beside_an_honest_un
         if any(edited):
             found += 1
             same = [rows(a) == rows(b) for a, b in zip(pairs[0], pairs[1], strict=True)]
-            assert sum(same) == 1  # the other look is that of the unchanged pair
+            assert sum(same) == 1  # the other observation is that of the unchanged pair
             assert sorted(edited) == [False, True]
     assert 45 < found < 75
 
@@ -185,30 +202,36 @@ def test_of_changed_pairs_the_given_share_is_of_rebuilt_maps_untouched_but_for_t
     noisy = replace(PLAIN, augmentation=Augmentation(), nuisance=Nuisance())
     settings = replace(noisy, shares=(0.5, 0.5, 0.0), rebuilt_share=0.6, revisit_share=1.0)
     maker, found = PairMaker(tiles, settings), 0
-    owner = {frozenset(rows(look.points)): look for look in tiles.looks if look.rebuilt}
+    owner = {
+        frozenset(rows(observation.points)): observation
+        for observation in tiles.observations
+        if observation.rebuilt
+    }
     for seed in range(100):
         pairs = drawn(maker, 2, seed)
-        looks = {label: owner.get(frozenset(rows(current))) for label, (_, current) in pairs.items()}
-        if looks[1] is not None:
+        observations = {label: owner.get(frozenset(rows(current))) for label, (_, current) in pairs.items()}
+        if observations[1] is not None:
             found += 1
-            assert looks[0] is not None
-            assert (looks[0].changed, looks[1].changed) == (False, True)
-            for label, look in looks.items():
-                assert rows(pairs[label][0]) == rows(tiles.points_a[look.tile])  # the map is the reference
+            assert observations[0] is not None
+            assert (observations[0].changed, observations[1].changed) == (False, True)
+            for label, observation in observations.items():
+                assert rows(pairs[label][0]) == rows(
+                    tiles.points_a[observation.tile]
+                )  # the map is the reference
     assert 45 < found < 75
 
 
-def test_unchanged_pairs_beside_a_change_are_looks_of_that_visit(tiles):
+def test_unchanged_pairs_beside_a_change_are_observations_of_that_visit(tiles):
     maker = PairMaker(tiles, replace(PLAIN, shares=(1.0, 0.0, 0.0), beside_share=0.5, revisit_share=1.0))
-    beside = looks_of(tiles, changed=False, rebuilt=False)
+    beside = observations_of(tiles, changed=False, rebuilt=False)
     found = sum(
         any(frozenset(rows(cloud)) in beside for cloud in drawn(maker, 1, seed)[0]) for seed in range(100)
     )
     assert 35 < found < 65
 
 
-def test_a_set_without_further_looks_has_synthetic_changes_alone(tiles):
-    bare = replace(tiles, looks=())
+def test_a_set_without_further_observations_has_synthetic_changes_alone(tiles):
+    bare = replace(tiles, observations=())
     settings = replace(PLAIN, edited_share=0.5, rebuilt_share=0.5, beside_share=1.0, revisit_share=0.0)
     pair = PairMaker(bare, settings).pair(1, np.random.default_rng(0))
     assert rows(pair.reference) != rows(pair.current)
@@ -230,8 +253,7 @@ def nearest(points: np.ndarray, others: np.ndarray) -> np.ndarray:
 
 
 def test_the_same_stream_gives_the_same_pairs(tiles):
-    maker = PairMaker(tiles, PairSettings())
-    first, again = (next(maker.batches(8, 8, np.random.default_rng(5))) for _ in range(2))
+    first, again = (batches(tiles, PairSettings(), count=8)[0] for _ in range(2))
     assert np.array_equal(first.points, again.points)
     assert np.array_equal(first.labels, again.labels)
 
@@ -274,17 +296,17 @@ def test_different_tiles_are_3_m_apart_or_of_two_buildings(tiles):
 
 def test_a_second_look_loses_points_and_keeps_the_shape_at_half_intensity(tiles):
     reference = tiles.points_a[0]
-    nuisance = replace(SAME_LOOK, dropout=(0.5, 0.5))
+    nuisance = replace(SAME_OBSERVATION, dropout=(0.5, 0.5))
     for intensity, expected in ((1.0, 0.5), (0.5, 0.75)):
-        _, current = second_look(reference, reference, nuisance, intensity, np.random.default_rng(0))
+        _, current = second_observation(reference, reference, nuisance, intensity, np.random.default_rng(0))
         assert len(current) == round(expected * len(reference))
         assert rows(current) <= rows(reference)
 
 
-def test_both_looks_are_turned_and_shifted_together(tiles):
+def test_both_observations_are_turned_and_shifted_together(tiles):
     points = tiles.points_a[0]
-    nuisance = replace(SAME_LOOK, yaw=1.0, shift=0.3)
-    reference, current = second_look(points, points, nuisance, 1.0, np.random.default_rng(0))
+    nuisance = replace(SAME_OBSERVATION, yaw=1.0, shift=0.3)
+    reference, current = second_observation(points, points, nuisance, 1.0, np.random.default_rng(0))
     assert rows(reference) == rows(current)
     assert np.abs(reference - points).max() > 0.1
 

@@ -43,7 +43,7 @@ def store(tiles, tmp_path_factory):
 
 def test_a_published_model_opens_and_its_card_says_how_it_was_made(store):
     card = open_detector(store, "spicd-net/3", device="cpu").card
-    assert card.preprocessing.patch_points == 256
+    assert card.detector_settings["patch_points"] == 256
     assert card.training["command"] == "pytest"
     assert card.training["settings"]["train_pairs"] == 8
     assert card.training["best_epoch"] == 1

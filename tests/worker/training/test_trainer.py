@@ -13,12 +13,10 @@ from worker.detectors.spicd_net.network import PairHead
 from worker.errors import Cancelled
 from worker.training.dataset import save_tiles
 from worker.training.log import LOG
-from worker.training.metrics import measured
 from worker.training.pairs import PairSettings
 from worker.training.prefetch import prefetched
-from worker.training.schedule import Schedule
-from worker.training.settings import PAPER, TrainSettings
-from worker.training.trainer import BEST, CHECKPOINT, SETTLING_PAIRS, train
+from worker.training.settings import PAPER, Schedule, TrainSettings
+from worker.training.trainer import BEST, CHECKPOINT, INITIALIZATION_PAIRS, train
 
 TINY = TrainSettings(
     epochs=2, batch=8, train_pairs=48, validation_pairs=16, held_out=0.2, pairs=PairSettings(patch_points=256)
@@ -92,28 +90,42 @@ def test_a_checkpoint_from_before_a_setting_was_there_is_taken_up(dataset, tmp_p
     quick = replace(TINY, epochs=1, train_pairs=8, validation_pairs=8)
     train(quick, dataset, tmp_path)
     state = torch.load(tmp_path / CHECKPOINT, weights_only=True)
-    del state["settings"]["settle_head"], state["settings"]["pairs"]["twins"]
+    del state["settings"]["initialize_head"], state["settings"]["pairs"]["matched_pairs"]
     torch.save(state, tmp_path / CHECKPOINT)
     assert train(quick, dataset, tmp_path).name == BEST
     with pytest.raises(ValueError, match="other settings"):
-        train(replace(quick, settle_head=False), dataset, tmp_path)
+        train(replace(quick, initialize_head=False), dataset, tmp_path)
+
+
+def test_a_checkpoint_of_release_0_1_is_taken_up_under_the_settings_names_of_today(dataset, tmp_path):
+    quick = replace(TINY, epochs=1, train_pairs=8, validation_pairs=8)
+    train(quick, dataset, tmp_path)
+    state = torch.load(tmp_path / CHECKPOINT, weights_only=True)
+    settings, pairs = state["settings"], state["settings"]["pairs"]
+    settings["settle_head"], pairs["twins"] = settings.pop("initialize_head"), pairs.pop("matched_pairs")
+    del settings["detector"]
+    torch.save(state, tmp_path / CHECKPOINT)
+    assert train(quick, dataset, tmp_path).name == BEST
+    assert len(log_of(tmp_path)) == 1
 
 
 def test_the_head_begins_by_pairs_of_one_place_alone(dataset, tmp_path, monkeypatch):
     seen = []
-    monkeypatch.setattr(PairHead, "settle", lambda _, *inputs: seen.append([len(each) for each in inputs]))
+    monkeypatch.setattr(
+        PairHead, "initialize_from_data", lambda _, *inputs: seen.append([len(each) for each in inputs])
+    )
     train(replace(TINY, epochs=1, train_pairs=8, validation_pairs=8), dataset, tmp_path)
-    different = round(0.15 * SETTLING_PAIRS)
-    assert seen == [[SETTLING_PAIRS - different] * 3]
+    different = round(0.15 * INITIALIZATION_PAIRS)
+    assert seen == [[INITIALIZATION_PAIRS - different] * 3]
 
 
 def test_every_epoch_is_announced_once_its_files_are_there(dataset, tmp_path):
     seen = []
 
-    def look(folder):
+    def announced(folder):
         seen.append((len(log_of(folder)), torch.load(folder / CHECKPOINT, weights_only=True)["epochs"]))
 
-    train(replace(TINY, train_pairs=8, validation_pairs=8), dataset, tmp_path, on_epoch=look)
+    train(replace(TINY, train_pairs=8, validation_pairs=8), dataset, tmp_path, on_epoch=announced)
     assert seen == [(1, 1), (2, 2)]
 
 
@@ -121,7 +133,7 @@ def test_the_papers_preset_is_section_3_8():
     assert (PAPER.epochs, PAPER.patience, PAPER.batch) == (1000, 100, 16)
     assert (PAPER.train_pairs, PAPER.validation_pairs, PAPER.held_out, PAPER.seed) == (2000, 500, 0.1, 42)
     assert (PAPER.learning_rate, PAPER.final_learning_rate, PAPER.weight_decay) == (1e-3, 1e-5, 1e-4)
-    assert (PAPER.settle_head, PAPER.pairs.twins) == (False, False)
+    assert (PAPER.initialize_head, PAPER.pairs.matched_pairs) == (False, False)
 
 
 def test_other_settings_do_not_take_up_a_checkpoint(dataset, tmp_path):
@@ -172,15 +184,6 @@ def test_the_rate_follows_whichever_of_epochs_and_minutes_is_nearer_its_end():
     assert schedule.rate(0) == pytest.approx(1e-3)
     assert schedule.rate(0.5) == pytest.approx((1e-3 + 1e-5) / 2)
     assert schedule.rate(1) == pytest.approx(1e-5)
-
-
-def test_metrics_of_a_known_confusion():
-    answers = torch.eye(3)[[0, 0, 1, 1, 2, 0]].numpy()
-    found = measured(answers, torch.tensor([0, 0, 0, 1, 2, 2]).numpy(), loss=0.5)
-    assert found.accuracy == pytest.approx(4 / 6)
-    assert found.precision == pytest.approx((2 / 3, 1 / 2, 1))
-    assert found.recall == pytest.approx((2 / 3, 1, 1 / 2))
-    assert found.rank == (found.accuracy, 0.5)
 
 
 def test_prefetching_keeps_the_order_and_raises_where_the_maker_failed():

@@ -24,7 +24,7 @@ from worker.benchmarks.plots import Log
 from worker.benchmarks.timing import machine
 from worker.detectors.card import MODEL_STORE, Card
 from worker.metrics import PAPER_SWEEP, Confusion, best_f1, confusion
-from worker.pipeline.flow import PipelineSettings
+from worker.pipeline.settings import PipelineSettings
 from worker.progress import Progress, no_progress
 
 QUICK = ("magnitude_15cm", "type_remove", "baseline_no_change")

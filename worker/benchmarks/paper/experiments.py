@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 
 from worker.benchmarks.paper.site import Site
-from worker.benchmarks.tiles import flat_cells, tiles_of
 from worker.cloud.formats.scan import Scan
 from worker.cloud.poses import inverse, transformed
 from worker.cloud.tiling import TilePairs, pair_tiles
@@ -120,9 +119,9 @@ def _change(
 ) -> Trace:
     """Change the tile in the given scans as if they were one cloud; `points` takes what becomes of them."""
     grid, index = site.tiles.grid, site.tiles.indices[[tile]]
-    cell, centre = flat_cells(index, grid)[0], grid.centers(index)[0]
+    cell, centre = grid.cells(index)[0], grid.centers(index)[0]
     before = {scan: points[scan] if scan in points else site.placed(scan) for scan in scans}
-    within = {scan: tiles_of(cloud, grid) == cell for scan, cloud in before.items()}
+    within = {scan: grid.locate(cloud) == cell for scan, cloud in before.items()}
     within = {scan: mask for scan, mask in within.items() if mask.any()}
     cloud = np.concatenate([before[scan][mask] for scan, mask in within.items()])
     change = Change(magnitude=experiment.magnitude, density=experiment.density)

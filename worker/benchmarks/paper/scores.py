@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from worker.benchmarks.methods import CachedDetector, Method, TileScore, change_scores, encode_reference
 from worker.benchmarks.paper.experiments import Trial
-from worker.benchmarks.tiles import selected
 from worker.cloud.tiling import TilePairs, Tiles
 from worker.cloud.types import Bools, Floats
 
@@ -102,7 +101,7 @@ def embed(
         chosen = _chosen(outcome, trial.pairs.observed, rng)
         if not len(chosen):
             continue
-        pair = selected(trial.pairs, chosen)
+        pair = trial.pairs.subset(chosen)
         current = Tiles(grid=pair.reference.grid, indices=pair.reference.indices, points=pair.current)
         reference, now = known[chosen], encode_reference(cached.detector, current)["descriptors"]
         vectors.append(np.hstack([np.abs(reference - now), reference * now]))

@@ -10,16 +10,15 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from numpy.typing import NDArray
 
-from worker.benchmarks.tiles import flat_cells, tiles_of
 from worker.benchmarks.trajectory import scan_files
 from worker.cloud.poses import transformed
 from worker.cloud.tiling import Tiles, cut, grid_over
 from worker.cloud.types import Matrix4, Points
 from worker.cloud.voxels import Voxels, merged_in_order
-from worker.pipeline.flow import PipelineSettings
 from worker.pipeline.mapping.fusion import reference_map
 from worker.pipeline.mapping.map_registration import register_map_scans
 from worker.pipeline.registration.surface import Surface
+from worker.pipeline.settings import PipelineSettings
 from worker.progress import Progress
 from worker.simulation.scenes import corridor
 from worker.simulation.visits import DRIFT, drifted_within, stops, visit
@@ -101,7 +100,9 @@ def _mapped(
     whole = merged_in_order(voxels)
     grid = grid_over(whole.points, tile_size=pipeline.tiling.tile_size, voxel_size=size)
     tiles = cut(whole.points, grid, min_points=pipeline.tiling.min_points)
-    reference = None if settings.true_poses else reference_map(whole, settings=pipeline.registration)
+    reference = (
+        None if settings.true_poses else reference_map(whole, grid=grid, settings=pipeline.registration)
+    )
     return Site(
         name=name,
         scans=tuple(points for points, _ in scans),
@@ -118,5 +119,5 @@ def _mapped(
 
 def _dense(points: Points, tiles: Tiles, least: int) -> NDArray[np.intp]:
     """Return the places of the tiles in which points (N, 3), map frame, number at least `least`."""
-    cells, counts = np.unique(tiles_of(points, tiles.grid), return_counts=True)
-    return np.flatnonzero(np.isin(flat_cells(tiles.indices, tiles.grid), cells[counts >= least]))
+    cells, counts = np.unique(tiles.grid.locate(points), return_counts=True)
+    return np.flatnonzero(np.isin(tiles.grid.cells(tiles.indices), cells[counts >= least]))

@@ -27,10 +27,11 @@ from worker.benchmarks.timing import StageClock, machine, processor_seconds
 from worker.cloud.formats.scan import read_scan
 from worker.cloud.poses import difference, inverse
 from worker.cloud.types import Matrix4
-from worker.pipeline.flow import BuiltMap, PipelineSettings, build_map
+from worker.pipeline.flow import BuiltMap, build_map
 from worker.pipeline.mapping.fusion import ReferenceMap
 from worker.pipeline.registration.preprocessing import prepare
 from worker.pipeline.registration.scan_to_map import register
+from worker.pipeline.settings import PipelineSettings
 from worker.progress import Progress, no_progress
 from worker.simulation.visits import DRIFT, drifted_within, stops, visit
 

@@ -18,8 +18,9 @@ from worker.benchmarks.timing import StageClock
 from worker.cloud.poses import difference, inverse
 from worker.cloud.types import Matrix4
 from worker.errors import PipelineError
-from worker.pipeline.flow import BuiltMap, PipelineSettings, build_map
+from worker.pipeline.flow import BuiltMap, build_map
 from worker.pipeline.registration.results import ScanFile
+from worker.pipeline.settings import PipelineSettings
 from worker.progress import Progress, no_progress
 
 

@@ -24,7 +24,7 @@ from worker.benchmarks.trajectory import WRONG
 from worker.cloud.types import Floats
 from worker.detectors.card import MODEL_STORE
 from worker.detectors.store import open_card
-from worker.pipeline.flow import PipelineSettings
+from worker.pipeline.settings import PipelineSettings
 from worker.progress import Progress, no_progress
 
 VISITS = "visits"  #: folder of what is kept, within the benchmark's own

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from worker.benchmarks.tiles import flat_cells, tiles_of
 from worker.benchmarks.trajectory import PlacedScan
 from worker.cloud.poses import transformed
 from worker.cloud.tiling import TileGrid
@@ -46,9 +45,9 @@ def stated_sigmas(scans: Sequence[PlacedScan], grid: TileGrid, indices: Indices)
 
 def points_in(scan: PlacedScan, grid: TileGrid, indices: Indices) -> NDArray[np.int64]:
     """Count the points of the scan in each tile: (T,)"""
-    cells = tiles_of(transformed(scan.points, scan.placement.map_from_scan), grid)
+    cells = grid.locate(transformed(scan.points, scan.placement.map_from_scan))
     counts = np.bincount(cells[cells >= 0], minlength=int(np.prod(grid.shape)))
-    wanted: NDArray[np.int64] = counts[flat_cells(indices, grid)]
+    wanted: NDArray[np.int64] = counts[grid.cells(indices)]
     return wanted
 
 

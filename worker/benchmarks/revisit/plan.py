@@ -8,7 +8,7 @@ from typing import Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from worker.pipeline.flow import PipelineSettings
+from worker.pipeline.settings import PipelineSettings
 from worker.simulation.scenes import BUILDINGS, BuildingKind, Scene
 from worker.simulation.visits import DRIFT
 

@@ -19,9 +19,9 @@ from worker.benchmarks.revisit.misalignment import residual_misalignments, state
 from worker.benchmarks.revisit.plan import RevisitSettings, SitePlan, VisitPlan
 from worker.benchmarks.timing import StageClock
 from worker.benchmarks.trajectory import PlacedScan, map_frame, placed_scans, scan_files
+from worker.cloud import npz
 from worker.cloud.tiling import TileGrid, TilePairs, pair_tiles
-from worker.cloud.types import Arrays, Bools, Floats, Indices, Matrix4
-from worker.pipeline import archive
+from worker.cloud.types import Bools, Floats, Indices, Matrix4
 from worker.pipeline.flow import BuiltMap, NoScanAccepted, build_map, locate_survey
 from worker.pipeline.registration.results import ScanFile, ScanResult
 from worker.progress import Progress, no_progress
@@ -234,63 +234,28 @@ def _located(
 ) -> tuple[TilePairs, tuple[ScanResult, ...]]:
     reference, tiles = site.built.reference, site.built.tiles
     try:
-        located = locate_survey(files, reference, tiles, settings=settings.pipeline, progress=progress)
+        located = locate_survey(files, reference, settings=settings.pipeline, progress=progress)
     except NoScanAccepted as nobody:
         nothing = np.empty((0, 3), np.float32)
         return pair_tiles(tiles, nothing, settings=settings.pipeline.tiling), nobody.outcomes
-    return located.pairs, located.outcomes
+    return located.comparison.tile_pairs, located.outcomes
 
 
 def save(revisit: Revisit, folder: Path) -> None:
-    """Write two files of plain arrays; the second is written last and vouches for the first. Raises OSError."""
+    """Keep the visit in one file of plain arrays. Raises OSError."""
     folder.mkdir(parents=True, exist_ok=True)
-    archive.save_pairs(folder / f"{revisit.name}.pairs.npz", revisit.pairs)
-    archive.save_arrays(
-        folder / f"{revisit.name}.truth.npz",
-        {
-            "cells": revisit.cells,
-            "in_sight": revisit.in_sight,
-            "outside": np.array([revisit.outside]),
-            "misfit": revisit.misalignment,
-            "sigma": revisit.sigma,
-            **_scan_arrays("first", revisit.first),
-            **_scan_arrays("second", revisit.second),
-        },
-    )
+    npz.save(_path(revisit.name, folder), revisit)
 
 
 def is_kept(name: str, folder: Path) -> bool:
     """Tell whether there is a visit of this name."""
-    return (folder / f"{name}.truth.npz").exists()
+    return _path(name, folder).exists()
 
 
 def load(name: str, folder: Path) -> Revisit:
-    """Read what `save` wrote. Raises OSError, and ValueError for other files."""
-    truth = archive.load_arrays(folder / f"{name}.truth.npz")
-    return Revisit(
-        name=name,
-        pairs=archive.load_pairs(folder / f"{name}.pairs.npz"),
-        cells=truth["cells"],
-        in_sight=truth["in_sight"],
-        outside=int(truth["outside"][0]),
-        misalignment=truth["misfit"],
-        sigma=truth["sigma"],
-        first=_scan_errors("first", truth),
-        second=_scan_errors("second", truth),
-    )
+    """Read what `save` kept. Raises OSError, and ValueError for other files."""
+    return npz.load(_path(name, folder), Revisit)
 
 
-def _scan_arrays(which: str, errors: ScanErrors) -> Arrays:
-    return {
-        f"{which}_scans": np.array([errors.scans]),
-        f"{which}_metres": errors.metres,
-        f"{which}_sigmas": errors.sigmas,
-    }
-
-
-def _scan_errors(which: str, arrays: Arrays) -> ScanErrors:
-    return ScanErrors(
-        scans=int(arrays[f"{which}_scans"][0]),
-        metres=arrays[f"{which}_metres"],
-        sigmas=arrays[f"{which}_sigmas"],
-    )
+def _path(name: str, folder: Path) -> Path:
+    return folder / f"{name}.npz"

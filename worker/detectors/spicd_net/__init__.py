@@ -1,5 +1,5 @@
 """SPICD-Net (paper, Section 3.6): a Siamese PointNet with Chamfer statistics.
 
-`layers` and `network` are the network and need torch alone, `frozen` runs it fast, `detector` makes it a
-detector.
+`layers`, `chamfer` and `network` are the network and need torch alone, `frozen` runs it fast, `training` says how it
+is trained, `detector` makes it a detector.
 """

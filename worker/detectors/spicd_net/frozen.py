@@ -15,7 +15,7 @@ from worker.detectors.spicd_net.network import PointEncoder, TransformNet
 
 Layer = tuple[Tensor, Tensor]  #: weight (outputs, inputs), bias (outputs,)
 
-#: Points of a piece: 1,024 outputs of 256 points are 1 MiB, a core's second-level cache (measured best of 64 to 4,096).
+#: Points of a piece: 1,024 outputs of 256 points are 1 MiB, a core's second-level cache (best of 64 to 4,096).
 CPU_PIECE = 256
 
 
@@ -64,20 +64,20 @@ class FrozenEncoder:
 
 
 def _after(transform: Tensor, layer: Layer) -> Layer:
-    """The layer that takes `x` where the given one takes `x @ transform`."""
+    """Return the layer that takes `x` where the given one takes `x @ transform`."""
     weight, bias = layer
     return weight @ transform.t(), bias
 
 
 def highest_of(x: Tensor, layers: tuple[Layer, ...], pooled: Layer, piece: int) -> Tensor:
-    """(m, inputs) -> (outputs,): `pooled` behind rectified `layers`, and its maximum over the points."""
+    """Return `pooled` behind rectified `layers`, and its maximum over the points."""
     weight, bias = pooled
     highest: Tensor | None = None
     for part in torch.split(x, piece):
         for layer in layers:
             part = _rectified(layer, part)  # noqa: PLW2901
-        found = (weight @ part.t()).amax(dim=1)  # (outputs, piece) -> (outputs,)
-        highest = found if highest is None else torch.maximum(highest, found)
+        here = (weight @ part.t()).amax(dim=1)  # (outputs, piece) -> (outputs,)
+        highest = here if highest is None else torch.maximum(highest, here)
     if highest is None:
         raise ValueError("a cloud needs at least one point")
     return highest + bias

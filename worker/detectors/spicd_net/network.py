@@ -74,7 +74,7 @@ class PointEncoder(nn.Module):
         self.mlp4 = PooledLinear(128, DESCRIPTOR)
 
     def forward(self, points: Tensor, sizes: list[int]) -> tuple[Tensor, Tensor, Tensor]:
-        """(P, 3) metres, centroid at 0 -> descriptor (B, 1024), transforms (B, 3, 3) and (B, 64, 64)"""
+        """Return (P, 3) metres, centroid at 0 -> descriptor (B, 1024), transforms (B, 3, 3) and (B, 64, 64)"""
         a3 = self.input_transform(points, sizes)
         features = functional.relu(self.mlp2(functional.relu(self.mlp1(transformed(points, a3, sizes)))))
         a64 = self.feature_transform(features, sizes)
@@ -109,15 +109,15 @@ class PairHead(nn.Module):
         return logits
 
     @torch.no_grad()
-    def settle(self, reference: Tensor, current: Tensor, statistics: Tensor) -> None:
-        """Initialise by data: both first layers begin as if their inputs were standardised.
+    def initialize_from_data(self, reference: Tensor, current: Tensor, statistics: Tensor) -> None:
+        """Initialise from data: both first layers begin as if their inputs were standardised.
 
         The statistics differ by centimetres and the products are some ten, so that at first the head would
         hear of nothing but the products. Same arguments as `forward`.
         """
-        _settle(self.chamfer[0], statistics, blocks=(STATISTICS,))
+        _standardise(self.chamfer[0], statistics, blocks=(STATISTICS,))
         inputs = fused(reference, current, self.chamfer(statistics))
-        _settle(self.classifier[0], inputs, blocks=(DESCRIPTOR, DESCRIPTOR, CHAMFER_FEATURES))
+        _standardise(self.classifier[0], inputs, blocks=(DESCRIPTOR, DESCRIPTOR, CHAMFER_FEATURES))
 
 
 def fused(reference: Tensor, current: Tensor, geometry: Tensor) -> Tensor:
@@ -125,10 +125,10 @@ def fused(reference: Tensor, current: Tensor, geometry: Tensor) -> Tensor:
     return torch.cat([(reference - current).abs(), reference * current, geometry], dim=1)
 
 
-def _settle(layer: nn.Module, inputs: Tensor, *, blocks: tuple[int, ...]) -> None:
+def _standardise(layer: nn.Module, inputs: Tensor, *, blocks: tuple[int, ...]) -> None:
     """Scale and shift a Linear for its inputs (n, C), each block of columns giving the outputs equal variance."""
     if not isinstance(layer, nn.Linear):
-        raise TypeError(f"a linear layer is settled, not {type(layer).__name__}")
+        raise TypeError(f"a linear layer is initialised from data, not {type(layer).__name__}")
     std = inputs.std(dim=0)
     std = std.clamp_min(0.1 * float(std[std > 0].median()))  # columns that hardly vary are not blown up
     shares = [torch.full((n,), (inputs.shape[1] / (len(blocks) * n)) ** 0.5) for n in blocks]
@@ -162,5 +162,5 @@ class SpicdNetwork(nn.Module):
 
 
 def transformed(x: Tensor, matrices: Tensor, sizes: list[int]) -> Tensor:
-    """(P, k) and a matrix (B, k, k) for each cloud -> (P, k)"""
+    """Return (P, k) and a matrix (B, k, k) for each cloud -> (P, k)"""
     return torch.cat([cloud @ matrix for cloud, matrix in zip(torch.split(x, sizes), matrices, strict=True)])

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from worker.cloud import npz
 from worker.cloud.formats.scan import Scan
 from worker.cloud.types import Arrays, Floats, Matrix4
 from worker.cloud.visibility import ENOUGH, RangeImage, share_in_front
@@ -35,7 +36,7 @@ class PreparedScan:
         return None if self.image is None else self.image.origin
 
     def save(self, path: Path) -> None:
-        """Write `.npz`, aside and renamed."""
+        """Keep it as `.npz`."""
         arrays: Arrays = {
             "points": self.surface.points.astype(np.float32),
             "normals": self.surface.normals.astype(np.float32),
@@ -45,24 +46,21 @@ class PreparedScan:
         }
         if self.image is not None:
             arrays |= {"origin": self.image.origin, "ranges": self.image.ranges.astype(np.float32)}
-        aside = path.with_name(path.name + ".part")
-        with aside.open("wb") as file:
-            np.savez(file, **arrays)  # type: ignore[arg-type]
-        aside.replace(path)
+        npz.save_arrays(path, arrays)
 
     @classmethod
     def load(cls, path: Path) -> PreparedScan:
-        """Read what `save` wrote, and build the tree."""
-        with np.load(path, allow_pickle=False) as arrays:
-            image = None
-            if "origin" in arrays:
-                image = RangeImage(origin=arrays["origin"], ranges=arrays["ranges"].astype(np.float64))
-            return cls(
-                name=str(arrays["name"]),
-                surface=Surface.of(arrays["points"], arrays["normals"], arrays["oriented"]),
-                image=image,
-                sensor_pose=arrays["sensor_pose"],
-            )
+        """Read what `save` kept, and build the tree."""
+        arrays = npz.load_arrays(path)
+        image = None
+        if "origin" in arrays:
+            image = RangeImage(origin=arrays["origin"], ranges=arrays["ranges"].astype(np.float64))
+        return cls(
+            name=str(arrays["name"]),
+            surface=Surface.of(arrays["points"], arrays["normals"], arrays["oriented"]),
+            image=image,
+            sensor_pose=arrays["sensor_pose"],
+        )
 
 
 def prepare(scan: Scan, settings: RegistrationSettings) -> PreparedScan:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from worker.cloud.tiling import TilePairs
-from worker.detectors.detector import TileScores, change_score
+from worker.detectors.detector import Detection, change_score
 
 
 class TileState(IntEnum):
@@ -42,22 +42,22 @@ class ChangeSet:
         return change_score(self.probabilities)
 
     def counts(self) -> dict[str, int]:
-        """Tiles by state, every state named."""
-        found = Counter(int(state) for state in self.states)
-        return {state.label: found[state] for state in TileState}
+        """Count the tiles by state, every state named."""
+        counts = Counter(int(state) for state in self.states)
+        return {state.label: counts[state] for state in TileState}
 
 
-def decide(pairs: TilePairs, scores: TileScores, *, threshold: float) -> ChangeSet:
+def decide(pairs: TilePairs, detection: Detection, *, threshold: float) -> ChangeSet:
     """Call a tile changed where its score is above the threshold, and inconsistent where class 2 wins below it.
 
     The paper only knows the first; a tile that looks like another place is no proof of "no change" either.
     Raises ValueError where an observed tile has no score: that is a fault of the detector, and no state fits it.
     """
     observed = pairs.observed
-    unscored = int(np.isnan(scores.probabilities[observed]).any(axis=1).sum())
+    unscored = int(np.isnan(detection.probabilities[observed]).any(axis=1).sum())
     if unscored:
         raise ValueError(f"{unscored} of {int(observed.sum())} observed tiles were given NaN by the detector")
-    probabilities = np.where(observed[:, None], scores.probabilities, np.float32(np.nan))
+    probabilities = np.where(observed[:, None], detection.probabilities, np.float32(np.nan))
     states = np.full(len(probabilities), TileState.UNCHANGED, np.uint8)
     states[np.nan_to_num(probabilities).argmax(axis=1) == 2] = TileState.INCONSISTENT
     states[change_score(probabilities) > threshold] = TileState.CHANGED

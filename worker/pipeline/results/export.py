@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from worker.cloud.formats.ply import write_ply
 from worker.cloud.tiling import tile_id
-from worker.cloud.types import Colors, Points
+from worker.cloud.types import Colors
 from worker.pipeline.mapping.fusion import CurrentMap
 from worker.pipeline.results.changes import ChangeSet, TileState
 
@@ -41,7 +41,7 @@ class TileResult:
 
 
 def tile_results(changes: ChangeSet) -> list[TileResult]:
-    """Every tile of the reference, in the grid's order."""
+    """Return every tile of the reference, in the grid's order."""
     tiles = changes.pairs.reference
     lower = tiles.grid.lower(tiles.indices)
     return [
@@ -76,12 +76,13 @@ def _rounded(corner: NDArray[np.float64]) -> tuple[float, float, float]:
 
 
 def write_coloured_cloud(path: Path, current: CurrentMap, changes: ChangeSet) -> None:
-    """The survey's fused cloud as PLY, each point in the colour of its tile's state.
+    """Write the survey's fused cloud as PLY, each point in the colour of its tile's state.
 
     Scalar fields: `change_score` (float; NaN where not scored) and `tile_state` (uchar; TileState, or 255
     outside every reference tile).
     """
-    tile = _tile_of_points(current.points, changes)
+    tiles = changes.pairs.reference
+    tile = tiles.grid.locate_among(current.points, tiles.indices)
     inside = tile >= 0
     state = np.full(len(tile), NOT_IN_A_TILE, np.uint8)
     state[inside] = changes.states[tile[inside]]
@@ -95,20 +96,8 @@ def write_coloured_cloud(path: Path, current: CurrentMap, changes: ChangeSet) ->
     )
 
 
-def _tile_of_points(points: Points, changes: ChangeSet) -> NDArray[np.int64]:
-    """(N,) row of the tile that holds each point, -1 where none does."""
-    tiles = changes.pairs.reference
-    table = np.full(tiles.grid.shape, -1, np.int64)
-    table[tuple((tiles.indices - tiles.grid.lowest).T)] = np.arange(len(tiles.indices))
-    index = np.floor((points - tiles.grid.origin) / tiles.grid.size).astype(np.int64) - tiles.grid.lowest
-    inside = np.all((index >= 0) & (index < tiles.grid.shape), axis=1)
-    found = np.full(len(points), -1, np.int64)
-    found[inside] = table[tuple(index[inside].T)]
-    return found
-
-
-def _colors(state: NDArray[np.uint8]) -> Colors:
+def _colors(states: NDArray[np.uint8]) -> Colors:
     table = np.full((256, 3), _NOT_IN_A_TILE_COLOR, np.uint8)
-    for each, color in STATE_COLORS.items():
-        table[each] = color
-    return table[state]
+    for state, color in STATE_COLORS.items():
+        table[state] = color
+    return table[states]

@@ -4,22 +4,18 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-
-from worker.cloud.patches import patch
 from worker.cloud.tiling import Tiles, tile_id
 from worker.cloud.types import Points
 
-PATCHES = "tiles.npz"  #: one archive of arrays instead of two files a tile
-
 
 def manifest(
-    points: Points, tiles: Tiles, *, patch_size: int, min_points: int, voxel_size: float
+    points: Points, tiles: Tiles, *, patch_size: int | None, min_points: int, voxel_size: float
 ) -> dict[str, Any]:
-    """Table A1's fields for the map cloud (M, 3) and its tiles; JSON-ready, metres, map frame.
+    """Return Table A1's fields for the map cloud (M, 3) and its tiles; JSON-ready, metres, map frame.
 
-    Two differences: `file` and `dense_file` name an array within one archive, and `tile_origin` and
-    `tile_lowest_idx` are added, so that the grid can be rebuilt exactly. `dense_voxel` is the map's voxel size.
+    `tile_origin` and `tile_lowest_idx` are added to them, so that the grid can be rebuilt exactly. `dense_voxel` is
+    the map's voxel size. No tile has a file: the tiles are cut from the map's cloud along the grid, so `file` and
+    `dense_file` are null and `save_dense_tiles` is false. `patch_size` is null for a detector that has no patches.
     """
     size = [float(edge) for edge in tiles.grid.size]
     n_cells = tiles.grid.shape[0] * tiles.grid.shape[1] * tiles.grid.shape[2]
@@ -29,7 +25,7 @@ def manifest(
         "tile_origin": [float(value) for value in tiles.grid.origin],
         "patch_size": patch_size,
         "min_points": min_points,
-        "save_dense_tiles": True,
+        "save_dense_tiles": False,
         "dense_voxel": voxel_size,
         "map_bounds": {
             "min": [float(value) for value in points.min(axis=0)],
@@ -44,20 +40,11 @@ def manifest(
                 "tile_center": [round(float(value), 6) for value in center],
                 "n_original_points": len(tile),
                 "n_sampled_points": patch_size,
-                "file": f"{PATCHES}#patch/{tile_id(index)}",
-                "dense_file": f"{PATCHES}#dense/{tile_id(index)}",
+                "file": None,
+                "dense_file": None,
             }
             for index, center, tile in zip(tiles.indices, centers, tiles.points, strict=True)
         ],
         "n_valid_patches": len(tiles.points),
         "n_skipped_tiles": n_cells - len(tiles.points),
     }
-
-
-def padded_patches(tiles: Tiles, *, size: int, seed: int) -> tuple[Points, ...]:
-    """T patches (size, 3) float32, metres, each relative to its tile's centre, as Table A1 stores them."""
-    centers = tiles.grid.centers(tiles.indices)
-    return tuple(
-        patch((points - center).astype(np.float32), size=size, seed=seed).padded()
-        for points, center in zip(tiles.points, centers, strict=True)
-    )

@@ -1,4 +1,4 @@
-"""What stands around the map in a picture, and the look that both share: title, scale bar, legend."""
+"""The picture of a survey: the map from above, its tiles by state, title, scale bar and legend."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
 from worker.cloud.types import Points
+from worker.files import write_atomically
 from worker.pipeline.mapping.fusion import CurrentMap
 from worker.pipeline.results.changes import ChangeSet, TileState
 from worker.pipeline.results.export import STATE_COLORS
@@ -24,27 +25,21 @@ Extent = tuple[float, float, float, float]  #: left, right, bottom, top; metres,
 
 INK = "#1a1a1a"
 QUIET = "#666666"
-#: of the tiles in one column of the grid, the one that is shown; the rest would lie under it
-PRECEDENCE = (TileState.CHANGED, TileState.INCONSISTENT, TileState.UNOBSERVED, TileState.UNCHANGED)
-FILL = {
-    TileState.CHANGED: 0.4,
-    TileState.INCONSISTENT: 0.3,
-    TileState.UNOBSERVED: 0.1,
-    TileState.UNCHANGED: 0.0,
+#: How strongly a tile is filled, and a second sign beside the colour, for eyes and printers without it. Of the tiles
+#: in one column of the grid the first in this order is shown; the rest would lie under it.
+STYLES = {
+    TileState.CHANGED: (0.4, ""),
+    TileState.INCONSISTENT: (0.3, "xx"),
+    TileState.UNOBSERVED: (0.1, "//"),
+    TileState.UNCHANGED: (0.0, ""),
 }
-#: a second sign beside the colour, for eyes and printers without it
-HATCH = {
-    TileState.CHANGED: "",
-    TileState.INCONSISTENT: "xx",
-    TileState.UNOBSERVED: "//",
-    TileState.UNCHANGED: "",
-}
+PRECEDENCE = tuple(STYLES)
 HATCH_WIDTH = 0.5  # points
 HEAD, FOOT, SIDE = 0.75, 1.0, 0.55  # inches above, below and left of it
 
 
 def draw_scale_bar(figure: Figure, extent: Extent, scale: float) -> None:
-    """At the head, on the right; `scale` is inches a metre."""
+    """Draw a scale bar at the head, on the right; `scale` is inches a metre."""
     wide, high = figure.get_size_inches()
     longest = max((extent[1] - extent[0]) / 4, 0.5)
     length = next(size for size in (20.0, 10.0, 5.0, 2.0, 1.0, 0.5) if size <= longest)
@@ -55,7 +50,7 @@ def draw_scale_bar(figure: Figure, extent: Extent, scale: float) -> None:
 
 
 def dress(figure: Figure, axes: Axes, extent: Extent, changes: ChangeSet, title: str) -> None:
-    """Axes, title and counts at the head, legend at the foot."""
+    """Write axes, title and counts at the head, the legend at the foot."""
     axes.set_xlim(extent[0], extent[1])
     axes.set_ylim(extent[2], extent[3])
     axes.tick_params(labelsize=7, colors=QUIET, length=2)
@@ -83,17 +78,17 @@ def dress(figure: Figure, axes: Axes, extent: Extent, changes: ChangeSet, title:
 
 
 def _legend_entry(state: TileState, count: int) -> Patch:
-    color = color_of(state)
+    color, (fill, hatch) = color_of(state), STYLES[state]
     return Patch(
-        facecolor=(*color, max(FILL[state], 0.05)),
+        facecolor=(*color, max(fill, 0.05)),
         edgecolor=color,
-        hatch=HATCH[state],
+        hatch=hatch,
         label=f"{count} {state.label}",
     )
 
 
 def color_of(state: TileState) -> tuple[float, float, float]:
-    """Red, green, blue, 0..1."""
+    """Return red, green, blue, 0..1."""
     red, green, blue = (channel / 255 for channel in STATE_COLORS[state])
     return red, green, blue
 
@@ -124,14 +119,12 @@ def draw_picture(
     _draw_tiles(axes, changes, tile_inches=float(changes.pairs.reference.grid.size[0]) * scale)
     draw_scale_bar(figure, extent, scale)
     dress(figure, axes, extent, changes, title)
-    aside = path.with_name(path.name + ".tmp")
     with rc_context({"hatch.linewidth": HATCH_WIDTH}):
-        figure.savefig(aside, format="png")
-    aside.replace(path)
+        write_atomically(path, lambda aside: figure.savefig(aside, format="png"))
 
 
 def _extent(changes: ChangeSet) -> Extent:
-    """left, right, bottom, top in metres: all tiles, and half a metre around."""
+    """Return left, right, bottom, top in metres: all tiles, and half a metre around."""
     tiles = changes.pairs.reference
     lower = tiles.grid.lower(tiles.indices)
     left, bottom = lower[:, :2].min(axis=0) - 0.5
@@ -151,7 +144,7 @@ def _draw_walls(axes: Axes, reference: Points, current: Points, extent: Extent) 
 
 
 def _standing(points: Points, floor: float, extent: Extent) -> NDArray[np.float64]:
-    """(rows, columns) voxels from 15 cm to 2 m above the floor in each pixel."""
+    """Return (rows, columns) voxels from 15 cm to 2 m above the floor in each pixel."""
     body = points[(points[:, 2] > floor + 0.15) & (points[:, 2] < floor + 2.0)]
     left, right, bottom, top = extent
     pixel = max(_PIXEL, (top - bottom) / _MOST_PIXELS, (right - left) / _MOST_PIXELS)
@@ -161,7 +154,7 @@ def _standing(points: Points, floor: float, extent: Extent) -> NDArray[np.float6
 
 
 def _near(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Grown by two pixels, 10 cm: noise at a wall is not news."""
+    """Grow the mask by two pixels, 10 cm: noise at a wall is no change."""
     grown = mask.copy()
     for axis in (0, 1):
         for shift in (-2, -1, 1, 2):
@@ -174,16 +167,16 @@ def _draw_tiles(axes: Axes, changes: ChangeSet, *, tile_inches: float) -> None:
     lower = tiles.grid.lower(tiles.indices)
     for row in _topmost(changes):
         state = TileState(int(changes.states[row]))
-        color = color_of(state)
+        color, (fill, hatch) = color_of(state), STYLES[state]
         axes.add_patch(
             Rectangle(
                 (lower[row, 0], lower[row, 1]),
                 float(tiles.grid.size[0]),
                 float(tiles.grid.size[1]),
-                facecolor=(*color, FILL[state]),
+                facecolor=(*color, fill),
                 edgecolor=(0.6, 0.6, 0.6, 0.35) if state is TileState.UNCHANGED else color,
                 linewidth=2.0 if state is TileState.CHANGED else 0.6,
-                hatch=HATCH[state],
+                hatch=hatch,
                 zorder=3 if state is TileState.CHANGED else 2,
             )
         )
@@ -192,7 +185,7 @@ def _draw_tiles(axes: Axes, changes: ChangeSet, *, tile_inches: float) -> None:
 
 
 def _topmost(changes: ChangeSet) -> list[int]:
-    """Of each column of the grid the row of the tile that is shown: by precedence, then by score."""
+    """Return of each column of the grid the row of the tile that is shown: by precedence, then by score."""
     shown: dict[tuple[int, int], int] = {}
     for row in sorted(range(len(changes.states)), key=lambda row: _order(changes, row)):
         i, j, _ = changes.pairs.reference.indices[row]
@@ -206,7 +199,7 @@ def _order(changes: ChangeSet, row: int) -> tuple[int, float]:
 
 
 def _label(axes: Axes, changes: ChangeSet, row: int, *, with_id: bool) -> None:
-    """In a corner of the tile, off what stands in it: the score, and the numbers of the id that tables name."""
+    """Write in a corner of the tile, off what stands in it: the score, and the numbers of the id that tables name."""
     tiles = changes.pairs.reference
     index = tiles.indices[row]
     x, y = tiles.grid.lower(index)[0], tiles.grid.lower(index)[1] + tiles.grid.size[1]

@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 
 from worker.benchmarks.paper.site import Site
-from worker.benchmarks.tiles import flat_cells, tiles_of
 from worker.cloud.tiling import cut, grid_over
 from worker.cloud.types import Points
 from worker.cloud.voxels import Voxels, merged_in_order
-from worker.pipeline.flow import PipelineSettings
+from worker.pipeline.settings import PipelineSettings
 
 TILES = 4
 POINTS = 2000  #: of a scan in a tile
@@ -34,8 +33,8 @@ def site() -> Site:
     voxels = tuple(Voxels.of(points, size=0.05) for points in scans)
     whole = merged_in_order(voxels)
     tiles = cut(whole.points, grid, min_points=512)
-    flat = flat_cells(tiles.indices, grid)
-    dense = tuple(np.flatnonzero(np.isin(flat, tiles_of(points, grid))) for points in scans)
+    flat = grid.cells(tiles.indices)
+    dense = tuple(np.flatnonzero(np.isin(flat, grid.locate(points))) for points in scans)
     return Site(
         name="boxes",
         scans=scans,

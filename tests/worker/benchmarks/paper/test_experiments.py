@@ -10,7 +10,6 @@ import pytest
 from tests.worker.benchmarks.paper.conftest import POINTS
 from worker.benchmarks.paper.experiments import Experiment, experiments, inject, published, trials
 from worker.benchmarks.paper.site import Site
-from worker.benchmarks.tiles import flat_cells, tiles_of
 from worker.cloud.types import Points
 from worker.progress import no_progress
 from worker.simulation.scenes import ChangeKind
@@ -45,10 +44,10 @@ def test_one_tile_of_one_scan_changes_by_its_share_of_points(
     found = inject(site, replace(ONE, operation=kind), 0)
     ((scan, after),) = found.scans.items()
     (tile,) = np.flatnonzero(found.truth)
-    cell = flat_cells(site.tiles.indices[[tile]], site.tiles.grid)[0]
-    inside = tiles_of(after, site.tiles.grid) == cell
+    cell = site.tiles.grid.cells(site.tiles.indices[[tile]])[0]
+    inside = site.tiles.grid.locate(after) == cell
     assert inside.sum() == POINTS + points
-    untouched = site.scans[scan][tiles_of(site.scans[scan], site.tiles.grid) != cell]
+    untouched = site.scans[scan][site.tiles.grid.locate(site.scans[scan]) != cell]
     assert rows(after[~inside]) == rows(untouched)
 
 
@@ -56,17 +55,17 @@ def test_what_is_moved_to_the_border_stays_in_its_tile(site: Site) -> None:
     far = replace(ONE, operation="move", magnitude=5.0, density=0.5)
     found = inject(site, far, 0)
     ((scan, after),) = found.scans.items()
-    before = np.unique(tiles_of(site.scans[scan], site.tiles.grid), return_counts=True)[1]
-    assert np.unique(tiles_of(after, site.tiles.grid), return_counts=True)[1].tolist() == before.tolist()
+    before = np.unique(site.tiles.grid.locate(site.scans[scan]), return_counts=True)[1]
+    assert np.unique(site.tiles.grid.locate(after), return_counts=True)[1].tolist() == before.tolist()
 
 
 def test_everywhere_the_points_vanish_from_all_scans_that_saw_the_tile(site: Site) -> None:
     found = inject(site, ONE, 0, everywhere=True)
     (tile,) = np.flatnonzero(found.truth)
-    cell = flat_cells(site.tiles.indices[[tile]], site.tiles.grid)[0]
+    cell = site.tiles.grid.cells(site.tiles.indices[[tile]])[0]
     seen = [scan for scan, places in enumerate(site.dense) if tile in places]
     assert sorted(found.scans) == seen
-    left = sum(int((tiles_of(points, site.tiles.grid) == cell).sum()) for points in found.scans.values())
+    left = sum(int((site.tiles.grid.locate(points) == cell).sum()) for points in found.scans.values())
     assert left == round(0.65 * POINTS * len(seen))
 
 

@@ -19,7 +19,7 @@ def test_only_tiles_with_new_points_are_scored_again(site: Site) -> None:
     detector = CountingDetector()
     carried_out = list(trials(site, [NOTHING, ONE, NOTHING], no_progress))
     method = scored_by_detector("counting", CachedDetector(detector=detector), carried_out)
-    assert detector.described == 1
+    assert detector.encoded == 1
     assert detector.asked == [4, 4, 1]  # the first against the clock
     assert method.scores[0].tolist() == method.scores[2].tolist() == [0, 0, 0, 0]
     (tile,) = np.flatnonzero(carried_out[1].truth)

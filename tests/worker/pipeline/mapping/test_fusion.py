@@ -5,6 +5,7 @@ import functools
 import numpy as np
 import pytest
 
+from tests.support.tilings import grid_of
 from worker.cloud.types import Colors, Floats
 from worker.cloud.voxels import Voxels
 from worker.errors import MapFailed
@@ -73,13 +74,15 @@ def test_no_scan_makes_no_map() -> None:
 def test_a_floor_seen_from_above_has_normals_up_and_seen_from_below_down() -> None:
     for height, up in ((1.0, 1.0), (-1.0, -1.0)):
         scan = scan_of(floor(), origin=np.array([1.0, 1.0, height]))
-        reference = reference_map(fuse([scan], voxel_size=0.05), settings=SETTINGS)
+        reference = reference_map(fuse([scan], voxel_size=0.05), grid=grid_of(1, 1, 1), settings=SETTINGS)
         assert reference.normals == pytest.approx(np.tile([0, 0, up], (len(reference.points), 1)), abs=1e-3)
         assert reference.oriented.all()
 
 
 def test_a_floor_seen_from_nowhere_known_is_not_oriented() -> None:
-    reference = reference_map(fuse([scan_of(floor())], voxel_size=0.05), settings=SETTINGS)
+    reference = reference_map(
+        fuse([scan_of(floor())], voxel_size=0.05), grid=grid_of(1, 1, 1), settings=SETTINGS
+    )
     assert not reference.oriented.any()
     assert np.abs(reference.normals[:, 2]) == pytest.approx(np.ones(len(reference.points)), abs=1e-3)
 
@@ -87,7 +90,7 @@ def test_a_floor_seen_from_nowhere_known_is_not_oriented() -> None:
 def test_the_reference_keeps_points_colours_and_the_voxel_size() -> None:
     colors = np.tile(np.array([[10, 20, 30]], np.uint8), (len(floor()), 1))
     fused = fuse([scan_of(floor(), colors=colors)], voxel_size=0.1)
-    reference = reference_map(fused, settings=SETTINGS)
+    reference = reference_map(fused, grid=grid_of(1, 1, 1), settings=SETTINGS)
     assert len(reference.points) == 20 * 20
     assert reference.voxel_size == 0.1
     assert reference.colors is not None
@@ -96,7 +99,9 @@ def test_the_reference_keeps_points_colours_and_the_voxel_size() -> None:
 
 
 def test_the_maps_surface_is_what_was_fused() -> None:
-    reference = reference_map(fuse([scan_of(floor())], voxel_size=0.05), settings=SETTINGS)
+    reference = reference_map(
+        fuse([scan_of(floor())], voxel_size=0.05), grid=grid_of(1, 1, 1), settings=SETTINGS
+    )
     surface = reference.surface()
     distance, index = surface.nearest(reference.points.astype(np.float64))
     assert distance.max() == 0
@@ -104,7 +109,9 @@ def test_the_maps_surface_is_what_was_fused() -> None:
 
 
 def test_the_current_map_is_fused_in_the_voxels_of_the_reference() -> None:
-    reference = reference_map(fuse([scan_of(floor())], voxel_size=0.05), settings=SETTINGS)
+    reference = reference_map(
+        fuse([scan_of(floor())], voxel_size=0.05), grid=grid_of(1, 1, 1), settings=SETTINGS
+    )
     current = current_map([scan_of(floor()[::-1])], voxel_size=reference.voxel_size)
     assert current.points == pytest.approx(reference.points)
     assert current.colors is None

@@ -5,7 +5,7 @@ import pytest
 
 from tests.support.rooms import scores_of
 from tests.support.tilings import row_of
-from worker.detectors.detector import TileScores
+from worker.detectors.detector import Detection
 from worker.pipeline.results.changes import TileState, decide
 
 NAN = (float("nan"),) * 3
@@ -83,6 +83,6 @@ def test_counts_name_every_state_and_add_up_to_the_tiles() -> None:
 
 
 def test_a_map_of_no_tile_has_no_state() -> None:
-    nothing = TileScores(probabilities=np.empty((0, 3), np.float32))
+    nothing = Detection(probabilities=np.empty((0, 3), np.float32))
     counts = decide(row_of([], [], observed=[]), nothing, threshold=0.5).counts()
     assert counts == {"unchanged": 0, "changed": 0, "inconsistent": 0, "unobserved": 0}

@@ -8,7 +8,7 @@ import pytest
 
 from tests.support.tilings import grid_of, in_tile
 from worker.cloud.tiling import TileGrid, cut, grown
-from worker.pipeline.results.manifest import PATCHES, manifest
+from worker.pipeline.results.manifest import manifest
 
 FIELDS = {
     "tile_size", "patch_size", "min_points", "save_dense_tiles", "dense_voxel", "map_bounds",
@@ -37,7 +37,14 @@ def test_the_fields_are_those_of_table_a1_and_where_the_grid_begins(listing: dic
 def test_sizes_stand_as_given(listing: dict[str, Any]) -> None:
     assert listing["tile_size"] == [1.5, 1.5, 1.0]
     assert (listing["patch_size"], listing["min_points"], listing["dense_voxel"]) == (4096, 512, 0.05)
-    assert listing["save_dense_tiles"] is True
+    assert listing["save_dense_tiles"] is False
+
+
+def test_a_detector_without_patches_says_nothing_of_their_size() -> None:
+    tiles = cut(POINTS, grid_of(3, 2, 2), min_points=512)
+    listing = manifest(POINTS, tiles, patch_size=None, min_points=512, voxel_size=0.05)
+    assert listing["patch_size"] is None
+    assert {patch["n_sampled_points"] for patch in listing["patches"]} == {None}
 
 
 def test_bounds_are_those_of_every_point_of_the_map(listing: dict[str, Any]) -> None:
@@ -54,8 +61,8 @@ def test_tile_2_1_1_is_listed_with_its_place_and_points(listing: dict[str, Any])
         "tile_center": [13.75, -0.75, 2.0],
         "n_original_points": 512,
         "n_sampled_points": 4096,
-        "file": f"{PATCHES}#patch/tile_002_001_001",
-        "dense_file": f"{PATCHES}#dense/tile_002_001_001",
+        "file": None,
+        "dense_file": None,
     }
 
 

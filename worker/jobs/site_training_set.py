@@ -20,20 +20,20 @@ MIN_TWICE_SEEN = 3  #: held-out tiles that both halves saw, for the threshold
 
 
 def halves(scans: Iterable[RegisteredScan], *, voxel_size: float) -> tuple[Points, Points]:
-    """Two clouds (N, 3) in the map frame, of every other scan each; one scan is held at a time."""
+    """Return two clouds (N, 3) in the map frame, of every other scan each; one scan is held at a time."""
     fused: list[Voxels | None] = [None, None]
     for number, scan in enumerate(scans):
         one, before = Voxels.of(scan.points, size=voxel_size), fused[number % 2]
         fused[number % 2] = one if before is None else before.merged(one)
     nothing = np.empty((0, 3), np.float32)
-    first, second = (nothing if each is None else each.points for each in fused)
+    first, second = (nothing if half is None else half.points for half in fused)
     return first, second
 
 
 def training_set(
     tiles: Tiles, visits: tuple[Points, Points], *, settings: TilingSettings, source: str
 ) -> TileSet:
-    """Where both visits saw a tile well, it is of these two; any other tile of the map has one look alone."""
+    """Pair the tiles that both visits saw well; any other tile of the map has one observation alone."""
     first, second = visits
     seen = _seen_twice(first, second, tiles, settings)
     middle = tiles.grid.centers(tiles.indices)
@@ -44,7 +44,7 @@ def training_set(
     return TileSet(
         points_a=tuple(_about(a, centre) for (a, _), centre in zip(pairs, middle, strict=True)),
         points_b=tuple(_about(b, centre) for (_, b), centre in zip(pairs, middle, strict=True)),
-        looks=(),
+        observations=(),
         centres=middle,
         buildings=np.zeros(len(pairs), np.int32),
         tile_size=settings.tile_size,
@@ -53,7 +53,7 @@ def training_set(
 
 
 def held_out_share(tiles: TileSet, *, min_separation: float) -> float:
-    """The least share of tiles that is enough to validate on. Raises TrainingFailed with the numbers."""
+    """Return the least share of tiles that is enough to validate on. Raises TrainingFailed with the numbers."""
     for share in SHARES:
         if len(tiles) < 2:
             break
@@ -74,10 +74,10 @@ def _seen_twice(
     if not len(first) or not len(second):
         return {}
     reference = cut(first, tiles.grid, min_points=settings.min_points)
-    found = pair_tiles(reference, second, settings=settings)
+    pairs = pair_tiles(reference, second, settings=settings)
     return {
-        tuple(reference.indices[at].tolist()): (reference.points[at], found.current[at])
-        for at in np.flatnonzero(found.observed).tolist()
+        tuple(reference.indices[row].tolist()): (reference.points[row], pairs.current[row])
+        for row in np.flatnonzero(pairs.observed).tolist()
     }
 
 
@@ -90,5 +90,5 @@ def _twice(tiles: TileSet) -> int:
 
 
 def _has_two_places(centres: NDArray[np.float64], min_separation: float) -> bool:
-    """Whether any two tiles are far enough apart to be told as different places."""
+    """Return whether any two tiles are far enough apart to be told as different places."""
     return any((np.linalg.norm(centres - one, axis=1) >= min_separation).any() for one in centres)

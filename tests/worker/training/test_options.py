@@ -1,0 +1,51 @@
+"""The options of both command lines are fields of the settings."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import fields
+from pathlib import Path
+
+import pytest
+
+from worker.training import __main__ as command
+from worker.training.options import OPTIONS, with_options
+from worker.training.pairs import PairSettings
+from worker.training.settings import PAPER, TrainSettings
+
+
+@pytest.mark.parametrize("option", OPTIONS, ids=lambda option: option.name)
+def test_every_option_is_a_field(option):
+    settings = PairSettings if option.of_pairs else TrainSettings
+    assert option.name in {field.name for field in fields(settings)}
+
+
+def test_what_is_given_takes_the_place_of_the_default_and_nothing_else_does():
+    given = {"epochs": 3, "edited_share": 0.0, "density": [0.1, 0.2], "minutes": None, "folder": Path()}
+    made = with_options(PAPER, given, device="cuda")
+    assert (made.epochs, made.minutes, made.device, made.coarse_search) == (3, None, "cuda", False)
+    assert (made.pairs.edited_share, made.pairs.density) == (0.0, (0.1, 0.2))
+    assert made.pairs.matched_pairs is PAPER.pairs.matched_pairs
+
+
+def test_the_bare_command_line_takes_them_all(monkeypatch, tmp_path, capsys):
+    seen = []
+
+    def train(settings, tiles, folder, progress):
+        seen.append((settings, tiles, folder))
+        return folder / "best.pt"
+
+    words = [
+        word
+        for option in OPTIONS
+        for word in (option.flag, *["1"] * option.count * (option.kind is not bool))
+    ]
+    monkeypatch.setattr(command, "train", train)
+    monkeypatch.setattr(sys, "argv", ["train", "tiles.npz", str(tmp_path), "--device", "cpu", *words])
+    command.main()
+    ((settings, tiles, folder),) = seen
+    assert (tiles, folder) == (Path("tiles.npz"), tmp_path)
+    for option in OPTIONS:
+        value = getattr(settings.pairs if option.of_pairs else settings, option.name)
+        assert value == ((1.0, 1.0) if option.count == 2 else option.kind(1))
+    assert capsys.readouterr().out == f"{tmp_path / 'best.pt'}\n"

@@ -1,0 +1,38 @@
+"""The settings of the whole method, one class a stage."""
+
+from __future__ import annotations
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from worker.cloud.tiling import TilingSettings
+from worker.detectors.card import Preprocessing
+from worker.pipeline.mapping.settings import JointRegistrationSettings, MapSettings
+from worker.pipeline.registration.settings import RegistrationSettings, with_values
+
+
+class PipelineSettings(BaseModel):
+    """One settings class a stage."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    registration: RegistrationSettings = Field(default_factory=RegistrationSettings)
+    mapping: MapSettings = Field(default_factory=MapSettings)
+    tiling: TilingSettings = Field(default_factory=TilingSettings)
+    max_scan_points: int = Field(50_000_000, gt=0)
+
+    def for_model(self, needs: Preprocessing) -> PipelineSettings:
+        """Return the same settings with what is tied to a model's weights put in its place."""
+        voxels = {"voxel_size": needs.voxel_size}
+        tiles = {"tile_size": needs.tile_size, "min_points": needs.min_points}
+        return with_values(
+            self,
+            registration=with_values(self.registration, **voxels),
+            tiling=with_values(self.tiling, **tiles),
+        )
+
+    @property
+    def joint_registration(self) -> JointRegistrationSettings:
+        """What the registration of many scans needs of these."""
+        return JointRegistrationSettings(
+            registration=self.registration, mapping=self.mapping, max_points=self.max_scan_points
+        )
