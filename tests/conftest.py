@@ -20,9 +20,9 @@ TESTS = Path(__file__).resolve().parent
 SLOW = (
     "acceptance",
     "integration",
-    "service/test_api_memory.py",
-    "service/test_catalog_migrations.py",
-    "service/test_embedded_redis.py",
+    "service/api/test_memory.py",
+    "service/catalog/test_migrations.py",
+    "service/up/test_embedded_redis.py",
     "worker/benchmarks/paper/test_benchmark.py",
     "worker/benchmarks/paper/test_report.py",
     "worker/benchmarks/registration/test_benchmark.py",

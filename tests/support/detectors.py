@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+from pydantic import BaseModel
 
 from worker.cloud.tiling import Tiles
 from worker.cloud.types import Arrays
@@ -10,6 +13,10 @@ from worker.detectors.card import Card, Preprocessing
 from worker.detectors.comparison import Comparison, Side
 from worker.detectors.detector import Detection
 from worker.progress import Progress, no_progress
+
+
+class NoSettings(BaseModel):
+    """The card says nothing beyond what every card does."""
 
 
 class CountingDetector:
@@ -23,6 +30,12 @@ class CountingDetector:
         threshold=0.0,
         preprocessing=Preprocessing(voxel_size=0.05, tile_size=(1.5, 1.5, 1.0), min_points=512),
     )
+
+    settings_class = NoSettings
+
+    @classmethod
+    def load(cls, card: Card, weights: Any, device: Any) -> CountingDetector:
+        return cls()
 
     def __init__(self) -> None:
         self.encoded = 0

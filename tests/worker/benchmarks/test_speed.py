@@ -54,7 +54,7 @@ def test_any_detector_of_the_store_can_be_timed(tmp_path: Path, monkeypatch: pyt
     folder = tmp_path / "counting" / "1"
     folder.mkdir(parents=True)
     write_card(folder, CountingDetector.card)
-    monkeypatch.setitem(store.DETECTORS, "counting", lambda *_: CountingDetector())
+    monkeypatch.setitem(store.DETECTORS, "counting", CountingDetector)
     detector = open_model(tmp_path, "counting/1")
     figures = scoring_bench(made_pairs(), detector, repeats=2)
     assert list(figures["seconds"]) == ["c2c", "uncached", "cached"]
