@@ -23,7 +23,7 @@ from worker.__main__ import _parse
 #: Required though no line imports them: SQLAlchemy loads the driver that a URL names.
 LOADED_BY_NAME = {"psycopg"}
 #: Imported though another package is required, which hands them on as its own.
-HANDED_ON = {"starlette": "fastapi", "psycopg-binary": "psycopg"}
+HANDED_ON = {"pydantic-core": "pydantic", "starlette": "fastapi", "psycopg-binary": "psycopg"}
 
 COMPOSE: dict[str, Any] = yaml.safe_load((ROOT / "docker/compose.yaml").read_text())
 SERVICES: dict[str, dict[str, Any]] = COMPOSE["services"]
