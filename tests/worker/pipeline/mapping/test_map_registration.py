@@ -383,16 +383,16 @@ def test_a_bare_plane_among_sound_scans_is_left_out_with_its_reason(
 # being stopped
 
 
-@pytest.mark.parametrize("stage", ["reading", "registering", "refining"])
-def test_a_dismissal_stops_any_stage(drifted: tuple[ScanFile, ...], stage: str) -> None:
+@pytest.mark.parametrize("last", ["reading", "registering", "refining"])
+def test_a_dismissal_stops_any_stage(drifted: tuple[ScanFile, ...], last: str) -> None:
     told: list[str] = []
 
-    def dismissed(at: str, share: float) -> None:
-        told.append(at)
-        if at == stage:
+    def dismissed(stage: str, share: float) -> None:
+        told.append(stage)
+        if stage == last:
             raise Cancelled("the job was dismissed")
 
     with pytest.raises(Cancelled):
         place(drifted[:2], progress=dismissed)
-    assert told[-1] == stage
-    assert told.count(stage) == 1
+    assert told[-1] == last
+    assert told.count(last) == 1

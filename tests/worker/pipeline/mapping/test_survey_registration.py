@@ -269,16 +269,16 @@ def test_a_scan_of_more_points_than_the_limit_is_refused(room: Room, files: tupl
         place(files[:1], room.target, few)
 
 
-@pytest.mark.parametrize("stage", ["registering", "refining"])
-def test_a_dismissal_stops_within_one_step(room: Room, files: tuple[ScanFile, ...], stage: str) -> None:
+@pytest.mark.parametrize("last", ["registering", "refining"])
+def test_a_dismissal_stops_within_one_step(room: Room, files: tuple[ScanFile, ...], last: str) -> None:
     told: list[str] = []
 
-    def dismissed(at: str, share: float) -> None:
-        told.append(at)
-        if told.count(stage) == 2:
+    def dismissed(stage: str, share: float) -> None:
+        told.append(stage)
+        if told.count(last) == 2:
             raise Cancelled("the job was dismissed")
 
     with pytest.raises(Cancelled):
         place(files[:2], room.target, progress=dismissed)
-    assert told.count(stage) == 2
-    assert told[-1] == stage
+    assert told.count(last) == 2
+    assert told[-1] == last
