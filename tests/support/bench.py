@@ -1,4 +1,4 @@
-"""A queue, workers with steps of their own (standin.py), and the record of what the steps did."""
+"""A queue, workers with steps of their own (standin.py), the record of what the steps did, and a map's job."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Models for tests that need no trained weights."""
+"""A model of SPICD-Net with random weights, written as `model_store` holds one."""
 
 from __future__ import annotations
 

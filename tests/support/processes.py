@@ -1,4 +1,4 @@
-"""Processes as tests look at them, in Linux's /proc, and how to wait for them."""
+"""Whether a process runs and which it has started, by Linux's /proc, and a wait for a condition."""
 
 from __future__ import annotations
 

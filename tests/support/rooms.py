@@ -1,4 +1,4 @@
-"""Known geometry for the stages: a simulated furnished room, and a stand-in for a network."""
+"""A simulated furnished room that was scanned twice, points as a scan, a wall, and scores as a detection."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A second detector, registered by its entry alone: what every stage has to do with it follows from the protocol."""
+"""A detector that is entered in the table of detectors, with settings of its own and scores of voxels."""
 
 from __future__ import annotations
 

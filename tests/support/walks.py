@@ -1,4 +1,7 @@
-"""Scans of the simulated room as files and as prepared scans, thinned so that a test takes no longer than it must."""
+"""Scans of the simulated room as files and as prepared scans, a corridor's points, and how far poses are off.
+
+Scans are thinned, so that a test takes no longer than it must.
+"""
 
 from __future__ import annotations
 

@@ -1,3 +1,5 @@
+"""The simulated room, made once a session."""
+
 from __future__ import annotations
 
 import pytest

@@ -274,6 +274,7 @@ def test_a_map_with_a_file_that_is_no_scan_goes_on_with_the_others_and_names_it(
     built = build_map([files[0], _broken(tmp_path), files[1]], settings=SETTINGS, processes=1)
     assert [outcome.registration is not None for outcome in built.outcomes] == [True, False, True]
     assert str(built.outcomes[1].reason).startswith("hall 3.ply: ")
+    assert built.report is not None
     assert (built.report.scans, built.report.accepted, built.report.discarded) == (3, 2, 1)
     assert built.reference.points == pytest.approx(told.built.reference.points, abs=1e-4)
 
@@ -302,6 +303,7 @@ def test_a_map_too_thin_for_a_tile_says_how_many_points_one_needs(files: list[Sc
 
 def test_the_report_of_a_map_names_its_reference_and_its_registrations(told: Told) -> None:
     report = told.built.report
+    assert report is not None
     assert (report.scans, report.accepted, report.pairs_possible, report.pairs_tried) == (2, 2, 1, 1)
     assert (report.pairs_accepted, report.pairs_contradicted) == (1, 0)
     assert report.reference in (0, 1)

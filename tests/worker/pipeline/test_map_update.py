@@ -13,7 +13,7 @@ from tests.support.rooms import Room
 from tests.support.walks import MANY, QUICK, registered, written
 from worker.cloud.poses import difference
 from worker.cloud.tiling import TileGrid
-from worker.cloud.types import Floats
+from worker.cloud.types import Floats, Points
 from worker.pipeline.flow import BuiltMap, NoScanAccepted, build_map
 from worker.pipeline.map_update import KeptMap, extend_map, renew_map, without
 from worker.pipeline.mapping.fusion import fuse, reference_map
@@ -54,6 +54,7 @@ def test_a_map_that_is_extended_holds_both_and_its_tiles_keep_their_ids(
     assert {tuple(index) for index in before.indices} < {tuple(index) for index in after.indices}
     assert built.reference.points[:, 0].min() > 1.8
     assert grown.reference.points[:, 0].min() < 0.2
+    assert grown.report is not None
     assert (grown.report.scans, grown.report.accepted, grown.report.reference) == (1, 1, None)
     assert list(dict.fromkeys(stages)) == ["registering", "fusing", "tiling"]
     for lower, points in zip(after.grid.lower(after.indices), after.points, strict=True):
@@ -76,7 +77,7 @@ def _kept(built: BuiltMap, files: Sequence[ScanFile]) -> KeptMap:
     return KeptMap(reference=built.reference, scans=scans)
 
 
-def _scan_of(*parts: Floats) -> RegisteredScan:
+def _scan_of(*parts: Floats | Points) -> RegisteredScan:
     return RegisteredScan(
         name="scan",
         points=np.concatenate(parts).astype(np.float32),

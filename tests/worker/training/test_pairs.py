@@ -215,9 +215,9 @@ def test_of_changed_pairs_the_given_share_is_of_rebuilt_maps_untouched_but_for_t
             assert observations[0] is not None
             assert (observations[0].changed, observations[1].changed) == (False, True)
             for label, observation in observations.items():
-                assert rows(pairs[label][0]) == rows(
-                    tiles.points_a[observation.tile]
-                )  # the map is the reference
+                assert observation is not None
+                map_points = tiles.points_a[observation.tile]
+                assert rows(pairs[label][0]) == rows(map_points)  # the map is the reference
     assert 45 < found < 75
 
 

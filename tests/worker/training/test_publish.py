@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict
+from pathlib import Path
 
 import pytest
 import torch
@@ -41,6 +42,12 @@ def store(tiles, tmp_path_factory):
     return folder / "store"
 
 
+def opened(store: Path, name: str = "spicd-net/3") -> SpicdNet:
+    detector = open_detector(store, name, device="cpu")
+    assert isinstance(detector, SpicdNet)
+    return detector
+
+
 def test_a_published_model_opens_and_its_card_says_how_it_was_made(store):
     card = open_detector(store, "spicd-net/3", device="cpu").card
     assert card.detector_settings["patch_points"] == 256
@@ -60,8 +67,9 @@ def test_the_threshold_is_the_best_on_the_held_out_tiles(store, tiles):
 
 def test_a_published_model_holds_the_checkpoints_weights(store):
     state = torch.load(store.parent / "run" / "best.pt", weights_only=True)["network"]
-    opened = open_detector(store, "spicd-net/3", device="cpu")
-    for name, tensor in opened._network.state_dict().items():
+    weights = opened(store).weights()
+    assert weights.keys() == state.keys()
+    for name, tensor in weights.items():
         assert torch.equal(tensor, state[name])
 
 
@@ -69,7 +77,7 @@ def test_a_published_model_holds_the_checkpoints_weights(store):
 def test_of_a_base_and_what_became_of_it_the_one_that_ranks_better_is_published(store, tmp_path, turned):
     """Turned round, a network ranks as badly as it ranked well; as it was, training has brought nothing."""
     run, tiles = store.parent / "run", store.parent / "tiles.npz"
-    base = open_detector(store, "spicd-net/3", device="cpu")
+    base = opened(store)
     if turned:
         weights = {name: value.clone() for name, value in base.weights().items()}
         for name in ("weight", "bias"):
@@ -83,7 +91,7 @@ def test_of_a_base_and_what_became_of_it_the_one_that_ranks_better_is_published(
     assert kept == (areas["validation"] == areas["base"])
     if not turned:
         assert kept
-    written = open_detector(tmp_path, "spicd-net/1", device="cpu").weights()
+    written = opened(tmp_path, "spicd-net/1").weights()
     expected = base.weights() if kept else torch.load(run / "best.pt", weights_only=True)["network"]
     assert all(torch.equal(written[name], expected[name]) for name in expected)
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -16,10 +14,11 @@ MAP_FROM_WORLD = rigid(3.0, 4.0, yaw=50.0)
 WALK = [rigid(2.0 * step, 0.1 * step**2, 0.35, yaw=15.0 * step) for step in range(9)]
 
 
-def outcome(name: str, pose: Matrix4 | None, sigma: float = 0.01) -> ScanResult:
+def outcome(name: str, pose: Matrix4 | None, sigma: float | None = 0.01) -> ScanResult:
     if pose is None:
         return ScanResult(name=name, registration=None, reason="fits nothing")
-    placement = RegistrationResult(
+    uncertainty = None if sigma is None else Uncertainty(translation=sigma, rotation=np.radians(0.1))
+    registration = RegistrationResult(
         map_from_scan=pose,
         sensor_origin=None,
         fitness=0.7,
@@ -27,10 +26,10 @@ def outcome(name: str, pose: Matrix4 | None, sigma: float = 0.01) -> ScanResult:
         overlap=0.8,
         two_way_inlier_ratio=0.9,
         from_global_search=False,
-        uncertainty=Uncertainty(translation=sigma, rotation=np.radians(0.1)),
+        uncertainty=uncertainty,
         path=(),
     )
-    return ScanResult(name=name, registration=placement, fitness=0.7, inlier_rmse=0.02)
+    return ScanResult(name=name, registration=registration, fitness=0.7, inlier_rmse=0.02)
 
 
 def test_errors_are_counted_after_alignment_and_by_scan() -> None:
@@ -68,7 +67,7 @@ def test_a_scan_without_a_stated_sigma_has_no_say_in_calibration() -> None:
     poses = [MAP_FROM_WORLD @ pose for pose in WALK]
     poses[1] = poses[1] @ rigid(0.005)
     outcomes = [outcome(f"scan-{at}", pose) for at, pose in enumerate(poses)]
-    bare = replace(outcomes[0], registration=replace(outcomes[0].registration, uncertainty=None))
+    bare = outcome("scan-0", poses[0], sigma=None)
     told = assess([bare, *outcomes[1:]], WALK, reference=4).document()
     assert told["scans"][0]["sigma_centimetres"] is None
     assert told["translation_sigma"]["within_2_sigma"] == 1.0

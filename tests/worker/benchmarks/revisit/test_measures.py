@@ -24,8 +24,8 @@ ADD, NONE = [50, 0, 0], [0, 0, 0]
 @pytest.fixture
 def table(made_visit):
     """A changed visit with four changed tiles, one of them unobserved, and one that is not; two visits of two quiet tiles."""
-    plans = plan_visits(6, RevisitSettings(kinds=("room",)), first_seed=1)
-    plans = [plans[0], plans[2], plans[5]]
+    planned = plan_visits(6, RevisitSettings(kinds=("room",)), first_seed=1)
+    plans = [planned[0], planned[2], planned[5]]
     visits = [
         made_visit(
             plans[0].name,

@@ -95,7 +95,7 @@ def test_the_reference_keeps_points_colours_and_the_voxel_size() -> None:
     assert reference.voxel_size == 0.1
     assert reference.colors is not None
     assert reference.colors.tolist() == [[10, 20, 30]] * 400
-    assert (reference.points.dtype, reference.normals.dtype) == (np.float32, np.float32)
+    assert (reference.points.dtype, reference.normals.dtype) == (np.dtype(np.float32), np.dtype(np.float32))
 
 
 def test_the_maps_surface_is_what_was_fused() -> None:

@@ -39,7 +39,7 @@ VIEWPOINT = exponential(np.array([0.1, -0.2, 0.7, 3.0, -2.0, 1.0]))
 PRIORS_ONLY = joint_settings(QUICK.model_copy(update={"search_resolutions": ()}))
 
 
-def place(
+def register(
     files: Sequence[ScanFile],
     settings: JointRegistrationSettings = PRIORS_ONLY,
     progress: Progress = no_progress,
@@ -84,7 +84,7 @@ def foreign(folder: Path) -> ScanFile:
 @pytest.fixture(scope="module")
 def together(drifted: tuple[ScanFile, ...]) -> tuple[MapRegistration, list[tuple[str, float]]]:
     told: list[tuple[str, float]] = []
-    return place(drifted, progress=lambda *at: told.append(at)), told
+    return register(drifted, progress=lambda *at: told.append(at)), told
 
 
 # one scan
@@ -92,7 +92,7 @@ def together(drifted: tuple[ScanFile, ...]) -> tuple[MapRegistration, list[tuple
 
 def test_a_single_scan_stands_at_its_prior(room: Room, tmp_path: Path) -> None:
     first = room.before[0]
-    found = place([written(tmp_path / "a.pcd", first, pose=first.world_from_sensor)])
+    found = register([written(tmp_path / "a.pcd", first, pose=first.world_from_sensor)])
     (outcome,) = found.outcomes
     assert registered(outcome).map_from_scan == pytest.approx(first.world_from_sensor)
     assert (outcome.fitness, outcome.inlier_rmse) == (None, None)  # there was nothing to fit to
@@ -103,7 +103,7 @@ def test_a_single_scan_stands_at_its_prior(room: Room, tmp_path: Path) -> None:
 
 
 def test_a_single_scan_stands_at_identity_without_a_prior(room: Room, tmp_path: Path) -> None:
-    (outcome,) = place([written(tmp_path / "a.pcd", room.before[0], viewpoint=VIEWPOINT)]).outcomes
+    (outcome,) = register([written(tmp_path / "a.pcd", room.before[0], viewpoint=VIEWPOINT)]).outcomes
     assert registered(outcome).map_from_scan.tolist() == np.eye(4).tolist()
     assert registered(outcome).sensor_origin == pytest.approx(VIEWPOINT[:3, 3], abs=1e-5)
 
@@ -114,7 +114,7 @@ def test_a_prior_speaks_of_the_sensor_and_the_file_of_where_that_stood(room: Roo
         written(tmp_path / "a.pcd", first, pose=first.world_from_sensor, viewpoint=VIEWPOINT),
         written(tmp_path / "b.pcd", second, pose=second.world_from_sensor, viewpoint=inverse(VIEWPOINT)),
     ]
-    a, b = (registered(outcome) for outcome in place(files).outcomes)
+    a, b = (registered(outcome) for outcome in register(files).outcomes)
     assert a.map_from_scan == pytest.approx(first.world_from_sensor @ inverse(VIEWPOINT), abs=1e-5)
     assert a.sensor_origin == pytest.approx(first.world_from_sensor[:3, 3], abs=1e-4)
     again = read_again(files[0], a, max_points=MANY)
@@ -192,7 +192,7 @@ def test_the_order_of_the_files_moves_no_scan_by_more_than_four_millimetres(
     drifted: tuple[ScanFile, ...], together: tuple[MapRegistration, list[tuple[str, float]]]
 ) -> None:
     order = (2, 0, 3, 1)
-    again = poses_of(place([drifted[number] for number in order]))
+    again = poses_of(register([drifted[number] for number in order]))
     back = {number: again[at] for at, number in enumerate(order)}
     assert spread(back, poses_of(together[0])) < 0.004
 
@@ -213,7 +213,7 @@ def test_other_processes_give_the_same_poses(room: Room, drifted: tuple[ScanFile
 def test_scans_without_any_prior_find_each_other_in_any_order(room: Room, folder: Path) -> None:
     order = (2, 0, 3, 1)
     files = [written(folder / f"lost-{number}.pcd", room.before[number]) for number in order]
-    found = place(files, joint_settings(QUICK))
+    found = register(files, joint_settings(QUICK))
     poses = {number: registered(found.outcomes[at]).map_from_scan for at, number in enumerate(order)}
     assert spread(poses, truth_of(room)) < 0.012
     assert any(registered(outcome).from_global_search for outcome in found.outcomes)
@@ -226,14 +226,14 @@ def test_one_scan_without_a_prior_finds_its_place_among_those_that_have_one(
     room: Room, drifted: tuple[ScanFile, ...], folder: Path
 ) -> None:
     lost = written(folder / "lost.pcd", room.before[2])
-    found = place([*drifted[:2], lost], joint_settings(QUICK))
+    found = register([*drifted[:2], lost], joint_settings(QUICK))
     poses = poses_of(found)
     assert set(poses) == {0, 1, 2}
     assert spread(poses, truth_of(room)) < 0.015
     assert off(poses[2], room.before[2].world_from_sensor) < 0.2  # the frame is that of a drifted prior
 
 
-def test_a_scan_that_fits_only_to_another_that_comes_later_is_placed(room: Room, tmp_path: Path) -> None:
+def test_a_scan_that_fits_only_to_another_that_comes_later_is_registered(room: Room, tmp_path: Path) -> None:
     """West and east of the room share nothing; the whole room, given last, ties them together."""
     east, whole, west = room.before[:3]
     files = [
@@ -241,8 +241,8 @@ def test_a_scan_that_fits_only_to_another_that_comes_later_is_placed(room: Room,
         written(tmp_path / "east.pcd", east, between=(3.0, np.inf), pose=east.world_from_sensor),
         written(tmp_path / "whole.pcd", whole, pose=whole.world_from_sensor),
     ]
-    assert len(poses_of(place(files[:2]))) == 1
-    poses = poses_of(place(files))
+    assert len(poses_of(register(files[:2]))) == 1
+    poses = poses_of(register(files))
     assert (
         spread(poses, {0: west.world_from_sensor, 1: east.world_from_sensor, 2: whole.world_from_sensor})
         < 0.03
@@ -258,7 +258,7 @@ def test_a_scan_that_no_pair_led_to_is_found_in_the_map_of_the_others(
     high = written(folder / "high.pcd", scan, pose=shifted(z=0.4) @ scan.world_from_sensor)
     settings = joint_settings(PRIORS_ONLY.registration, max_height_difference=0.2)
     told: list[tuple[str, float]] = []
-    found = place([*drifted[:3], high], settings, progress=lambda *at: told.append(at))
+    found = register([*drifted[:3], high], settings, progress=lambda *at: told.append(at))
     assert never_falls(told)  # though all are refined once more with the scan that was found
     assert spread(poses_of(found), truth_of(room)) < 0.012
     late = registered(found.outcomes[3])
@@ -279,7 +279,7 @@ def test_a_foreign_scan_is_left_out_with_a_reason_and_moves_no_other(
     foreign: ScanFile,
     together: tuple[MapRegistration, list[tuple[str, float]]],
 ) -> None:
-    found = place([drifted[0], foreign, *drifted[1:]], joint_settings(QUICK))
+    found = register([drifted[0], foreign, *drifted[1:]], joint_settings(QUICK))
     assert [outcome.registration is not None for outcome in found.outcomes] == [True, False, True, True, True]
     stranger = found.outcomes[1]
     assert stranger.name == "foreign.pcd"
@@ -297,7 +297,7 @@ def test_a_scan_whose_prior_is_astray_is_left_out_with_its_numbers(
     room: Room, drifted: tuple[ScanFile, ...], folder: Path
 ) -> None:
     astray = room.before[2].world_from_sensor @ shifted(2.5, yaw=np.pi / 2)
-    found = place([*drifted[:2], written(folder / "astray.pcd", room.before[2], pose=astray)])
+    found = register([*drifted[:2], written(folder / "astray.pcd", room.before[2], pose=astray)])
     assert set(poses_of(found)) == {0, 1}
     outcome = found.outcomes[2]
     assert outcome.reason is not None
@@ -316,7 +316,7 @@ def test_a_scan_with_a_board_where_its_neighbours_saw_nothing_is_left_out(
     scan = room.before[3]
     board = written(folder / "board.pcd", scan, pose=drifted[3].pose, more=hanging(scan, size=1.0))
     told: list[tuple[str, float]] = []
-    found = place([*drifted[:3], board], progress=lambda *at: told.append(at))
+    found = register([*drifted[:3], board], progress=lambda *at: told.append(at))
     assert never_falls(told)  # though the others are refined once more without it
     assert set(poses_of(found)) == {0, 1, 2}
     assert found.outcomes[3].reason is not None
@@ -332,7 +332,7 @@ def test_a_file_that_is_no_scan_is_named_and_left_out(
     (tmp_path / "x.bin").write_bytes(b"nothing like a scan")
     files = [*drifted[:2]]
     files.insert(place_of_it, ScanFile(name="broken scan.ply", path=tmp_path / "x.bin"))
-    found = place(files)
+    found = register(files)
     assert set(poses_of(found)) == {0, 1, 2} - {place_of_it}
     reason = found.outcomes[place_of_it].reason
     assert reason is not None
@@ -343,13 +343,13 @@ def test_where_no_file_is_a_scan_the_first_is_named(tmp_path: Path) -> None:
     (tmp_path / "x.bin").write_bytes(b"nothing like a scan")
     files = [ScanFile(name=name, path=tmp_path / "x.bin") for name in ("one.ply", "two.ply")]
     with pytest.raises(ScanError, match=r"^one\.ply: neither PLY nor PCD"):
-        place(files)
+        register(files)
 
 
 def test_a_scan_of_more_points_than_the_limit_is_refused(drifted: tuple[ScanFile, ...]) -> None:
     few = JointRegistrationSettings(registration=QUICK, mapping=MapSettings(), max_points=1000)
     with pytest.raises(ScanTooLarge, match=r"^drifted-0\.pcd: "):
-        place(drifted[:1], few)
+        register(drifted[:1], few)
 
 
 def bare_plane(path: Path) -> ScanFile:
@@ -361,20 +361,20 @@ def bare_plane(path: Path) -> ScanFile:
 
 def test_a_bare_plane_makes_no_map(tmp_path: Path) -> None:
     with pytest.raises(MapFailed, match=r"plane\.pcd: its surfaces leave a motion free"):
-        place([bare_plane(tmp_path / "plane.pcd")])
+        register([bare_plane(tmp_path / "plane.pcd")])
 
 
 def test_where_nothing_holds_a_pose_every_reason_is_told(tmp_path: Path) -> None:
     (tmp_path / "x.bin").write_bytes(b"nothing like a scan")
     files = [bare_plane(tmp_path / "plane.pcd"), ScanFile(name="x.ply", path=tmp_path / "x.bin")]
     with pytest.raises(MapFailed, match=r"plane\.pcd: its surfaces leave.*; x\.ply: neither PLY nor PCD"):
-        place(files)
+        register(files)
 
 
 def test_a_bare_plane_among_sound_scans_is_left_out_with_its_reason(
     drifted: tuple[ScanFile, ...], tmp_path: Path
 ) -> None:
-    found = place([bare_plane(tmp_path / "plane.pcd"), drifted[0]])
+    found = register([bare_plane(tmp_path / "plane.pcd"), drifted[0]])
     assert set(poses_of(found)) == {1}
     assert "leave a motion free" in str(found.outcomes[0].reason)
     assert poses_of(found)[1] == pytest.approx(drifted[0].pose)
@@ -383,16 +383,16 @@ def test_a_bare_plane_among_sound_scans_is_left_out_with_its_reason(
 # being stopped
 
 
-@pytest.mark.parametrize("stage", ["reading", "registering", "refining"])
-def test_a_dismissal_stops_any_stage(drifted: tuple[ScanFile, ...], stage: str) -> None:
+@pytest.mark.parametrize("last", ["reading", "registering", "refining"])
+def test_a_dismissal_stops_any_stage(drifted: tuple[ScanFile, ...], last: str) -> None:
     told: list[str] = []
 
-    def dismissed(at: str, share: float) -> None:
-        told.append(at)
-        if at == stage:
+    def dismissed(stage: str, share: float) -> None:
+        told.append(stage)
+        if stage == last:
             raise Cancelled("the job was dismissed")
 
     with pytest.raises(Cancelled):
-        place(drifted[:2], progress=dismissed)
-    assert told[-1] == stage
-    assert told.count(stage) == 1
+        register(drifted[:2], progress=dismissed)
+    assert told[-1] == last
+    assert told.count(last) == 1

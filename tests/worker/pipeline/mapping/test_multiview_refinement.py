@@ -210,7 +210,7 @@ def test_gradient_and_information_are_those_of_the_squared_distances() -> None:
     """A source that stands 1 cm off the walls of its target: the step of the quadratic lays it on them."""
     by = shifted(0.01, -0.012, 0.008, yaw=0.002)
     first = corridor_equations(by, within=0.1)
-    step = -np.linalg.solve(first.information, first.gradient)
+    step = -np.linalg.solve(first.information, first.gradient).astype(np.float64)
     metres, radians = difference(exponential(step) @ by, np.eye(4))
     assert metres < 0.004
     assert radians < 0.0005

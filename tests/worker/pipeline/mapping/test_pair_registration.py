@@ -11,11 +11,11 @@ import pytest
 from tests.support.rooms import Room
 from tests.support.walks import QUICK, joint_settings, off, registered, written
 from worker.errors import Cancelled
-from worker.pipeline.mapping import pair_registration as pairing
+from worker.pipeline.mapping import pair_registration
 from worker.pipeline.mapping.map_registration import MapRegistration, register_map_scans
 from worker.pipeline.mapping.pair_registration import NullPairCache, PairCache, PairPlan
 from worker.pipeline.mapping.settings import MapSettings
-from worker.pipeline.mapping.tasks import RegisterTask, SearchTask
+from worker.pipeline.mapping.tasks import RegisterTask, SearchTask, register_pairs, search
 from worker.pipeline.registration.results import ScanFile
 from worker.pipeline.registration.scan_to_scan import PairResult
 
@@ -48,13 +48,12 @@ def files(room: Room, tmp_path_factory: pytest.TempPathFactory) -> tuple[ScanFil
 def icp_pairs(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int]]:
     """The pairs that ICP was run on, in the order of the work."""
     pairs: list[tuple[int, int]] = []
-    real = pairing.register_pairs
 
     def counted(task: RegisterTask) -> list[PairResult]:
         pairs.extend((task.target, number) for number, *_ in task.sources)
-        return real(task)
+        return register_pairs(task)
 
-    monkeypatch.setattr(pairing, "register_pairs", counted)
+    monkeypatch.setattr(pair_registration, "register_pairs", counted)
     return pairs
 
 
@@ -134,13 +133,12 @@ def test_pairs_that_had_to_be_searched_are_remembered_too(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     searched: list[int] = []
-    real = pairing.search
 
     def counted(task: SearchTask) -> object:
         searched.append(task.source)
-        return real(task)
+        return search(task)
 
-    monkeypatch.setattr(pairing, "search", counted)
+    monkeypatch.setattr(pair_registration, "search", counted)
     lost = tuple(written(tmp_path / f"{number}.pcd", room.before[number], thinned=6) for number in (0, 1))
     cache = Kept()
     first = build(lost, cache)

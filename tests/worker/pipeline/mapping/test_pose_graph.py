@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from functools import partial
 
 import numpy as np
 import pytest
@@ -27,7 +28,7 @@ from worker.pipeline.registration.scan_to_scan import PairResult
 SETTINGS = MapSettings()
 MOTION = exponential(np.array([0.02, -0.01, 1.9, 4.0, -7.0, 0.3]))
 TRUTH = line(8)
-DOUBTFUL = {"two_way_inlier_ratio": 0.84, "free_space_violation": 0.003}
+doubtful = partial(edge, two_way_inlier_ratio=0.84, free_space_violation=0.003)
 
 
 def test_the_largest_component_comes_first_and_of_equal_ones_that_with_the_lowest_index() -> None:
@@ -75,14 +76,14 @@ def test_a_path_goes_round_a_doubtful_registration() -> None:
     sure = [edge(TRUTH, a, b) for a, b in ((0, 1), (1, 2), (2, 3), (0, 4), (0, 5), (0, 6))]
     found = chain(range(7), [*sure, edge(TRUTH, 0, 3)], SETTINGS)
     assert found.paths[3] == (0, 3)
-    found = chain(range(7), [*sure, edge(TRUTH, 0, 3, **DOUBTFUL)], SETTINGS)
+    found = chain(range(7), [*sure, doubtful(TRUTH, 0, 3)], SETTINGS)
     assert found.paths[3] == (0, 1, 2, 3)
 
 
 def test_where_there_is_but_a_doubtful_registration_a_path_takes_one_not_two() -> None:
     edges = [
         *(edge(TRUTH, 0, number) for number in (1, 2, 5)),
-        *(edge(TRUTH, a, b, **DOUBTFUL) for a, b in ((1, 3), (3, 4), (2, 4))),
+        *(doubtful(TRUTH, a, b) for a, b in ((1, 3), (3, 4), (2, 4))),
     ]
     found = chain(range(6), edges, SETTINGS)
     assert found.paths[4] == (0, 2, 4)
@@ -141,7 +142,7 @@ def test_reliability_grows_with_triangles_that_close_and_falls_with_those_that_d
     assert contradicted < alone < consistent_with_prior
 
 
-QUESTIONABLE = {"two_way_inlier_ratio": 0.84, "free_space_violation": 0.002}
+questionable = partial(edge, two_way_inlier_ratio=0.84, free_space_violation=0.002)
 
 
 def worst(found: Solution, truth: dict[int, Matrix4]) -> float:
@@ -231,7 +232,7 @@ def test_few_right_edges_win_over_more_wrong_ones_of_lower_confidence() -> None:
     halves = [*along({n: truth[n] for n in range(5)}), *along({n: truth[n] for n in range(5, 10)})]
     right = [edge(truth, 4, 5), edge(truth, 3, 5), edge(truth, 4, 6)]
     slid = truth | {number: shifted(2.0) @ truth[number] for number in range(5, 10)}
-    wrong = [edge(slid, a, b, **QUESTIONABLE) for a, b in ((2, 5), (2, 6), (3, 6), (3, 7))]
+    wrong = [questionable(slid, a, b) for a, b in ((2, 5), (2, 6), (3, 6), (3, 7))]
     found = solve_graph(range(10), [*halves, *right, *wrong], SETTINGS)
     assert pairs_of(found.rejected) == pairs_of(wrong)
     assert worst(found, truth) < 0.03
@@ -255,7 +256,7 @@ def test_of_two_registrations_of_one_scan_that_contradict_each_other_the_surer_o
     """Scan 12 hangs on one scan at either side of the ring."""
     truth = ring(12) | {12: shifted(8.0, 0, 0.35)}
     right = edge(truth, 0, 12)
-    wrong = edge(truth, 6, 12, error=shifted(2.0), **QUESTIONABLE)
+    wrong = questionable(truth, 6, 12, error=shifted(2.0))
     found = solve_graph(range(13), [*around(ring(12)), right, wrong], SETTINGS)
     assert pairs_of(found.rejected) == {(6, 12)}
     assert 12 in found.poses

@@ -73,7 +73,7 @@ def test_a_scan_without_a_prior_is_searched_in_the_map_of_the_others(room: Room,
     assert found.result.registration.from_global_search
 
 
-def test_it_stands_beside_the_placed_scan_that_is_nearest(room: Room, work: Workspace) -> None:
+def test_it_stands_beside_the_registered_scan_that_is_nearest(room: Room, work: Workspace) -> None:
     found = looked_for(room, work, prior=AWAY @ truth(room, LEFT))
     apart = {number: off(truth(room, number), truth(room, LEFT)) for number in range(LEFT)}
     assert found.nearest == min(apart, key=lambda number: apart[number])

@@ -62,7 +62,7 @@ def west(room: Room) -> Surface:
     return surface_of(voxels, RegistrationSettings())
 
 
-def place(
+def register(
     files: Sequence[ScanFile],
     target: Surface,
     settings: JointRegistrationSettings = PRIORS_ONLY,
@@ -77,9 +77,9 @@ def place(
 def together(
     room: Room, files: tuple[ScanFile, ...]
 ) -> tuple[tuple[ScanResult, ...], list[tuple[str, float]]]:
-    """All three placed at once, and what was told on the way."""
+    """All three registered at once, and what was told on the way."""
     told: list[tuple[str, float]] = []
-    return place(files, room.target, progress=lambda *at: told.append(at)), told
+    return register(files, room.target, progress=lambda *at: told.append(at)), told
 
 
 def stages(told: list[tuple[str, float]]) -> list[str]:
@@ -90,7 +90,7 @@ def test_one_scan_stands_where_it_fits_the_map_and_tells_how_sure_that_is(
     room: Room, files: tuple[ScanFile, ...]
 ) -> None:
     told: list[tuple[str, float]] = []
-    (outcome,) = place(files[:1], room.target, progress=lambda *at: told.append(at))
+    (outcome,) = register(files[:1], room.target, progress=lambda *at: told.append(at))
     found = registered(outcome)
     assert off(found.map_from_scan, room.after[0].world_from_sensor) < 0.012
     assert found.sensor_origin == pytest.approx(found.map_from_scan[:3, 3])
@@ -125,7 +125,7 @@ def test_scans_that_agree_move_each_other_by_millimetres_only(
     together: tuple[tuple[ScanResult, ...], list[tuple[str, float]]],
 ) -> None:
     for outcome, file in list(zip(together[0], files, strict=True))[1:]:
-        (alone,) = place([file], room.target)
+        (alone,) = register([file], room.target)
         moved = off(registered(outcome).map_from_scan, registered(alone).map_from_scan)
         assert 0 < moved < 0.006
 
@@ -136,17 +136,17 @@ def test_a_scan_that_sees_a_board_where_the_others_saw_nothing_is_left_out_and_n
     """A board of 1.8 m square: eight in a hundred of its points stand in what the others saw as free."""
     scan = room.after[1]
     odd = written(folder / "odd.pcd", scan, pose=scan.world_from_sensor, more=hanging(scan, size=1.8))
-    alone = place([odd], room.target)
+    alone = register([odd], room.target)
     assert alone[0].registration is not None  # the map alone would have it
     told: list[tuple[str, float]] = []
-    outcomes = place([files[0], odd, files[2]], room.target, progress=lambda *at: told.append(at))
+    outcomes = register([files[0], odd, files[2]], room.target, progress=lambda *at: told.append(at))
     assert never_falls(told)
     assert [outcome.registration is not None for outcome in outcomes] == [True, False, True]
     assert outcomes[1].reason is not None
     assert outcomes[1].reason.startswith("scan odd.pcd: it disagrees with the other scans")
     assert outcomes[1].fitness is not None
     assert outcomes[1].fitness > 0.3
-    without = place([files[0], files[2]], room.target)
+    without = register([files[0], files[2]], room.target)
     for number, other in ((0, 0), (2, 1)):
         a, b = registered(outcomes[number]), registered(without[other])
         assert off(a.map_from_scan, b.map_from_scan) < 0.001
@@ -163,7 +163,7 @@ def test_a_scan_that_the_others_would_have_elsewhere_is_left_out_and_named(folde
         path = folder / f"corridor-{number}.pcd"
         write_pcd(path, corridor_points(ends=True, seed=number))
         files.append(ScanFile(name=path.name, path=path, pose=shifted(off_by)))
-    outcomes = place(files, target, lenient)
+    outcomes = register(files, target, lenient)
     assert [outcome.registration is not None for outcome in outcomes] == [True, False, True]
     assert outcomes[1].reason is not None
     assert outcomes[1].reason.startswith("scan corridor-1.pcd: it disagrees with the other scans")
@@ -176,12 +176,12 @@ def test_a_foreign_scan_is_left_out_and_moves_no_other(
     room: Room, files: tuple[ScanFile, ...], folder: Path
 ) -> None:
     foreign = written(folder / "foreign.pcd", visit(random_room(11), 1, seed=5)[0])
-    outcomes = place([files[0], foreign, files[1]], room.target)
+    outcomes = register([files[0], foreign, files[1]], room.target)
     assert [outcome.registration is not None for outcome in outcomes] == [True, False, True]
     assert outcomes[1].reason is not None
     assert outcomes[1].reason.startswith("scan foreign.pcd: fitness 0.")
     assert (outcomes[1].fitness is not None, outcomes[1].name) == (True, "foreign.pcd")
-    without = place(files[:2], room.target)
+    without = register(files[:2], room.target)
     for number, other in ((0, 0), (2, 1)):
         a, b = registered(outcomes[number]), registered(without[other])
         assert a.map_from_scan.tolist() == b.map_from_scan.tolist()
@@ -189,7 +189,7 @@ def test_a_foreign_scan_is_left_out_and_moves_no_other(
 
 def test_a_scan_without_a_prior_is_searched(room: Room, folder: Path) -> None:
     lost = written(folder / "lost.pcd", room.after[0])
-    (outcome,) = place([lost], room.target, joint_settings(QUICK))
+    (outcome,) = register([lost], room.target, joint_settings(QUICK))
     assert registered(outcome).from_global_search
     assert off(registered(outcome).map_from_scan, room.after[0].world_from_sensor) < 0.012
 
@@ -201,7 +201,7 @@ def test_a_survey_without_any_place_has_a_reason_for_every_scan_and_no_placement
         written(folder / f"stranger-{number}.pcd", scan)
         for number, scan in enumerate(visit(random_room(11), 2, seed=5))
     ]
-    outcomes = place(out_of_place, room.target)
+    outcomes = register(out_of_place, room.target)
     assert [outcome.registration for outcome in outcomes] == [None, None]
     assert all(str(outcome.reason).startswith(f"scan {outcome.name}: ") for outcome in outcomes)
 
@@ -209,7 +209,7 @@ def test_a_survey_without_any_place_has_a_reason_for_every_scan_and_no_placement
 # a map that is to grow
 
 
-def test_a_scan_that_touches_only_another_new_one_is_placed_where_the_map_is_to_grow(
+def test_a_scan_that_touches_only_another_new_one_is_registered_where_the_map_is_to_grow(
     room: Room, west: Surface, folder: Path
 ) -> None:
     """The map knows the west; one scan saw the whole room, the other its east alone."""
@@ -218,10 +218,10 @@ def test_a_scan_that_touches_only_another_new_one_is_placed_where_the_map_is_to_
         written(folder / "east.pcd", east, between=EAST, pose=east.world_from_sensor),
         written(folder / "whole.pcd", whole, pose=whole.world_from_sensor),
     ]
-    survey = place(files, west)
+    survey = register(files, west)
     assert [outcome.registration is not None for outcome in survey] == [False, True]
     told: list[tuple[str, float]] = []
-    grown = place(files, west, growing=True, progress=lambda *at: told.append(at))
+    grown = register(files, west, growing=True, progress=lambda *at: told.append(at))
     assert never_falls(told)
     for outcome, scan in zip(grown, (east, whole), strict=True):
         assert off(registered(outcome).map_from_scan, scan.world_from_sensor) < 0.03
@@ -233,7 +233,7 @@ def test_what_finds_no_place_in_the_grown_map_either_is_left_out(
     whole = room.before[1]
     foreign = written(folder / "foreign-2.pcd", visit(random_room(11), 1, seed=5)[0])
     files = [foreign, written(folder / "whole-2.pcd", whole, pose=whole.world_from_sensor)]
-    outcomes = place(files, west, growing=True)
+    outcomes = register(files, west, growing=True)
     assert [outcome.registration is not None for outcome in outcomes] == [False, True]
     assert str(outcomes[0].reason).startswith("scan foreign-2.pcd: ")
 
@@ -248,7 +248,7 @@ def test_a_file_that_is_no_scan_is_left_out_with_its_reason(
     (tmp_path / "x").write_bytes(b"ply\nbut no more")
     asked = [files[0]]
     asked.insert(place_of_it, ScanFile(name="hall 3.ply", path=tmp_path / "x"))
-    outcomes = place(asked, room.target)
+    outcomes = register(asked, room.target)
     assert outcomes[place_of_it].registration is None
     assert str(outcomes[place_of_it].reason).startswith("hall 3.ply: ")
     assert registered(outcomes[1 - place_of_it]).fitness is not None
@@ -258,7 +258,7 @@ def test_where_no_file_is_a_scan_the_first_is_named(room: Room, tmp_path: Path) 
     (tmp_path / "x").write_bytes(b"ply\nbut no more")
     asked = [ScanFile(name=name, path=tmp_path / "x") for name in ("one.ply", "two.ply")]
     with pytest.raises(ScanError, match=r"^one\.ply: "):
-        place(asked, room.target)
+        register(asked, room.target)
 
 
 def test_a_scan_of_more_points_than_the_limit_is_refused(room: Room, files: tuple[ScanFile, ...]) -> None:
@@ -266,19 +266,19 @@ def test_a_scan_of_more_points_than_the_limit_is_refused(room: Room, files: tupl
         registration=PRIORS_ONLY.registration, mapping=PRIORS_ONLY.mapping, max_points=1000
     )
     with pytest.raises(ScanTooLarge, match=r"^now-0\.pcd: "):
-        place(files[:1], room.target, few)
+        register(files[:1], room.target, few)
 
 
-@pytest.mark.parametrize("stage", ["registering", "refining"])
-def test_a_dismissal_stops_within_one_step(room: Room, files: tuple[ScanFile, ...], stage: str) -> None:
+@pytest.mark.parametrize("last", ["registering", "refining"])
+def test_a_dismissal_stops_within_one_step(room: Room, files: tuple[ScanFile, ...], last: str) -> None:
     told: list[str] = []
 
-    def dismissed(at: str, share: float) -> None:
-        told.append(at)
-        if told.count(stage) == 2:
+    def dismissed(stage: str, share: float) -> None:
+        told.append(stage)
+        if told.count(last) == 2:
             raise Cancelled("the job was dismissed")
 
     with pytest.raises(Cancelled):
-        place(files[:2], room.target, progress=dismissed)
-    assert told.count(stage) == 2
-    assert told[-1] == stage
+        register(files[:2], room.target, progress=dismissed)
+    assert told.count(last) == 2
+    assert told[-1] == last

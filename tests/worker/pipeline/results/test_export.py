@@ -44,7 +44,7 @@ def test_no_two_states_share_a_colour() -> None:
 
 
 def test_open3d_reads_state_and_score_of_each_point(written: Path) -> None:
-    cloud = o3d.t.io.read_point_cloud(str(written))
+    cloud = o3d.t.io.read_point_cloud(written)
     state, score = (cloud.point[name].numpy().ravel() for name in ("tile_state", "change_score"))
     assert state.tolist() == [0, 1, 1, 2, 2, 2, 3, 3, 3, 3, NOT_IN_A_TILE, NOT_IN_A_TILE]
     assert score[:6].tolist() == [0.25, 0.75, 0.75, 0.875, 0.875, 0.875]
@@ -66,12 +66,15 @@ def test_in_a_map_that_grew_below_its_origin_points_have_the_colours_of_their_ow
     known = four_states()
     tiles = known.pairs.reference
     grown = replace(tiles.grid, lowest=(-2, 0, 0))
-    pairs = replace(known.pairs, reference=replace(tiles, grid=grown, indices=tiles.indices - [2, 0, 0]))
+    pairs = replace(
+        known.pairs,
+        reference=replace(tiles, grid=grown, indices=tiles.indices - np.array([2, 0, 0], np.int32)),
+    )
     cloud = np.concatenate([in_tile(i - 2, 0, 0, 1) for i in range(5)])  # the last one is of no tile
     write_coloured_cloud(
         tmp_path / "c.ply", CurrentMap(points=cloud, colors=None), replace(known, pairs=pairs)
     )
-    state = o3d.t.io.read_point_cloud(str(tmp_path / "c.ply")).point["tile_state"].numpy().ravel()
+    state = o3d.t.io.read_point_cloud(tmp_path / "c.ply").point["tile_state"].numpy().ravel()
     assert state.tolist() == [0, 1, 2, 3, NOT_IN_A_TILE]
 
 

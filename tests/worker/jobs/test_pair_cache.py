@@ -1,4 +1,4 @@
-"""What a build of a map remembers of itself in the blob store."""
+"""The pairs that a build of a map keeps in the blob store, so that one that was killed goes on."""
 
 from __future__ import annotations
 
@@ -66,10 +66,10 @@ def test_a_new_build_remembers_nothing(blobs: Blobs) -> None:
 
 
 def test_pairs_come_back_as_they_were_those_that_met_nothing_too(blobs: Blobs) -> None:
-    memory = StoredPairCache(blobs, JOB)
+    cache = StoredPairCache(blobs, JOB)
     saved = [pair(0, 1), pair(1, 2, rmse=np.inf)]
-    memory.save(saved)
-    memory.flush()
+    cache.save(saved)
+    cache.flush()
     found = loaded(blobs)
     assert set(found) == {(0, 1), (1, 2)}
     for each in saved:
@@ -80,23 +80,23 @@ def test_pairs_come_back_as_they_were_those_that_met_nothing_too(blobs: Blobs) -
 
 
 def test_pairs_within_two_seconds_of_a_write_wait_for_the_next(blobs: Blobs, clock: Clock) -> None:
-    memory = StoredPairCache(blobs, JOB, clock=clock)
+    cache = StoredPairCache(blobs, JOB, clock=clock)
     for number in range(1, 20):
         clock.now += 0.25
-        memory.save([pair(0, number)])
+        cache.save([pair(0, number)])
     # after 2, 4 seconds: the eighth and the sixteenth; the last three would be lost
     assert writes(blobs) == 2
     assert len(loaded(blobs)) == 16
     clock.now += 2
-    memory.save([])
+    cache.save([])
     assert len(loaded(blobs)) == 19
 
 
 def test_nothing_new_writes_nothing(blobs: Blobs, clock: Clock) -> None:
-    memory = StoredPairCache(blobs, JOB, clock=clock)
+    cache = StoredPairCache(blobs, JOB, clock=clock)
     for _ in range(5):
         clock.now += 10
-        memory.save([])
+        cache.save([])
     assert writes(blobs) == 0
 
 
@@ -104,9 +104,9 @@ def test_a_second_attempt_adds_to_the_first_and_neither_overwrites_the_other(
     blobs: Blobs, clock: Clock
 ) -> None:
     first, second = (StoredPairCache(blobs, JOB, clock=clock) for _ in range(2))
-    for number, memory in enumerate((first, second, first)):  # the first was thought dead
+    for number, cache in enumerate((first, second, first)):  # the first was thought dead
         clock.now += 3
-        memory.save([pair(0, number + 1)])
+        cache.save([pair(0, number + 1)])
     assert set(loaded(blobs)) == {(0, 1), (0, 2), (0, 3)}
 
 
@@ -119,8 +119,8 @@ def test_each_build_has_its_own(blobs: Blobs, clock: Clock) -> None:
 
 
 def test_what_another_release_wrote_is_left_aside(blobs: Blobs, clock: Clock) -> None:
-    memory = StoredPairCache(blobs, JOB, clock=clock)
-    memory.save([pair(0, 1)])
-    memory.flush()
+    cache = StoredPairCache(blobs, JOB, clock=clock)
+    cache.save([pair(0, 1)])
+    cache.flush()
     blobs.put_bytes(blob_keys.map_pairs(JOB, "old"), b'[{"target": 0, "source": 2}]')
     assert list(loaded(blobs)) == [(0, 1)]

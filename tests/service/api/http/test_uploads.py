@@ -39,11 +39,11 @@ def server(tmp_path: Path) -> Iterator[tuple[httpx.Client, int, Path]]:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    here = Path(__file__).resolve()
+    root = Path(__file__).resolve().parents[4]
     process = subprocess.Popen(
         [sys.executable, "-c", SERVER, settings.data_dir, settings.model_store, str(port)],
-        cwd=here.parents[3],
-        env={"PYTHONPATH": f"{here.parents[3]}:{here.parent}", "PATH": "/usr/bin:/bin"},
+        cwd=root,
+        env={"PYTHONPATH": str(root), "PATH": "/usr/bin:/bin"},
     )
     try:
         with httpx.Client(base_url=f"http://127.0.0.1:{port}", timeout=120) as client:

@@ -57,7 +57,8 @@ def files(tmp_path: Path, room: np.ndarray) -> tuple[str, str]:
     pose = rigid(0.08, -0.05, 0.0, yaw=2.0)
     seen = room[room[:, 0] < 2.0] @ pose[:3, :3].T + pose[:3, 3]
     write_pcd(tmp_path / "before.pcd", room)
-    write_pcd(tmp_path / "after.pcd", seen + np.random.default_rng(1).normal(0, 0.003, seen.shape))
+    noisy = seen + np.random.default_rng(1).normal(0, 0.003, seen.shape)
+    write_pcd(tmp_path / "after.pcd", noisy.astype(np.float32))
     return str(tmp_path / "before.pcd"), str(tmp_path / "after.pcd")
 
 
