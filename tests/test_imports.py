@@ -202,11 +202,6 @@ def imports() -> Imports:
     return read_imports(ROOT)
 
 
-@pytest.fixture(scope="module")
-def imports_at_start() -> Imports:
-    return read_imports(ROOT, in_functions=False)
-
-
 def test_each_part_imports_what_stands_below_it_and_nothing_else(imports: Imports) -> None:
     assert against_layers(imports) == []
 
@@ -237,8 +232,8 @@ def test_training_runs_where_there_is_only_torch_and_numpy(imports: Imports) -> 
     assert third_party(reached(imports, "worker.training.__main__")) <= TRAINING_NEEDS | OPTIONAL_FOR_TRAINING
 
 
-def test_no_modules_import_each_other_in_a_circle(imports_at_start: Imports) -> None:
-    assert circle(imports_at_start) is None
+def test_no_modules_import_each_other_in_a_circle(imports: Imports) -> None:
+    assert circle(imports) is None
 
 
 @pytest.mark.parametrize(
@@ -275,9 +270,11 @@ def test_a_forbidden_import_is_found(imports: Imports, path: str, line: str) -> 
     assert set(violations(with_line(imports, path, line))) - set(violations(imports))
 
 
-def test_a_circle_is_found(imports_at_start: Imports) -> None:
-    line = "from worker.cloud import tiling"  # which imports types
-    assert circle(with_line(imports_at_start, "worker/cloud/types.py", line))
+@pytest.mark.parametrize(
+    "line", ["from worker.cloud import tiling", "def f():\n    from worker.cloud import tiling"]
+)
+def test_a_circle_is_found(imports: Imports, line: str) -> None:
+    assert circle(with_line(imports, "worker/cloud/types.py", line))  # tiling imports types
 
 
 def with_line(imports: Imports, path: str, line: str) -> Imports:
@@ -358,10 +355,7 @@ def third_party(names: set[str]) -> set[str]:
 
 
 def circle(imports: Imports) -> list[str] | None:
-    """Modules that import each other in a circle; a package and its own parts do not count.
-
-    `imports` are those that run when a module is imported: one inside a function is how a circle is cut.
-    """
+    """Return modules that import each other in a circle, inside functions too; a package and its parts do not count."""
     graph = {
         name: {other for other in found if other in imports and not within(name, (other,))}
         for name, found in imports.items()
@@ -378,7 +372,7 @@ def within(name: str, parts: tuple[str, ...]) -> bool:
     return any(name == part or name.startswith(part + ".") for part in parts)
 
 
-def read_imports(root: Path, *, in_functions: bool = True) -> Imports:
+def read_imports(root: Path) -> Imports:
     """Every import of every module of our packages under `root`."""
     files = [path for package in PACKAGES for path in sorted((root / package).rglob("*.py"))]
     modules = {module_name(path.relative_to(root)) for path in files}
@@ -388,7 +382,6 @@ def read_imports(root: Path, *, in_functions: bool = True) -> Imports:
             name,
             is_package=path.name == "__init__.py",
             modules=modules,
-            in_functions=in_functions,
         )
         for path in files
     }
@@ -399,19 +392,10 @@ def module_name(path: Path) -> str:
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
-def imports_of(
-    source: str, module: str, *, is_package: bool, modules: set[str], in_functions: bool = True
-) -> frozenset[str]:
+def imports_of(source: str, module: str, *, is_package: bool, modules: set[str]) -> frozenset[str]:
     """The dotted names that the source of `module` imports, wherever in it."""
-    nodes = _nodes(ast.parse(source), in_functions)
+    nodes = ast.walk(ast.parse(source))
     return frozenset(name for node in nodes for name in _named(node, module, is_package, modules))
-
-
-def _nodes(node: ast.AST, in_functions: bool) -> Iterator[ast.AST]:
-    yield node
-    for child in ast.iter_child_nodes(node):
-        if in_functions or not isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef):
-            yield from _nodes(child, in_functions)
 
 
 def _named(node: ast.AST, module: str, is_package: bool, modules: set[str]) -> Iterator[str]:
