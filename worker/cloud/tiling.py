@@ -16,7 +16,7 @@ _MOST_TILES = 10_000_000  # of a grid's box; a wider one means stray points, not
 
 
 class TilingSettings(BaseModel):
-    """Section 3.4 and Table 3 of the paper; the values come from the model's card."""
+    """Section 3.4 and Table 3 of the paper; tile size and points come from the model's card."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 

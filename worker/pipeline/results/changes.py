@@ -18,7 +18,7 @@ class TileState(IntEnum):
 
     UNCHANGED = 0  #: looked at, and the same
     CHANGED = 1  #: looked at, and different
-    INCONSISTENT = 2  #: looked at, and so different that it seems to be another place
+    INCONSISTENT = 2  #: below the threshold, but "different place" is the likeliest class
     UNOBSERVED = 3  #: not seen densely enough to say
 
     @property
