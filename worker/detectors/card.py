@@ -33,7 +33,7 @@ class Card(BaseModel):
 
     name: str
     version: str
-    detector: str = Field(description="key in worker.detectors.store.DETECTORS")
+    detector: str = Field(description="key in worker.detectors.registry.DETECTORS")
     summary: str
     classes: tuple[str, str, str] = ("unchanged", "changed", "different place")
     threshold: float = Field(

@@ -58,7 +58,7 @@ class Detector(Protocol):
     """A method of comparing a survey with its map. It prepares its own input and says in its card what it needs.
 
     A new detector is a folder with one class of this shape and a `load`, one entry in
-    `worker.detectors.store.DETECTORS`, and one folder in `model_store/` with its card.
+    `worker.detectors.registry.DETECTORS`, and one folder in `model_store/` with its card.
     """
 
     card: Card

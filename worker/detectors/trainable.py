@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from pkgutil import resolve_name
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from worker.cloud.types import Points
+from worker.detectors.registry import DETECTORS
 from worker.progress import Progress
 
 UNCHANGED, CHANGED, DIFFERENT = 0, 1, 2  #: the classes of a pair
@@ -91,3 +93,12 @@ class TrainableNetwork(Protocol[B]):
 
 
 NetworkClass = Callable[..., TrainableNetwork[Any]]  #: called with the detector's settings, by keyword
+
+
+def network_class(key: str) -> NetworkClass:
+    """Return what trains the detector of this key. Raises KeyError where nothing of it is trained."""
+    network = DETECTORS[key].network
+    if network is None:
+        raise KeyError(f"nothing of a detector {key!r} is trained")
+    trains: NetworkClass = resolve_name(network)
+    return trains

@@ -13,7 +13,7 @@ from typing import Any
 from service.catalog import blob_keys
 from service.catalog.records import ModelRecord, VersionRecord
 from worker.detectors.card import Card
-from worker.detectors.networks import NETWORKS
+from worker.detectors.registry import trainable_detectors
 from worker.detectors.store import make_detector, read_card, resolve_device, settings_of, weights_of
 from worker.errors import Cancelled, TrainingFailed
 from worker.jobs.maps import encode_reference
@@ -115,13 +115,13 @@ def _detector_key(model: ModelRecord, card: Card) -> str:
 
     Raises TrainingFailed.
     """
-    if card.detector in NETWORKS:
+    if card.detector in trainable_detectors():
         return card.detector
     if model.base is None:
         return SITE.detector
     raise TrainingFailed(
         f"model {model.base} cannot be trained further: nothing of a detector {card.detector!r} is trained; "
-        f"name a base of {' or '.join(sorted(NETWORKS))}, or none"
+        f"name a base of {' or '.join(trainable_detectors())}, or none"
     )
 
 

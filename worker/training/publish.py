@@ -23,7 +23,7 @@ from worker.cloud.types import Arrays
 from worker.detectors.card import MODEL_STORE, Card, Preprocessing
 from worker.detectors.comparison import Comparison
 from worker.detectors.detector import Detector
-from worker.detectors.store import DETECTORS, WEIGHTS, weights_of, write_model
+from worker.detectors.store import WEIGHTS, detector_class, weights_of, write_model
 from worker.training.calibration import (
     PREVALENCE,
     SurveyPairs,
@@ -169,7 +169,7 @@ def change_scores(detector: Detector, pairs: SurveyPairs) -> NDArray[np.float32]
 
 
 def _detector(card: Card, weights: dict[str, torch.Tensor]) -> Detector:
-    return DETECTORS[card.detector].load(card, weights, torch.device("cpu"))
+    return detector_class(card.detector).load(card, weights, torch.device("cpu"))
 
 
 def _pairs(tiles: TileSet, settings: dict[str, Any]) -> SurveyPairs:
