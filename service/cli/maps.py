@@ -9,13 +9,8 @@ from rich.console import Group
 from rich.table import Table
 
 from service.cli.tables import columns, counts, facts, point, scan_table
-from service.cli.terminal import Captured, Device, Model, Scans, Terminal, Wait, add_group
+from service.cli.terminal import Captured, Device, Model, Scans, Terminal, Wait
 from service.client import Document
-
-
-def register(commands: typer.Typer) -> None:
-    """Add `maps` to the command line."""
-    add_group(commands, "maps", "Reference maps.", create, list_, show, delete)
 
 
 def create(

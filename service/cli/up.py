@@ -17,11 +17,6 @@ from service.settings import Settings
 from service.up.embedded_redis import LaunchFailed
 
 
-def register(commands: typer.Typer) -> None:
-    """Add `up` to the command line."""
-    commands.command("up")(up)
-
-
 def up(
     ctx: typer.Context,
     host: Annotated[str | None, typer.Option(help="Address to listen on.")] = None,

@@ -9,17 +9,12 @@ from rich.console import Group
 from rich.table import Table
 
 from service.cli.tables import columns, counts, facts, scan_table
-from service.cli.terminal import Captured, Device, Terminal, Wait, add_group
+from service.cli.terminal import Captured, Device, Terminal, Wait
 from service.client import Document
 
 Further = Annotated[
     list[str] | None, typer.Argument(help="Further scans: files, which are uploaded, or ids of scans.")
 ]
-
-
-def register(commands: typer.Typer) -> None:
-    """Add `versions` to the command line."""
-    add_group(commands, "versions", "Versions of a map.", add, list_, show, delete)
 
 
 def add(
