@@ -31,7 +31,7 @@ class Database:
     """An engine and its sessions; `write()` takes the lock at once, so that no read turns stale before its write."""
 
     def __init__(self, url: str) -> None:
-        """`url` is `sqlite:///file` or `postgresql://...`; nothing is opened before it is needed."""
+        """Take `sqlite:///file` or `postgresql://...`; nothing is opened before it is needed."""
         self.engine = _engine(url)
         self._writer = self.engine.execution_options(spicd_write=True)
 

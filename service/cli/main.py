@@ -51,9 +51,7 @@ def _commands() -> typer.Typer:
     return commands
 
 
-def _add_group(
-    commands: typer.Typer, name: str, help_text: str, *group: Callable[..., None]
-) -> typer.Typer:
+def _add_group(commands: typer.Typer, name: str, help_text: str, *group: Callable[..., None]) -> typer.Typer:
     """Add a group of commands to the command line, each under the name of its function."""
     added = typer.Typer(no_args_is_help=True, help=help_text)
     for command in group:

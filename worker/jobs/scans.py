@@ -10,7 +10,7 @@ import numpy as np
 
 from service.catalog.records import ScanOutcome
 from worker.cloud import npz
-from worker.jobs.step import Context, put
+from worker.jobs.step import Context, load, put
 from worker.pipeline import archive
 from worker.pipeline.registration.results import RegisteredScan, ScanFile, ScanResult, read_registered
 
@@ -49,8 +49,7 @@ def save_scans(
 
 def kept_scan(context: Context, key: str) -> RegisteredScan:
     """Return an accepted scan as `save_scans` kept it."""
-    with context.catalog.blobs.local(key) as path:
-        return archive.load_scan(path)
+    return load(context, key, archive.load_scan)
 
 
 def kept_scans(

@@ -90,7 +90,7 @@ def build_training_set(
     ]
     walks: dict[int, TileSet] = {}
     with open_processes(min(processes or default_processes(), len(tasks))) as pool:
-        for number, tiles in pool.each(_numbered_walk, tasks):
+        for number, tiles in pool.map_unordered(_numbered_walk, tasks):
             walks[number] = tiles
             progress("build training set", len(walks) / len(tasks))
     source = f"simulated visits: {settings.model_dump_json()}"

@@ -223,7 +223,7 @@ def _take_log(log: Path, place: Path) -> None:
 
 
 def main() -> None:
-    """`python -m worker.training.publish CHECKPOINT TILES`"""
+    """Publish from the command line: `python -m worker.training.publish CHECKPOINT TILES`."""
     parser = argparse.ArgumentParser(prog="python -m worker.training.publish")
     parser.add_argument("checkpoint", type=Path)
     parser.add_argument("tiles", type=Path, help="the training set that it was made with")

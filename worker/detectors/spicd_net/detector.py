@@ -116,7 +116,7 @@ class SpicdNet:
         )
 
     def _patches(self, tiles: Tiles, points: Sequence[Points], indices: NDArray[np.intp]) -> list[Patch]:
-        """Of the tiles at these indices, with these points (n, 3), metres, map frame."""
+        """Return patches of the tiles at these indices, with these points (n, 3), metres, map frame."""
         settings, centres = self._settings, tiles.grid.centers(tiles.indices)
         return [
             patch(
@@ -128,7 +128,7 @@ class SpicdNet:
         ]
 
     def _encoded(self, patches: Sequence[Patch], progress: Progress, stage: str) -> NDArray[np.float32]:
-        """(t, 1024)"""
+        """Return the descriptors (t, 1024)."""
         descriptors = np.empty((len(patches), DESCRIPTOR), dtype=np.float32)
         for row, prepared in enumerate(patches):
             if row % TILES_PER_REPORT == 0:
@@ -152,14 +152,14 @@ class SpicdNet:
             places = np.random.default_rng((settings.seed, stream)).choice(
                 settings.patch_points, settings.chamfer_points, replace=False
             )
-            clouds = [prepared.at(places) for prepared in patches]
+            clouds = [prepared.points_at(places) for prepared in patches]
         return [torch.from_numpy(cloud).to(self._device) for cloud in clouds]
 
     @torch.inference_mode()
     def _probabilities(
         self, reference: NDArray[np.float32], current: NDArray[np.float32], statistics: Tensor
     ) -> NDArray[np.float32]:
-        """Descriptors (t, 1024) of both sides and (t, 8) -> (t, 3)"""
+        """Classify descriptors (t, 1024) of both sides and statistics (t, 8): (t, 3)."""
         f_ref, f_cur = (torch.from_numpy(side).to(self._device) for side in (reference, current))
         logits: Tensor = self._network.head(f_ref, f_cur, statistics)
         probabilities: NDArray[np.float32] = logits.softmax(dim=1).cpu().numpy()

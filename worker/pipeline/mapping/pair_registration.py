@@ -121,7 +121,7 @@ def _search(
             for first in range(0, len(targets), _TARGETS)
         ]
     results = []
-    for count, batch in enumerate(workspace.processes.each(search, tasks), start=1):
+    for count, batch in enumerate(workspace.processes.map_unordered(search, tasks), start=1):
         results += batch
         progress(count / len(tasks))
     return results
@@ -156,7 +156,7 @@ def register_planned(
         )
         for target, sources in sorted(by_target.items())
     ]
-    for count, batch in enumerate(workspace.processes.each(register_pairs, tasks), start=1):
+    for count, batch in enumerate(workspace.processes.map_unordered(register_pairs, tasks), start=1):
         pair_cache.save(batch)
         results |= {result.pair: result for result in batch}
         progress(count / len(tasks))

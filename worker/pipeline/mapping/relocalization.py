@@ -81,7 +81,7 @@ def relocalize(
         )
         for index in missing
     ]
-    return {attempt.index: attempt for attempt in workspace.processes.each(_relocalize_one, tasks)}
+    return {attempt.index: attempt for attempt in workspace.processes.map_unordered(_relocalize_one, tasks)}
 
 
 def _relocalize_one(task: _RelocalizeTask) -> Relocalized:

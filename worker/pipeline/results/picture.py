@@ -133,7 +133,7 @@ def _extent(changes: ChangeSet) -> Extent:
 
 
 def _draw_walls(axes: Axes, reference: Points, current: Points, extent: Extent) -> None:
-    """How much stands above each spot between knee and head, so that furniture and walls show."""
+    """Draw how much stands above each spot between knee and head, so that furniture and walls show."""
     floor = float(np.percentile(reference[:, 2], 1))
     before, now = (_standing(points, floor, extent) for points in (reference, current))
     shade = np.clip(before / 12.0, 0, 1) * _DARKEST_WALL
