@@ -149,7 +149,7 @@ class Run:
         self._best, self._best_epoch = tuple(state["best"]), state["best_epoch"]
 
     def _train_pass(self, began: float, progress: Progress) -> None:
-        """Take one epoch's steps; end early when the time is up. Raises FloatingPointError for a loss that is no number."""
+        """Take one epoch's steps; end early when the time is up. Raises FloatingPointError for a loss of NaN."""
         settings, schedule = self._settings, self._settings.schedule
         steps = max(settings.train_pairs // settings.batch, 1)
         # Each epoch has its own stream, so that a resumed run sees the pairs that an unbroken one sees.

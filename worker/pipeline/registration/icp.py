@@ -57,13 +57,8 @@ def icp(
         points, index, distance = _correspondences(source, target, pose, max_correspondence_distance)
         if len(points) < 6:
             break
-        jacobian, residual = _linearized(points, target, index)
-        weighted = jacobian
-        if robust:
-            weighted = jacobian * ((1 - (distance / max_correspondence_distance) ** 2) ** 2)[:, None]
-        # 1e-9 keeps a degenerate scene solvable: the step in a free direction is zero
-        normal_matrix = weighted.T @ jacobian + 1e-9 * len(residual) * np.eye(6)
-        step: Floats = -np.linalg.solve(normal_matrix, weighted.T @ residual).astype(np.float64)
+        weights = (1 - (distance / max_correspondence_distance) ** 2) ** 2 if robust else None
+        step = _step(*_linearized(points, target, index), weights)
         pose = exponential(step) @ pose
         converged = bool(np.abs(step).max() < tolerance)
     distance, _ = target.nearest(transformed(source.points, pose), within=max_correspondence_distance)
@@ -76,6 +71,15 @@ def icp(
         fitness=len(inliers) / max(len(source.points), 1),
         inlier_rmse=float(np.sqrt(np.mean(inliers**2))) if len(inliers) else float("inf"),
     )
+
+
+def _step(jacobian: Floats, residual: Floats, weights: Floats | None) -> Floats:
+    """Solve the normal equations of (K, 6) and (K,), with (K,) weights if given: the twist (6,) of one iteration."""
+    weighted = jacobian if weights is None else jacobian * weights[:, None]
+    # 1e-9 keeps a degenerate scene solvable: the step in a free direction is zero
+    normal_matrix = weighted.T @ jacobian + 1e-9 * len(residual) * np.eye(6)
+    step: Floats = -np.linalg.solve(normal_matrix, weighted.T @ residual).astype(np.float64)
+    return step
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
