@@ -65,10 +65,8 @@ class Detector(Protocol):
 
     def encode_reference(self, reference: Side, tiles: Tiles, *, progress: Progress = no_progress) -> Arrays:
         """Return what can be computed of the map alone, once when it is built; {} if nothing."""
-        ...
 
     def detect(
         self, comparison: Comparison, *, embedding: Arrays | None = None, progress: Progress = no_progress
     ) -> Detection:
         """Score every observed tile; `embedding` is what `encode_reference` returned for the map, if it was kept."""
-        ...

@@ -30,11 +30,9 @@ class DetectorClass(Protocol):
     @property
     def settings_class(self) -> type[BaseModel]:
         """Of the card's `detector_settings`."""
-        ...
 
     def load(self, card: Card, weights: Weights, device: torch.device) -> Detector:
         """Open a model. Raises RuntimeError for weights of another network, ValueError for unsound settings."""
-        ...
 
 
 @runtime_checkable
@@ -43,7 +41,6 @@ class TrainedDetector(Detector, Protocol):
 
     def weights(self) -> Weights:
         """Return what `load` takes."""
-        ...
 
 
 def detector_class(key: str) -> DetectorClass:

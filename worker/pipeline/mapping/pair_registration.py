@@ -35,11 +35,9 @@ class PairCache(Protocol):
 
     def load(self) -> Iterable[PairResult]:
         """Load what an earlier run of this build left."""
-        ...
 
     def save(self, results: Iterable[PairResult]) -> None:
         """Keep a few more results; called seconds apart at most."""
-        ...
 
 
 class NullPairCache:

@@ -73,7 +73,10 @@ def dress(figure: Figure, axes: Axes, extent: Extent, changes: ChangeSet, title:
         fontsize=8,
         frameon=False,
     )
-    note = "seen from above, between 0.15 and 2 m over the floor; of tiles above each other the first in this list is drawn"
+    note = (
+        "seen from above, between 0.15 and 2 m over the floor; "
+        "of tiles above each other the first in this list is drawn"
+    )
     figure.text(0.5, 0.14 / above, note, fontsize=6.5, color=QUIET, ha="center", va="center")
 
 
