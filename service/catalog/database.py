@@ -35,11 +35,9 @@ class Database:
         self.engine = _engine(url)
         self._writer = self.engine.execution_options(spicd_write=True)
 
-    @contextlib.contextmanager
-    def read(self) -> Iterator[Session]:
-        """Open a session that sees one state of the database and changes nothing."""
-        with Session(self.engine) as session:
-            yield session
+    def read(self) -> Session:
+        """Return a session, to be opened, that sees one state of the database and changes nothing."""
+        return Session(self.engine)
 
     @contextlib.contextmanager
     def write(self) -> Iterator[Session]:

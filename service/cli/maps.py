@@ -47,9 +47,7 @@ def show(ctx: typer.Context, map_id: str) -> None:
 def delete(ctx: typer.Context, map_id: str) -> None:
     """Remove a map with its versions and surveys."""
     terminal: Terminal = ctx.obj
-    with terminal.client() as client:
-        client.delete_map(map_id)
-    terminal.deleted(f"map {map_id}", map_id=map_id)
+    terminal.delete(lambda client: client.delete_map(map_id), f"map {map_id}", map_id=map_id)
 
 
 def _table(maps: list[Document]) -> Table:

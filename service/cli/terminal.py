@@ -8,8 +8,7 @@ from __future__ import annotations
 import json
 import re
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -53,11 +52,9 @@ class Terminal:
     )
     err: Console = field(default_factory=lambda: Console(stderr=True, markup=False, emoji=False))
 
-    @contextmanager
-    def client(self) -> Iterator[Client]:
-        """Open the API for the length of a command."""
-        with Client(self.url) as client:
-            yield client
+    def client(self) -> Client:
+        """Return the API, to be opened for the length of a command."""
+        return Client(self.url)
 
     def ask(self, call: Callable[[Client], T], table: Callable[[T], Any]) -> None:
         """Call the API and print its answer."""
@@ -72,8 +69,10 @@ class Terminal:
         else:
             self.out.print(table(document))
 
-    def deleted(self, name: str, **ids: Any) -> None:
-        """Say that a thing is gone."""
+    def delete(self, call: Callable[[Client], None], name: str, **ids: Any) -> None:
+        """Have the API delete a thing, and say that it is gone."""
+        with self.client() as client:
+            call(client)
         self.show({**ids, "deleted": True}, lambda _: f"{name} is deleted")
 
     def accepted(

@@ -51,9 +51,10 @@ def show(ctx: typer.Context, map_id: str, version: int) -> None:
 def delete(ctx: typer.Context, map_id: str, version: int) -> None:
     """Remove a version that is not in use; surveys compared with it stay."""
     terminal: Terminal = ctx.obj
-    with terminal.client() as client:
-        client.delete_version(map_id, version)
-    terminal.deleted(f"version {version} of map {map_id}", map_id=map_id, version=version)
+    name = f"version {version} of map {map_id}"
+    terminal.delete(
+        lambda client: client.delete_version(map_id, version), name, map_id=map_id, version=version
+    )
 
 
 def _made_from(one: Document) -> str:

@@ -61,23 +61,15 @@ def kept_scans(
 
 def _recorded(scan_id: str, outcome: ScanResult, ids: Sequence[str]) -> ScanOutcome:
     registration = outcome.registration
-    if registration is None:
-        return ScanOutcome(
-            scan_id=scan_id,
-            accepted=False,
-            fitness=outcome.fitness,
-            rmse=outcome.inlier_rmse,
-            reason=outcome.reason,
-        )
-    sigma = registration.uncertainty
+    sigma = None if registration is None else registration.uncertainty
     return ScanOutcome(
         scan_id=scan_id,
-        accepted=True,
+        accepted=registration is not None,
         fitness=outcome.fitness,
         rmse=outcome.inlier_rmse,
-        map_from_scan=registration.map_from_scan.tolist(),
+        map_from_scan=None if registration is None else registration.map_from_scan.tolist(),
         translation_sigma=None if sigma is None else sigma.translation,
         rotation_sigma=None if sigma is None else sigma.rotation,
-        path=tuple(ids[index] for index in registration.path) or None,
+        path=None if registration is None else tuple(ids[index] for index in registration.path) or None,
         reason=outcome.reason,
     )

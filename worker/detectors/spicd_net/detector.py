@@ -8,10 +8,11 @@ from typing import Self
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 from torch import Tensor
 
 from worker.cloud.patches import Patch, patch
+from worker.cloud.settings import StrictModel
 from worker.cloud.tiling import TilePairs, Tiles
 from worker.cloud.types import Arrays, Points
 from worker.detectors.card import Card
@@ -28,10 +29,8 @@ TILES_PER_REPORT = 8
 REFERENCE, CURRENT = 0, 1  #: streams of the Chamfer sample, so that two equal patches are not sampled alike
 
 
-class SpicdNetSettings(BaseModel):
+class SpicdNetSettings(StrictModel):
     """`detector_settings` of a card of this detector: what of the input is tied to the weights."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     patch_points: int = Field(gt=0, description="points of a patch after FPS and repetition")
     chamfer_points: int | None = Field(
