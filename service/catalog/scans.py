@@ -101,11 +101,6 @@ class Scans:
         with self._database.read() as session:
             return ScanRecord.of_row(_row(session, scan_id))
 
-    def many(self, scan_ids: Sequence[str]) -> tuple[ScanRecord, ...]:
-        """Return several scans, in the order asked for. Raises NotFound naming every id that is unknown."""
-        with self._database.read() as session:
-            return scans_in_order(session, scan_ids)
-
     def page(self, *, after: Position | None = None, limit: int = 100) -> Page[ScanRecord]:
         """Return scans, newest first."""
         table = tables.Scan

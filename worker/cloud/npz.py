@@ -84,10 +84,10 @@ def _arrays(kind: Any, value: Any, name: str) -> Iterator[tuple[str, NDArray[Any
     item = _item(kind)
     if value is None:
         return
-    if is_dataclass(kind):
+    if _is_dataclass(kind):
         for field, its_kind in _fields(kind).items():
             yield from _arrays(its_kind, getattr(value, field), _inner(name, field))
-    elif is_dataclass(item):
+    elif _is_dataclass(item):
         for field, its_kind in _fields(item).items():
             column = tuple(getattr(row, field) for row in value)
             yield from _arrays(_column(its_kind), column, _inner(name, field))
@@ -106,11 +106,11 @@ def _value(kind: Any, arrays: Arrays, name: str) -> Any:
         return None
     kind = _without_none(kind)
     item = _item(kind)
-    if is_dataclass(kind):
+    if _is_dataclass(kind):
         return kind(
             **{field: _value(its, arrays, _inner(name, field)) for field, its in _fields(kind).items()}
         )
-    if is_dataclass(item):
+    if _is_dataclass(item):
         columns = {
             field: _value(_column(its), arrays, _inner(name, field)) for field, its in _fields(item).items()
         }
@@ -145,6 +145,10 @@ def _item(kind: Any) -> Any:
 def _column(kind: Any) -> Any:
     """Return the type of a tuple of items of this type."""
     return GenericAlias(tuple, (kind, ...))
+
+
+def _is_dataclass(kind: Any) -> bool:
+    return is_dataclass(kind)
 
 
 def _is_array(kind: Any) -> bool:
