@@ -61,15 +61,7 @@ def tile_feature(
         "type": "Feature",
         "id": f"{survey['survey_id']}.{tile_id}",
         "geometry": geometry,
-        "place": {
-            "type": "Prism",
-            "base": {
-                "type": "Polygon",
-                "coordinates": [[list(corner) for corner in footprint(lower, upper)]],
-            },
-            "lower": lower[2],
-            "upper": upper[2],
-        },
+        "place": _prism(lower, upper),
         "time": None if captured_at is None else {"timestamp": captured_at},
         "properties": {
             "tile_id": tile_id,
@@ -83,6 +75,13 @@ def tile_feature(
             **survey,
         },
     }
+
+
+def _prism(lower: Corner, upper: Corner) -> dict[str, Any]:
+    """Return a box over its footprint (JSON-FG, Prism)."""
+    ring = [list(corner) for corner in footprint(lower, upper)]
+    base = {"type": "Polygon", "coordinates": [ring]}
+    return {"type": "Prism", "base": base, "lower": lower[2], "upper": upper[2]}
 
 
 def footprint(lower: Corner, upper: Corner) -> Ring:

@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from worker.detectors.registry import DETECTORS
+
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("service", "worker")
 
@@ -196,6 +198,11 @@ KNOWS_THE_SERVICE = (
 TRAINING_NEEDS = {"torch", "numpy"}
 OPTIONAL_FOR_TRAINING = {"fpsample", "scipy"}  #: imported in a `try`; there is a slower way without
 
+#: Modules that the table of detectors names in words, so that no import statement shows them.
+NETWORKS = {entry.network.partition(":")[0] for entry in DETECTORS.values() if entry.network is not None}
+NAMED = NETWORKS | {entry.detector.partition(":")[0] for entry in DETECTORS.values()}
+TRAINING = ("worker.training.__main__", *sorted(NETWORKS))
+
 
 @pytest.fixture(scope="module")
 def imports() -> Imports:
@@ -228,8 +235,15 @@ def test_only_the_shell_of_the_worker_knows_the_service(imports: Imports) -> Non
     assert outside(worker, "service", KNOWS_THE_SERVICE) == []
 
 
-def test_training_runs_where_there_is_only_torch_and_numpy(imports: Imports) -> None:
-    assert third_party(reached(imports, "worker.training.__main__")) <= TRAINING_NEEDS | OPTIONAL_FOR_TRAINING
+@pytest.mark.parametrize("name", TRAINING)
+def test_training_runs_where_there_is_only_torch_and_numpy(imports: Imports, name: str) -> None:
+    assert third_party(reached(imports, name)) <= TRAINING_NEEDS | OPTIONAL_FOR_TRAINING
+
+
+@pytest.mark.parametrize("name", sorted(NAMED))
+def test_a_detector_that_is_named_lies_in_the_room_of_detectors(imports: Imports, name: str) -> None:
+    assert name in imports
+    assert name.startswith("worker.detectors.")
 
 
 def test_no_modules_import_each_other_in_a_circle(imports: Imports) -> None:
@@ -286,9 +300,8 @@ def with_line(imports: Imports, path: str, line: str) -> Imports:
 
 def violations(imports: Imports) -> list[str]:
     """What the tests above would complain of, circles apart."""
-    training = (
-        third_party(reached(imports, "worker.training.__main__")) - TRAINING_NEEDS - OPTIONAL_FOR_TRAINING
-    )
+    training = set().union(*(third_party(reached(imports, name)) for name in TRAINING))
+    training -= TRAINING_NEEDS | OPTIONAL_FOR_TRAINING
     return [
         *against_layers(imports),
         *in_the_service(imports),

@@ -64,7 +64,7 @@ class CatalogRecords:
         self._url = database_url
 
     def failed(self, job_id: str, code: str, sentence: str) -> bool:
-        """The job failed with this problem."""
+        """Record that the job failed with this problem."""
         with self._database() as database:
             return Jobs(database).fail(job_id, Problem(code=code, detail=sentence))
 
@@ -74,7 +74,7 @@ class CatalogRecords:
             return Jobs(database).lose_attempt(job_id, how)
 
     def stopped(self, job_id: str) -> bool:
-        """The step waits for another worker; whether the job still wants it."""
+        """Record that the step waits for another worker; tell whether the job still wants it."""
         with self._database() as database:
             return Jobs(database).put_back(job_id)
 

@@ -28,8 +28,8 @@ class Processes:
     def __init__(self, pool: ProcessPoolExecutor | None) -> None:
         self._pool = pool
 
-    def each(self, run: Callable[[Task], Result], tasks: Sequence[Task]) -> Iterator[Result]:
-        """Results as they come, in no order; function, tasks and results have to be picklable.
+    def map_unordered(self, run: Callable[[Task], Result], tasks: Sequence[Task]) -> Iterator[Result]:
+        """Yield results as they come, in no order; function, tasks and results have to be picklable.
 
         Raises what the function raises, and ProcessLost.
         """
@@ -52,7 +52,7 @@ class Processes:
 
 @contextmanager
 def open_processes(count: int) -> Iterator[Processes]:
-    """So many processes, or none and this one does the work where `count` is under 2."""
+    """Start so many processes, or none where `count` is under 2: this one does the work then."""
     if count < 2:
         yield Processes(None)
         return
@@ -62,12 +62,12 @@ def open_processes(count: int) -> Iterator[Processes]:
 
 
 def default_processes() -> int:
-    """One a core that this process may use."""
+    """Return one a core that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _begin() -> None:
-    """First thing in a new process: one thread for itself, and no life without its parent."""
+    """Prepare a new process: one thread for itself, and no life without its parent."""
     wait_passively()
     one_thread()
     threading.Thread(target=_end_with_parent, daemon=True).start()

@@ -20,11 +20,11 @@ def no_progress(stage: str, share: float) -> None:
 
 
 def monotonic_progress(progress: Progress) -> Progress:
-    """The same, for work whose rounds begin anew: a share that would fall is told as the highest so far."""
+    """Return the same for work whose rounds begin anew: a share that would fall is reported as the highest so far."""
     highest: dict[str, float] = {}
 
-    def told(stage: str, share: float) -> None:
+    def report(stage: str, share: float) -> None:
         highest[stage] = max(highest.get(stage, 0.0), share)
         progress(stage, highest[stage])
 
-    return told
+    return report

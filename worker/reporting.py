@@ -14,7 +14,7 @@ class Reporter:
     """A `worker.progress.Progress` that writes where the job is, seldom enough to cost nothing."""
 
     def __init__(self, spans: Mapping[str, tuple[float, float]], write: Callable[[str, float], bool]) -> None:
-        """`spans` gives each stage its part of the job, 0..1; `write(stage, share)` says whether to go on."""
+        """Take of each stage its part of the job, 0..1; `write(stage, share)` says whether to go on."""
         self._spans = spans
         self._write = write
         self._stage = ""

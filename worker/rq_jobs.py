@@ -87,5 +87,5 @@ class StepJob(Job):  # type: ignore[misc]  # rq is untyped here
 
 
 def step_job(allowed: frozenset[str]) -> type[StepJob]:
-    """The job class that calls these dotted names only. rq takes a class, not an instance."""
+    """Return the job class that calls these dotted names only. rq takes a class, not an instance."""
     return type("AllowedStepJob", (StepJob,), {"allowed": allowed})

@@ -44,13 +44,13 @@ class Records(Protocol):
     """What a worker tells the catalog, and asks it."""
 
     def failed(self, job_id: str, code: str, sentence: str) -> object:
-        """A step ended for good, with this problem."""
+        """Record that a step ended for good, with this problem."""
 
     def lost(self, job_id: str, how: str) -> bool:
-        """An attempt ended without a word; whether to start the step again."""
+        """Record that an attempt ended without a word; tell whether to start the step again."""
 
     def stopped(self, job_id: str) -> bool:
-        """A step was stopped with its worker; whether it shall go on with another."""
+        """Record that a step was stopped with its worker; tell whether it shall go on with another."""
 
 
 class WorkerStopped(BaseException):
@@ -97,7 +97,7 @@ class _StepWorker(BaseWorker):  # type: ignore[misc]  # rq is untyped here
         super().handle_job_failure(job, queue, *args, **kwargs)
 
     def handle_warm_shutdown_request(self) -> None:
-        """The first SIGTERM: the running step has `grace_s` seconds to end by itself."""
+        """Answer the first SIGTERM: the running step has `grace_s` seconds to end by itself."""
         log.info("%s: stopping", self.queues[0].name)
         timer = threading.Timer(self._grace_s, self._end_grace)
         timer.daemon = True
@@ -107,7 +107,7 @@ class _StepWorker(BaseWorker):  # type: ignore[misc]  # rq is untyped here
         raise NotImplementedError
 
     def _record(self, job: StepJob, kind: type[BaseException], error: BaseException, *_: Any) -> None:
-        """Handler of rq for a step that raised, and for one whose worker went away."""
+        """Handle a step that raised, or whose worker went away; rq calls this."""
         if kind is AbandonedJobError:
             self._lost(job, _gone(job))
             if not job.should_retry:
@@ -118,18 +118,18 @@ class _StepWorker(BaseWorker):  # type: ignore[misc]  # rq is untyped here
             self._tell(job, self._records.failed, *_problem(error, job))
 
     def _lost(self, job: StepJob, how: str) -> None:
-        """An attempt ended without a word."""
+        """Record an attempt that ended without a word, and start the step again where it shall be."""
         log.warning("%s: %s", job.id, how)
         if self._tell(job, self._records.lost, how):
             job.start_again()
 
     def _put_back(self, job: StepJob) -> None:
-        """The step ends with this worker, through no fault of its own."""
+        """Put back a step that ends with this worker, through no fault of its own."""
         if self._tell(job, self._records.stopped):
             job.start_again()
 
     def _tell(self, job: StepJob, record: Callable[..., object], *words: str) -> bool:
-        """The catalog's answer; one that does not answer must not take the worker down.
+        """Return the catalog's answer; one that does not answer must not take the worker down.
 
         What it did not hear, it learns when the service next starts and finds the job running without a step.
         """
@@ -146,7 +146,7 @@ class GeometryWorker(_StepWorker, Worker):  # type: ignore[misc]
     """One forked process for each step."""
 
     def main_work_horse(self, job: StepJob, queue: Queue) -> None:
-        """First thing in the forked process: end with the worker, whatever ends that."""
+        """Run the step in the forked process, which ends with the worker, whatever ends that."""
         end_with_parent(self.pid)
         super().main_work_horse(job, queue)
 
@@ -168,7 +168,7 @@ class GeometryWorker(_StepWorker, Worker):  # type: ignore[misc]
         status: int | None,
         usage: Any,  # noqa: ARG002
     ) -> None:
-        """A step's process ended without a word: a crash, no memory, or this worker's end."""
+        """Handle a process that ended without a word: a crash, no memory, or this worker's end."""
         if self._stop_requested:
             self._put_back(job)
         elif status is None:
@@ -186,7 +186,7 @@ class InferenceWorker(_StepWorker, SimpleWorker):  # type: ignore[misc]
     _working: threading.Event | None = None  #: set when the running step is over
 
     def get_heartbeat_ttl(self, job: StepJob) -> int:
-        """The forking worker's claim, not `SimpleWorker`'s, which lasts as long as the step may take."""
+        """Return the forking worker's claim, not `SimpleWorker`'s, which lasts as long as the step may take."""
         return int(BaseWorker.get_heartbeat_ttl(self, job))
 
     def perform_job(self, job: StepJob, queue: Queue) -> bool:
@@ -198,13 +198,13 @@ class InferenceWorker(_StepWorker, SimpleWorker):  # type: ignore[misc]
             self._working.set()
 
     def handle_execution_ended(self, job: StepJob, queue: Queue, heartbeat_ttl: int) -> None:
-        """The work is done and rq is about to remove its claim: no sign of life may come after that."""
+        """End the signs of life: the work is done, rq is about to remove its claim, and none may come after that."""
         if self._working is not None:
             self._working.set()
         super().handle_execution_ended(job, queue, heartbeat_ttl)
 
     def request_force_stop(self, *_: Any) -> None:
-        """Time is up: leave the step from wherever it is."""
+        """Leave the step from wherever it is: time is up."""
         raise WorkerStopped
 
     def _beat(self, job: StepJob, over: threading.Event) -> None:
@@ -213,12 +213,12 @@ class InferenceWorker(_StepWorker, SimpleWorker):  # type: ignore[misc]
                 self.maintain_heartbeats(job)
 
     def _end_grace(self) -> None:
-        """Signals reach the main thread, which runs the step; the handler is `request_force_stop` by now."""
+        """Signal the main thread, which runs the step; the handler is `request_force_stop` by now."""
         os.kill(os.getpid(), signal.SIGTERM)
 
 
 def _problem(error: BaseException, job: StepJob) -> tuple[str, str]:
-    """Code and sentence for an error that left a step."""
+    """Return code and sentence for an error that left a step."""
     match error:
         case PipelineError():
             return error.code, str(error)
@@ -238,7 +238,7 @@ def _gone(job: StepJob) -> str:
 
 
 def _ending(status: int) -> str:
-    """How a process ended, from its wait status."""
+    """Say how a process ended, from its wait status."""
     if not os.WIFSIGNALED(status):
         return f"with exit status {os.waitstatus_to_exitcode(status)}"
     number = os.WTERMSIG(status)

@@ -27,5 +27,5 @@ def one_thread() -> None:
 
 
 def query_threads() -> int:
-    """For SciPy's trees, which ask for a number at each query."""
+    """Return the number that SciPy's trees ask for at each query."""
     return _threads

@@ -27,9 +27,11 @@ from service.queue import JobQueue
 from service.settings import Settings
 
 DESCRIPTION = """\
-Upload LiDAR scans of a building, build a reference map of them, and ask, tile by tile, what a later visit found changed.
+Upload LiDAR scans of a building, build a reference map of them, and ask, tile by tile, \
+what a later visit found changed.
 
-Maps, their versions and surveys are built by jobs: the answer to the POST names the job, and `GET /jobs/{id}` says how far it is.
+Maps, their versions and surveys are built by jobs: the answer to the POST names the job, \
+and `GET /jobs/{id}` says how far it is.
 Every error is a problem document (RFC 9457) with a stable `type`.
 """
 

@@ -149,5 +149,4 @@ def position_of(cursor: str | None) -> ChangePosition | None:
     """Return where to go on. Raises BadRequest."""
     if cursor is None:
         return None
-    captured_at, survey_id, score, tile_id = decoded(cursor, instant, str, float.fromhex, str)
-    return ChangePosition(captured_at=captured_at, survey_id=survey_id, score=score, tile_id=tile_id)
+    return ChangePosition(*decoded(cursor, instant, str, float.fromhex, str))

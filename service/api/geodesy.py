@@ -59,7 +59,7 @@ def to_ecef(longitude: float, latitude: float, height: float) -> Vector3:
 
 
 def to_geodetic(x: float, y: float, z: float) -> Vector3:
-    """Return longitude, latitude (radians) and height (metres) of an Earth-centred position near the Earth's surface."""
+    """Return longitude, latitude (radians) and height (metres) of an Earth-centred position near the surface."""
     out = math.hypot(x, y)
     latitude = math.atan2(z, out * (1 - _E2))
     for _ in range(_ROUNDS):

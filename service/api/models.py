@@ -36,7 +36,8 @@ class TrainingRequest(Request):
         float | None,
         Field(
             gt=0,
-            description="of training, at most; left out: `SPICD_TRAINING_MINUTES`; no more than `SPICD_MAX_TRAINING_MINUTES`",
+            description="of training, at most; left out: `SPICD_TRAINING_MINUTES`; no more than "
+            "`SPICD_MAX_TRAINING_MINUTES`",
         ),
     ] = None
     epochs: Annotated[

@@ -34,7 +34,7 @@ class Blobs:
     """A key-value store of files; keys come from `service.catalog.blob_keys`."""
 
     def __init__(self, url: str) -> None:
-        """`url` is `file:///folder` (made when absent) or what else obstore opens, such as `s3://bucket/prefix`."""
+        """Open `url`: `file:///folder` (made when absent) or what else obstore opens, such as `s3://bucket/prefix`."""
         parts = urlsplit(url)
         self._store: ObjectStore
         if parts.scheme == "file":

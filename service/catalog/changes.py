@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from datetime import datetime
-from typing import Any
+from typing import Any, NamedTuple
 
 from sqlalchemy import Select, and_, func, or_, select
 
@@ -13,10 +13,10 @@ from service.catalog.database import Database
 from service.catalog.records import Bounds, ChangeRecord, TileRecord
 
 _TILE, _SURVEY = tables.SurveyTile, tables.Survey
+_TILES = select(_TILE, _SURVEY).join(_SURVEY, _SURVEY.survey_id == _TILE.survey_id)
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class ChangePosition:
+class ChangePosition(NamedTuple):
     """Where a page ended."""
 
     captured_at: datetime
@@ -72,22 +72,13 @@ class Changes:
 
     def of_survey(self, survey_id: str) -> tuple[ChangeRecord, ...]:
         """Return every tile of a survey, unobserved ones too, in the order of the grid."""
-        query = (
-            select(_TILE, _SURVEY)
-            .join(_SURVEY, _SURVEY.survey_id == _TILE.survey_id)
-            .where(_TILE.survey_id == survey_id)
-            .order_by(_TILE.i, _TILE.j, _TILE.k)
-        )
+        query = _TILES.where(_TILE.survey_id == survey_id).order_by(_TILE.i, _TILE.j, _TILE.k)
         with self._database.read() as session:
             return tuple(_record(tile, survey) for tile, survey in session.execute(query))
 
 
 def _matching(wanted: ChangeFilter) -> Select[tables.SurveyTile, tables.Survey]:
-    query = (
-        select(_TILE, _SURVEY)
-        .join(_SURVEY, _SURVEY.survey_id == _TILE.survey_id)
-        .where(_SURVEY.map_id == wanted.map_id, _SURVEY.status == "ready", _TILE.state == "changed")
-    )
+    query = _TILES.where(_SURVEY.map_id == wanted.map_id, _SURVEY.status == "ready", _TILE.state == "changed")
     if wanted.survey_id is not None:
         query = query.where(_SURVEY.survey_id == wanted.survey_id)
     if wanted.since is not None:
@@ -117,12 +108,7 @@ def _behind(after: ChangePosition) -> Any:
 
 
 def _position(last: ChangeRecord) -> ChangePosition:
-    return ChangePosition(
-        captured_at=last.captured_at,
-        survey_id=last.survey_id,
-        score=last.tile.score or 0.0,
-        tile_id=last.tile.tile_id,
-    )
+    return ChangePosition(last.captured_at, last.survey_id, last.tile.score or 0.0, last.tile.tile_id)
 
 
 def _record(tile: tables.SurveyTile, survey: tables.Survey) -> ChangeRecord:

@@ -31,15 +31,13 @@ class Database:
     """An engine and its sessions; `write()` takes the lock at once, so that no read turns stale before its write."""
 
     def __init__(self, url: str) -> None:
-        """`url` is `sqlite:///file` or `postgresql://...`; nothing is opened before it is needed."""
+        """Take `sqlite:///file` or `postgresql://...`; nothing is opened before it is needed."""
         self.engine = _engine(url)
         self._writer = self.engine.execution_options(spicd_write=True)
 
-    @contextlib.contextmanager
-    def read(self) -> Iterator[Session]:
-        """Open a session that sees one state of the database and changes nothing."""
-        with Session(self.engine) as session:
-            yield session
+    def read(self) -> Session:
+        """Return a session, to be opened, that sees one state of the database and changes nothing."""
+        return Session(self.engine)
 
     @contextlib.contextmanager
     def write(self) -> Iterator[Session]:

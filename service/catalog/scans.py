@@ -69,18 +69,7 @@ class Scans:
             key=key,
             created=tables.now(),
         )
-        try:
-            with self._database.write() as session:
-                session.add(row)
-                session.flush()
-                return ScanRecord.of_row(row), True
-        except IntegrityError:  # the same upload, a moment earlier
-            self._blobs.delete_prefix(blob_keys.folder_of(key))
-            if known := self._sent_again(scan_id):
-                return known, False
-            raise Conflict(
-                f"scan {scan_id!r} was deleted while it was sent again; send it once more"
-            ) from None
+        return self._insert(row)
 
     def correct(
         self, scan_id: str, *, captured_at: datetime | None = None, pose: Matrix | None = None
@@ -112,11 +101,6 @@ class Scans:
         with self._database.read() as session:
             return ScanRecord.of_row(_row(session, scan_id))
 
-    def many(self, scan_ids: Sequence[str]) -> tuple[ScanRecord, ...]:
-        """Return several scans, in the order asked for. Raises NotFound naming every id that is unknown."""
-        with self._database.read() as session:
-            return scans_in_order(session, scan_ids)
-
     def page(self, *, after: Position | None = None, limit: int = 100) -> Page[ScanRecord]:
         """Return scans, newest first."""
         table = tables.Scan
@@ -136,6 +120,22 @@ class Scans:
         """Delete a scan that `add` said was new, unless somebody else sent it again or uses it by now."""
         with contextlib.suppress(IntegrityError):
             self._forget(tables.Scan.key == added.key, tables.Scan.resent.is_(None))
+
+    def _insert(self, row: tables.Scan) -> tuple[ScanRecord, bool]:
+        """Record a scan whose file is kept, unless the same upload came a moment earlier. Raises Conflict."""
+        scan_id, key = row.scan_id, row.key
+        try:
+            with self._database.write() as session:
+                session.add(row)
+                session.flush()
+                return ScanRecord.of_row(row), True
+        except IntegrityError:
+            self._blobs.delete_prefix(blob_keys.folder_of(key))
+            if known := self._sent_again(scan_id):
+                return known, False
+            raise Conflict(
+                f"scan {scan_id!r} was deleted while it was sent again; send it once more"
+            ) from None
 
     def _forget(self, *which: ColumnElement[bool]) -> bool:
         """Delete one scan, then the very file that its row named: another of the same bytes may just be coming."""

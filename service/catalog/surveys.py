@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from datetime import datetime
 from typing import get_args
 
@@ -104,18 +104,10 @@ class Surveys:
             write_outcomes(row.scans, outcomes)
             row.updated = now()
 
-    def save_result(
-        self,
-        survey_id: str,
-        *,
-        tiles: Iterable[TileRecord],
-        threshold: float,
-        counts: Mapping[str, int] | None = None,
-    ) -> None:
+    def save_result(self, survey_id: str, *, tiles: Iterable[TileRecord], threshold: float) -> None:
         """Record the tiles, replacing those of an earlier run; `jobs.succeed` makes the survey ready.
 
-        `threshold` is the one that was used. The number of tiles in each state is counted here; `counts` adds
-        to it. Raises NotFound.
+        `threshold` is the one that was used. The number of tiles in each state is counted here. Raises NotFound.
         """
         tiles = tuple(tiles)
         by_state = Counter(tile.state for tile in tiles)
@@ -124,11 +116,7 @@ class Surveys:
             session.execute(delete(SurveyTile).where(SurveyTile.survey_id == survey_id))
             session.add_all(_tile_row(survey_id, tile) for tile in tiles)
             row.threshold = threshold
-            row.counts = {
-                **(counts or {}),
-                "tiles": len(tiles),
-                **{state: by_state[state] for state in get_args(TileState)},
-            }
+            row.counts = {"tiles": len(tiles), **{state: by_state[state] for state in get_args(TileState)}}
             row.updated = now()
 
     def delete(self, survey_id: str) -> None:

@@ -16,11 +16,6 @@ from service.client import ClientError, Document, sentence
 _STYLES = {"successful": "green", "failed": "red", "dismissed": "yellow", "running": "cyan"}
 
 
-def register(commands: typer.Typer) -> None:
-    """Add `jobs` to the command line."""
-    commands.command("jobs")(jobs)
-
-
 def jobs(
     ctx: typer.Context,
     job_id: Annotated[str | None, typer.Argument(help="One job; left out: all.")] = None,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from typing import Annotated
 
 import typer
@@ -35,9 +36,28 @@ def _commands() -> typer.Typer:
         help="Says what changed in a building: LiDAR scans in, changed tiles out.",
     )
     commands.callback()(_options)
-    for part in (up, scans, maps, versions, surveys, jobs, models):
-        part.register(commands)
+    commands.command()(up.up)
+    _add_group(commands, "scans", "Upload scans.", scans.add)
+    _add_group(commands, "maps", "Reference maps.", maps.create, maps.list_, maps.show, maps.delete)
+    of_versions = (versions.add, versions.list_, versions.show, versions.delete)
+    _add_group(commands, "versions", "Versions of a map.", *of_versions)
+    of_surveys = (surveys.submit, surveys.list_, surveys.show)
+    _add_group(commands, "surveys", "Later visits of a mapped space.", *of_surveys)
+    commands.command()(surveys.changes)
+    commands.command()(jobs.jobs)
+    of_models = _add_group(commands, "models", "Models that score tiles; alone, it lists them.", models.train)
+    of_models.info.no_args_is_help = False
+    of_models.callback(invoke_without_command=True)(models.list_)
     return commands
+
+
+def _add_group(commands: typer.Typer, name: str, help_text: str, *group: Callable[..., None]) -> typer.Typer:
+    """Add a group of commands to the command line, each under the name of its function."""
+    added = typer.Typer(no_args_is_help=True, help=help_text)
+    for command in group:
+        added.command(command.__name__.rstrip("_"))(command)
+    commands.add_typer(added, name=name)
+    return added
 
 
 def _options(

@@ -9,13 +9,8 @@ from rich.console import Group
 from rich.table import Table
 
 from service.cli.tables import columns, counts, facts, point, scan_table
-from service.cli.terminal import Captured, Device, Model, Scans, Terminal, Wait, add_group
+from service.cli.terminal import Captured, Device, Model, Scans, Terminal, Wait
 from service.client import Document
-
-
-def register(commands: typer.Typer) -> None:
-    """Add `maps` to the command line."""
-    add_group(commands, "maps", "Reference maps.", create, list_, show, delete)
 
 
 def create(
@@ -52,9 +47,7 @@ def show(ctx: typer.Context, map_id: str) -> None:
 def delete(ctx: typer.Context, map_id: str) -> None:
     """Remove a map with its versions and surveys."""
     terminal: Terminal = ctx.obj
-    with terminal.client() as client:
-        client.delete_map(map_id)
-    terminal.deleted(f"map {map_id}", map_id=map_id)
+    terminal.delete(lambda client: client.delete_map(map_id), f"map {map_id}", map_id=map_id)
 
 
 def _table(maps: list[Document]) -> Table:

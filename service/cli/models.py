@@ -13,18 +13,6 @@ from service.cli.terminal import Terminal, Wait
 from service.client import Document
 
 
-def register(commands: typer.Typer) -> None:
-    """Add `models` to the command line."""
-    group = typer.Typer(
-        invoke_without_command=True,
-        help="Models that score tiles; alone, it lists them.",
-        no_args_is_help=False,
-    )
-    group.callback()(list_)
-    group.command("train")(train)
-    commands.add_typer(group, name="models")
-
-
 def list_(ctx: typer.Context) -> None:
     """The models that can score tiles, those of the site among them."""
     if ctx.invoked_subcommand is not None:

@@ -9,13 +9,8 @@ import typer
 from rich.table import Table
 
 from service.cli.tables import columns
-from service.cli.terminal import Captured, Device, Terminal, add_group, read_pose
+from service.cli.terminal import Captured, Device, Terminal, read_pose
 from service.client import ClientError, Document
-
-
-def register(commands: typer.Typer) -> None:
-    """Add `scans` to the command line."""
-    add_group(commands, "scans", "Upload scans.", add)
 
 
 def add(

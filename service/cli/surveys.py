@@ -10,14 +10,8 @@ from rich.console import Group
 from rich.table import Table
 
 from service.cli.tables import columns, counts, facts, number, point, scan_table
-from service.cli.terminal import Captured, Device, Model, Scans, Terminal, Wait, add_group
+from service.cli.terminal import Captured, Device, Model, Scans, Terminal, Wait
 from service.client import Document
-
-
-def register(commands: typer.Typer) -> None:
-    """Add `surveys` and `changes` to the command line."""
-    add_group(commands, "surveys", "Later visits of a mapped space.", submit, list_, show)
-    commands.command("changes")(changes)
 
 
 def submit(

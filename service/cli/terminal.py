@@ -8,8 +8,7 @@ from __future__ import annotations
 import json
 import re
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -39,14 +38,6 @@ PIPE_WIDTH = 160  #: characters; where nobody says how wide the place is that st
 _ID = re.compile(r"[A-Za-z0-9_-]{1,64}")
 
 
-def add_group(commands: typer.Typer, name: str, help_text: str, *group: Callable[..., None]) -> None:
-    """Add a group of commands to the command line, each under the name of its function."""
-    added = typer.Typer(no_args_is_help=True, help=help_text)
-    for command in group:
-        added.command(command.__name__.rstrip("_"))(command)
-    commands.add_typer(added, name=name)
-
-
 @dataclass(kw_only=True, slots=True)
 class Terminal:
     """The global options and the two consoles; a command finds it as `ctx.obj`."""
@@ -61,11 +52,9 @@ class Terminal:
     )
     err: Console = field(default_factory=lambda: Console(stderr=True, markup=False, emoji=False))
 
-    @contextmanager
-    def client(self) -> Iterator[Client]:
-        """Open the API for the length of a command."""
-        with Client(self.url) as client:
-            yield client
+    def client(self) -> Client:
+        """Return the API, to be opened for the length of a command."""
+        return Client(self.url)
 
     def ask(self, call: Callable[[Client], T], table: Callable[[T], Any]) -> None:
         """Call the API and print its answer."""
@@ -80,8 +69,10 @@ class Terminal:
         else:
             self.out.print(table(document))
 
-    def deleted(self, name: str, **ids: Any) -> None:
-        """Say that a thing is gone."""
+    def delete(self, call: Callable[[Client], None], name: str, **ids: Any) -> None:
+        """Have the API delete a thing, and say that it is gone."""
+        with self.client() as client:
+            call(client)
         self.show({**ids, "deleted": True}, lambda _: f"{name} is deleted")
 
     def accepted(
@@ -113,7 +104,7 @@ class Terminal:
 
     def upload(self, client: Client, path: Path, **about: Any) -> Document:
         """Send one file under a progress bar. Raises `ClientError`, also where the file cannot be read."""
-        with self._bar(_description(), BarColumn(), DownloadColumn()) as bar:
+        with self._bar(_title(), BarColumn(), DownloadColumn()) as bar:
             task = bar.add_task(path.name, total=None)
             try:
                 return client.upload_scan(
@@ -137,7 +128,7 @@ class Terminal:
 
         Raises `JobFailed`; with `--json` the job's document is printed first, for it is the only result there is.
         """
-        columns = (_description(), BarColumn(), TaskProgressColumn(), TimeElapsedColumn())
+        columns = (_title(), BarColumn(), TaskProgressColumn(), TimeElapsedColumn())
         try:
             with self._bar(*columns) as bar:
                 return client.wait(job_id, _advance(bar))
@@ -158,7 +149,7 @@ class Terminal:
         return Progress(*columns, console=self.err, transient=True, disable=hidden)
 
 
-def _description() -> TextColumn:
+def _title() -> TextColumn:
     """Return the column that says what a bar is about, as it is: a file name may look like markup."""
     return TextColumn("{task.description}", style="bold", markup=False)
 

@@ -6,7 +6,7 @@ import json
 import os
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from pydantic import ValidationError
@@ -16,10 +16,8 @@ from service.cli.terminal import Terminal
 from service.settings import Settings
 from service.up.embedded_redis import LaunchFailed
 
-
-def register(commands: typer.Typer) -> None:
-    """Add `up` to the command line."""
-    commands.command("up")(up)
+if TYPE_CHECKING:
+    from service.up.launcher import Running
 
 
 def up(
@@ -39,31 +37,24 @@ def up(
     """Start API, workers and Redis, and stay; Ctrl-C ends all. What is left out comes from SPICD_* or defaults."""
     # The API and uvicorn are of no use to the other commands, which start the faster without.
     from service.logs import set_up_logging  # noqa: PLC0415
-    from service.up.launcher import Running  # noqa: PLC0415
     from service.up.launcher import up as launch  # noqa: PLC0415
     from service.up.lifetime import end_with_parent as end  # noqa: PLC0415
 
     if end_with_parent:
         end(os.getppid())
     terminal: Terminal = ctx.obj
-    given = {
-        "host": host,
-        "port": port,
-        "data_dir": data_dir,
-        "geometry_workers": geometry_workers,
-        "inference_workers": inference_workers,
-    }
-    settings = _settings({name: value for name, value in given.items() if value is not None})
+    settings = _settings(
+        host=host,
+        port=port,
+        data_dir=data_dir,
+        geometry_workers=geometry_workers,
+        inference_workers=inference_workers,
+    )
     set_up_logging(settings.log_level)
 
     def ready(running: Running) -> None:
         if ready_file is not None:
-            try:
-                running.write(ready_file)
-            except OSError as error:
-                raise LaunchFailed(
-                    f"the ready file {ready_file} cannot be written ({error.strerror})"
-                ) from error
+            _write_ready_file(running, ready_file)
         if terminal.as_json:
             sys.stdout.write(
                 json.dumps(running.document()) + "\n"
@@ -75,9 +66,17 @@ def up(
     launch(settings, on_ready=ready)
 
 
-def _settings(given: dict[str, Any]) -> Settings:
+def _write_ready_file(running: Running, path: Path) -> None:
     try:
-        return Settings(**given)
+        running.write(path)
+    except OSError as error:
+        raise LaunchFailed(f"the ready file {path} cannot be written ({error.strerror})") from error
+
+
+def _settings(**given: Any) -> Settings:
+    """Return the settings, with what was given in place of what SPICD_* says. Raises `LaunchFailed`."""
+    try:
+        return Settings(**{name: value for name, value in given.items() if value is not None})
     except ValidationError as error:
         first = error.errors()[0]
         name = "SPICD_" + "_".join(str(part) for part in first["loc"]).upper().removeprefix("SPICD_")

@@ -9,17 +9,12 @@ from rich.console import Group
 from rich.table import Table
 
 from service.cli.tables import columns, counts, facts, scan_table
-from service.cli.terminal import Captured, Device, Terminal, Wait, add_group
+from service.cli.terminal import Captured, Device, Terminal, Wait
 from service.client import Document
 
 Further = Annotated[
     list[str] | None, typer.Argument(help="Further scans: files, which are uploaded, or ids of scans.")
 ]
-
-
-def register(commands: typer.Typer) -> None:
-    """Add `versions` to the command line."""
-    add_group(commands, "versions", "Versions of a map.", add, list_, show, delete)
 
 
 def add(
@@ -56,9 +51,10 @@ def show(ctx: typer.Context, map_id: str, version: int) -> None:
 def delete(ctx: typer.Context, map_id: str, version: int) -> None:
     """Remove a version that is not in use; surveys compared with it stay."""
     terminal: Terminal = ctx.obj
-    with terminal.client() as client:
-        client.delete_version(map_id, version)
-    terminal.deleted(f"version {version} of map {map_id}", map_id=map_id, version=version)
+    name = f"version {version} of map {map_id}"
+    terminal.delete(
+        lambda client: client.delete_version(map_id, version), name, map_id=map_id, version=version
+    )
 
 
 def _made_from(one: Document) -> str:

@@ -149,7 +149,8 @@ class EmbeddedRedis:
             lock = os.open(self._folder / "lock", os.O_RDWR | os.O_CREAT, 0o600)
         except OSError as error:
             raise LaunchFailed(
-                f"the data folder {self._folder.parent} cannot be used ({error.strerror}); name another with SPICD_DATA_DIR"
+                f"the data folder {self._folder.parent} cannot be used ({error.strerror}); "
+                "name another with SPICD_DATA_DIR"
             ) from error
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)

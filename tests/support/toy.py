@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict
 
 from worker.cloud.tiling import Tiles
 from worker.cloud.types import Arrays
-from worker.detectors import store
+from worker.detectors import registry, store
 from worker.detectors.card import Card, Preprocessing
 from worker.detectors.comparison import Comparison, Side
 from worker.detectors.detector import Detection, VoxelScores
@@ -75,7 +75,7 @@ def install(patch: pytest.MonkeyPatch, model_store: Path) -> Card:
         preprocessing=Preprocessing(voxel_size=0.05, tile_size=(1.5, 1.5, 1.0), min_points=512),
         detector_settings={"gain": 0.5},
     )
-    patch.setitem(store.DETECTORS, "toy", Toy)
+    patch.setitem(registry.DETECTORS, "toy", registry.Entry(detector=f"{__name__}:Toy"))
     folder = model_store / MODEL
     folder.mkdir(parents=True)
     store.write_card(folder, card)

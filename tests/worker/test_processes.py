@@ -21,15 +21,15 @@ WHO = "__import__('os').getpid()"
 @pytest.mark.parametrize("count", [0, 1, 2])
 def test_every_task_gives_its_result_whatever_the_number_of_processes(count: int) -> None:
     with open_processes(count) as processes:
-        assert sorted(processes.each(math.sqrt, [9.0, 4.0, 1.0, 16.0])) == [1.0, 2.0, 3.0, 4.0]
-        assert list(processes.each(math.sqrt, [])) == []
-        assert list(processes.each(math.sqrt, [25.0])) == [5.0]  # and it goes on
+        assert sorted(processes.map_unordered(math.sqrt, [9.0, 4.0, 1.0, 16.0])) == [1.0, 2.0, 3.0, 4.0]
+        assert list(processes.map_unordered(math.sqrt, [])) == []
+        assert list(processes.map_unordered(math.sqrt, [25.0])) == [5.0]  # and it goes on
 
 
 @pytest.mark.parametrize("count", [0, 1])
 def test_fewer_than_two_processes_are_none_and_the_caller_does_the_work(count: int) -> None:
     with open_processes(count) as processes:
-        assert list(processes.each(eval, [WHO])) == [os.getpid()]
+        assert list(processes.map_unordered(eval, [WHO])) == [os.getpid()]
 
 
 def test_two_processes_are_others_than_the_caller_with_one_thread_each() -> None:
@@ -40,7 +40,7 @@ def test_two_processes_are_others_than_the_caller_with_one_thread_each() -> None
         "__import__('worker.threads').threads.query_threads()",
     )
     with open_processes(2) as processes:
-        who, *rest = (next(processes.each(eval, [each])) for each in asked)
+        who, *rest = (next(processes.map_unordered(eval, [each])) for each in asked)
     assert who != os.getpid()
     assert rest == ["1", "passive", 1]
 
@@ -51,7 +51,7 @@ def test_an_exception_of_a_task_comes_through(count: int) -> None:
         open_processes(count) as processes,
         pytest.raises(ValueError, match=r"math domain error|nonnegative"),
     ):
-        list(processes.each(math.sqrt, [4.0, -1.0]))
+        list(processes.map_unordered(math.sqrt, [4.0, -1.0]))
 
 
 def test_a_process_that_is_killed_is_told_as_lost_with_advice() -> None:
@@ -59,7 +59,7 @@ def test_a_process_that_is_killed_is_told_as_lost_with_advice() -> None:
         open_processes(2) as processes,
         pytest.raises(ProcessLost, match=r"out of memory.*more memory") as error,
     ):
-        list(processes.each(signal.raise_signal, [signal.SIGKILL]))
+        list(processes.map_unordered(signal.raise_signal, [signal.SIGKILL]))
     assert isinstance(error.value, PipelineError)
     assert error.value.code == "process_lost"
 
@@ -68,7 +68,7 @@ def test_who_stops_listening_leaves_most_tasks_undone(tmp_path: Path) -> None:
     """A dismissal arrives between two results; what waits in the queue is not begun."""
     task = "(__import__('pathlib').Path({!r}).touch(), __import__('time').sleep(0.1))"
     with open_processes(2) as processes:
-        results = processes.each(eval, [task.format(str(tmp_path / str(n))) for n in range(60)])
+        results = processes.map_unordered(eval, [task.format(str(tmp_path / str(n))) for n in range(60)])
         next(results)
         results.close()  # type: ignore[attr-defined]
     assert 1 <= len(list(tmp_path.iterdir())) < 30
@@ -80,8 +80,8 @@ from worker.processes import open_processes
 
 if __name__ == "__main__":
     with open_processes(2) as processes:
-        print(*sorted(processes.each(eval, ["__import__('os').getpid()"] * 2)), flush=True)
-        list(processes.each(time.sleep, [100, 100]))
+        print(*sorted(processes.map_unordered(eval, ["__import__('os').getpid()"] * 2)), flush=True)
+        list(processes.map_unordered(time.sleep, [100, 100]))
 """
 
 

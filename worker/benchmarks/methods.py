@@ -22,7 +22,7 @@ from worker.cloud.tiling import TilePairs, Tiles
 from worker.cloud.types import Arrays
 from worker.detectors.comparison import Comparison, side_of
 from worker.detectors.detector import Detection, Detector
-from worker.detectors.store import DETECTORS, open_card, open_detector, resolve_device, sha256_of
+from worker.detectors.store import detector_class, open_card, open_detector, resolve_device, sha256_of
 from worker.errors import DetectorUnavailable
 from worker.progress import Progress, no_progress
 from worker.training.log import LOG
@@ -83,7 +83,7 @@ def open_model(model_store: Path, model: str, weights: Path | None = None) -> De
             "sha256": sha256_of(state["network"]),
         }
         card = card.model_copy(update=update)
-        return DETECTORS[card.detector].load(card, state["network"], resolve_device("auto"))
+        return detector_class(card.detector).load(card, state["network"], resolve_device("auto"))
     except OSError as missing:
         raise DetectorUnavailable(f"no checkpoint at {weights}: {missing.strerror}") from missing
     except (AttributeError, KeyError, TypeError, EOFError, RuntimeError, pickle.UnpicklingError) as unsound:

@@ -79,7 +79,7 @@ def load_arrays(path: Path, names: Collection[str] | None = None) -> Arrays:
 
 
 def _arrays(kind: Any, value: Any, name: str) -> Iterator[tuple[str, NDArray[Any]]]:
-    """The arrays, by name, that a value of this type is kept as."""
+    """Yield the arrays, by name, that a value of this type is kept as."""
     kind = _without_none(kind)
     item = _item(kind)
     if value is None:
@@ -126,24 +126,24 @@ def _value(kind: Any, arrays: Arrays, name: str) -> Any:
 
 
 def _fields(kind: Any) -> dict[str, Any]:
-    """The types of a dataclass's fields."""
+    """Return the types of a dataclass's fields."""
     hints = get_type_hints(kind)
     return {field.name: hints[field.name] for field in fields(kind)}
 
 
 def _without_none(kind: Any) -> Any:
-    """X of `X | None`; any other type as it is."""
+    """Return X of `X | None`; any other type as it is."""
     others = [part for part in get_args(kind) if part is not NoneType]
     return others[0] if NoneType in get_args(kind) else kind
 
 
 def _item(kind: Any) -> Any:
-    """The type of a tuple's items; None for any other type."""
+    """Return the type of a tuple's items; None for any other type."""
     return get_args(kind)[0] if get_origin(kind) is tuple else None
 
 
 def _column(kind: Any) -> Any:
-    """The type of a tuple of items of this type."""
+    """Return the type of a tuple of items of this type."""
     return GenericAlias(tuple, (kind, ...))
 
 
@@ -160,6 +160,6 @@ def _inner(name: str, field: str) -> str:
 
 
 def _kept(name: str, arrays: Arrays) -> bool:
-    """Whether any array belongs to the value of this name."""
+    """Tell whether any array belongs to the value of this name."""
     own = (name, f"{name}_points")
     return any(kept in own or kept.startswith(f"{name}.") for kept in arrays)

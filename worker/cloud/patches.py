@@ -30,9 +30,9 @@ class Patch:
 
     def padded(self) -> Points:
         """Return (size, 3) float32, the distinct points over and over in their order."""
-        return self.at(np.arange(self.size))
+        return self.points_at(np.arange(self.size))
 
-    def at(self, places: NDArray[np.int64]) -> Points:
+    def points_at(self, places: NDArray[np.int64]) -> Points:
         """Return (k, 3) float32, the points at these places (k,) of the padded patch."""
         return self.distinct[places % len(self.distinct)]
 

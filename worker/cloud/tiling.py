@@ -7,18 +7,17 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from worker.cloud.settings import StrictModel
 from worker.cloud.types import Bools, Floats, Indices, Points
 from worker.errors import MapFailed
 
 _MOST_TILES = 10_000_000  # of a grid's box; a wider one means stray points, not a building
 
 
-class TilingSettings(BaseModel):
+class TilingSettings(StrictModel):
     """Section 3.4 and Table 3 of the paper; tile size and points come from the model's card."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     tile_size: tuple[float, float, float] = Field((1.5, 1.5, 1.0), description="metres")
     min_points: int = Field(512, gt=0, description="tiles of the map with fewer points are left out")

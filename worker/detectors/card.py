@@ -5,7 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, Field, ValidationError, model_validator
+
+from worker.cloud.settings import StrictModel
 
 #: The models that come with the code, wherever a command is typed.
 MODEL_STORE = Path(__file__).resolve().parents[2] / "model_store"
@@ -16,24 +18,20 @@ _SPICD_NET_SETTINGS_OF_0_1 = ("patch_points", "chamfer_points", "seed")
 S = TypeVar("S", bound=BaseModel)
 
 
-class Preprocessing(BaseModel):
+class Preprocessing(StrictModel):
     """How a map is built for a model: tied to the weights, so it comes from the card and never from a default."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     voxel_size: float = Field(gt=0, description="metres; both maps are fused at this size")
     tile_size: tuple[float, float, float] = Field(description="metres")
     min_points: int = Field(gt=0, description="tiles with fewer points are not scored")
 
 
-class Card(BaseModel):
+class Card(StrictModel):
     """`model_store/<name>/<version>/card.json`."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     name: str
     version: str
-    detector: str = Field(description="key in worker.detectors.store.DETECTORS")
+    detector: str = Field(description="key in worker.detectors.registry.DETECTORS")
     summary: str
     classes: tuple[str, str, str] = ("unchanged", "changed", "different place")
     threshold: float = Field(

@@ -19,17 +19,14 @@ class SeenScan(Protocol):
     @property
     def points(self) -> Points:
         """(N, 3) float32, metres, map frame."""
-        ...
 
     @property
     def map_from_scan(self) -> Matrix4:
         """(4, 4) rigid."""
-        ...
 
     @property
     def sensor_origin(self) -> Floats | None:
         """(3,) metres, map frame; None where the points cannot all have been seen from one place."""
-        ...
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)

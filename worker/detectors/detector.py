@@ -58,17 +58,15 @@ class Detector(Protocol):
     """A method of comparing a survey with its map. It prepares its own input and says in its card what it needs.
 
     A new detector is a folder with one class of this shape and a `load`, one entry in
-    `worker.detectors.store.DETECTORS`, and one folder in `model_store/` with its card.
+    `worker.detectors.registry.DETECTORS`, and one folder in `model_store/` with its card.
     """
 
     card: Card
 
     def encode_reference(self, reference: Side, tiles: Tiles, *, progress: Progress = no_progress) -> Arrays:
         """Return what can be computed of the map alone, once when it is built; {} if nothing."""
-        ...
 
     def detect(
         self, comparison: Comparison, *, embedding: Arrays | None = None, progress: Progress = no_progress
     ) -> Detection:
         """Score every observed tile; `embedding` is what `encode_reference` returned for the map, if it was kept."""
-        ...

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Any, Literal, Protocol, runtime_checkable
 
 import pydantic
@@ -13,10 +14,9 @@ from pydantic import BaseModel
 from safetensors import SafetensorError
 from safetensors.torch import load, save
 
-from worker.detectors.c2c.detector import CloudToCloud
 from worker.detectors.card import Card
 from worker.detectors.detector import Detector
-from worker.detectors.spicd_net.detector import SpicdNet
+from worker.detectors.registry import DETECTORS
 from worker.errors import DetectorUnavailable, TrainingFailed
 from worker.files import write_text
 
@@ -30,11 +30,9 @@ class DetectorClass(Protocol):
     @property
     def settings_class(self) -> type[BaseModel]:
         """Of the card's `detector_settings`."""
-        ...
 
     def load(self, card: Card, weights: Weights, device: torch.device) -> Detector:
         """Open a model. Raises RuntimeError for weights of another network, ValueError for unsound settings."""
-        ...
 
 
 @runtime_checkable
@@ -43,11 +41,12 @@ class TrainedDetector(Detector, Protocol):
 
     def weights(self) -> Weights:
         """Return what `load` takes."""
-        ...
 
 
-#: A new detector is one folder and one entry here; `worker.detectors.networks` has another where it can be trained.
-DETECTORS: dict[str, DetectorClass] = {"c2c": CloudToCloud, "spicd-net": SpicdNet}
+def detector_class(key: str) -> DetectorClass:
+    """Return what opens the models of the detector of this key. Raises KeyError."""
+    opens: DetectorClass = resolve_name(DETECTORS[key].detector)
+    return opens
 
 
 def open_detector(model_store: Path, name: str = "spicd-net/1", device: Device = "auto") -> Detector:
@@ -69,14 +68,14 @@ def make_detector(card: Card, content: bytes | None, device: Device = "auto") ->
         )
     weights = {} if content is None else _checked_weights(name, card, content)
     try:
-        return DETECTORS[card.detector].load(card, weights, resolve_device(device))
+        return detector_class(card.detector).load(card, weights, resolve_device(device))
     except (RuntimeError, ValueError) as unsound:
         raise DetectorUnavailable(f"model {name}: {unsound}") from unsound
 
 
 def settings_of(card: Card) -> dict[str, Any]:
     """Return the detector's own settings with every default. Raises ValueError, which names each unsound field."""
-    return card.settings_as(DETECTORS[card.detector].settings_class).model_dump()
+    return card.settings_as(detector_class(card.detector).settings_class).model_dump()
 
 
 def open_card(model_store: Path, name: str) -> Card:

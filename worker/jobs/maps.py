@@ -21,7 +21,7 @@ from worker.pipeline.results.manifest import manifest
 
 @step
 def register_map(context: Context) -> None:
-    """Scans to a fused, tiled map: the first version of it, or a later one."""
+    """Build a fused, tiled map of scans: the first version of it, or a later one."""
     version = context.catalog.versions.of_job(context.job.job_id)
     card = card_of(context, version.model)
     made = make_version(context, version, pipeline_settings(context, version, card))

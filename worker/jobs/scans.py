@@ -10,7 +10,7 @@ import numpy as np
 
 from service.catalog.records import ScanOutcome
 from worker.cloud import npz
-from worker.jobs.step import Context, put
+from worker.jobs.step import Context, load, put
 from worker.pipeline import archive
 from worker.pipeline.registration.results import RegisteredScan, ScanFile, ScanResult, read_registered
 
@@ -49,8 +49,7 @@ def save_scans(
 
 def kept_scan(context: Context, key: str) -> RegisteredScan:
     """Return an accepted scan as `save_scans` kept it."""
-    with context.catalog.blobs.local(key) as path:
-        return archive.load_scan(path)
+    return load(context, key, archive.load_scan)
 
 
 def kept_scans(
@@ -62,23 +61,15 @@ def kept_scans(
 
 def _recorded(scan_id: str, outcome: ScanResult, ids: Sequence[str]) -> ScanOutcome:
     registration = outcome.registration
-    if registration is None:
-        return ScanOutcome(
-            scan_id=scan_id,
-            accepted=False,
-            fitness=outcome.fitness,
-            rmse=outcome.inlier_rmse,
-            reason=outcome.reason,
-        )
-    sigma = registration.uncertainty
+    sigma = None if registration is None else registration.uncertainty
     return ScanOutcome(
         scan_id=scan_id,
-        accepted=True,
+        accepted=registration is not None,
         fitness=outcome.fitness,
         rmse=outcome.inlier_rmse,
-        map_from_scan=registration.map_from_scan.tolist(),
+        map_from_scan=None if registration is None else registration.map_from_scan.tolist(),
         translation_sigma=None if sigma is None else sigma.translation,
         rotation_sigma=None if sigma is None else sigma.rotation,
-        path=tuple(ids[index] for index in registration.path) or None,
+        path=None if registration is None else tuple(ids[index] for index in registration.path) or None,
         reason=outcome.reason,
     )

@@ -9,6 +9,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import TypeVar
 
 from service.catalog.catalog import Catalog, open_catalog
 from service.catalog.records import JobRecord, Problem
@@ -18,6 +19,8 @@ from worker.errors import Cancelled, PipelineError
 from worker.reporting import Reporter
 
 log = logging.getLogger("worker.jobs")
+
+T = TypeVar("T")
 
 #: The part of the whole job that each stage takes, about as `make bench` measures it.
 MAP_STAGES = {
@@ -90,6 +93,12 @@ def step(run: Callable[[Context], None]) -> Callable[[str], None]:
                 raise
 
     return call
+
+
+def load(context: Context, key: str, read: Callable[[Path], T]) -> T:
+    """Read a blob with `read`, from a file on this machine. Raises FileNotFoundError."""
+    with context.catalog.blobs.local(key) as path:
+        return read(path)
 
 
 def put(context: Context, key: str, write: Callable[[Path], None]) -> None:

@@ -12,7 +12,7 @@ from worker.cloud import npz
 from worker.detectors.detector import Detection
 from worker.jobs.models import card_of, card_that_fits, kept_detector, pipeline_settings
 from worker.jobs.scans import kept_scans, save_scans, scan_files, scan_outcomes
-from worker.jobs.step import Context, put, step
+from worker.jobs.step import Context, load, put, step
 from worker.jobs.versions import kept_reference
 from worker.pipeline.flow import NoScanAccepted, compare, locate_survey
 from worker.pipeline.mapping.fusion import CurrentMap
@@ -25,7 +25,7 @@ from worker.progress import Progress
 
 @step
 def register_survey(context: Context) -> None:
-    """Scans to one cloud in the map's frame; a survey with no accepted scan fails here."""
+    """Fuse the scans to one cloud in the map's frame; a survey with no accepted scan fails here."""
     survey, version, settings = _asked(context)
     reference = kept_reference(context, version)
     with ExitStack() as stack:
@@ -45,14 +45,13 @@ def register_survey(context: Context) -> None:
 
 @step
 def score_survey(context: Context) -> None:
-    """The map and the survey side by side to class probabilities."""
+    """Score the map and the survey side by side: class probabilities."""
     survey, version, settings = _asked(context)
     detector = kept_detector(context, survey.model)
     embedding = None
     key = blob_keys.map_embedding(version.job_id, survey.model, detector.card.sha256)
     if context.catalog.blobs.exists(key):
-        with context.catalog.blobs.local(key) as path:
-            embedding = npz.load_arrays(path)
+        embedding = load(context, key, npz.load_arrays)
     map_key = functools.partial(blob_keys.map_scan, version.job_id)
     survey_key = functools.partial(blob_keys.survey_scan, survey.survey_id)
     comparison = compare(
@@ -69,13 +68,12 @@ def score_survey(context: Context) -> None:
 
 @step
 def export_survey(context: Context) -> None:
-    """Scores to tile states, the coloured cloud and the picture; then the survey is ready."""
+    """Make of the scores tile states, the coloured cloud and the picture; then the survey is ready."""
     survey, version, settings = _asked(context)
     survey_id = survey.survey_id
     context.report("exporting", 0.0)
     reference, current = kept_reference(context, version), _kept_current(context, survey)
-    with context.catalog.blobs.local(blob_keys.survey_scores(survey_id)) as path:
-        detection = npz.load(path, Detection)
+    detection = load(context, blob_keys.survey_scores(survey_id), functools.partial(npz.load, kind=Detection))
     card = card_of(context, survey.model)
     threshold = card.threshold if survey.threshold is None else survey.threshold
     pairs = compare(reference, current, settings=settings).tile_pairs
@@ -118,8 +116,8 @@ def _asked(context: Context) -> tuple[SurveyRecord, VersionRecord, PipelineSetti
 
 
 def _kept_current(context: Context, survey: SurveyRecord) -> CurrentMap:
-    with context.catalog.blobs.local(blob_keys.survey_current(survey.survey_id)) as path:
-        return npz.load(path, CurrentMap)
+    key = blob_keys.survey_current(survey.survey_id)
+    return load(context, key, functools.partial(npz.load, kind=CurrentMap))
 
 
 def _tile_record(result: TileResult) -> TileRecord:

@@ -6,14 +6,13 @@ import functools
 import json
 import shutil
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from service.catalog import blob_keys
 from service.catalog.records import ModelRecord, VersionRecord
 from worker.detectors.card import Card
-from worker.detectors.networks import NETWORKS
+from worker.detectors.registry import trainable_detectors
 from worker.detectors.store import make_detector, read_card, resolve_device, settings_of, weights_of
 from worker.errors import Cancelled, TrainingFailed
 from worker.jobs.maps import encode_reference
@@ -40,10 +39,9 @@ KEPT = (BEST, LOG, CHECKPOINT)  #: what a training goes on from, in the order it
 
 @step
 def pack_tiles(context: Context) -> None:
-    """The map's tiles as a training set, each seen by one half of its scans and by the other."""
-    model, version = _asked(context)
-    card = _card(context, model, version)
-    _detector_key(model, card)  # a base that cannot be trained, or too small a map, fails before the wait
+    """Pack the map's tiles as a training set, each seen by one half of its scans and by the other."""
+    asked = _asked(context)  # a base that cannot be trained, or too small a map, fails before the wait
+    version, card = asked.version, asked.card
     settings = pipeline_settings(context, version, card)
     tiles = kept_reference(context, version).tiles(min_points=settings.tiling.min_points)
     visits = halves(_scans(context, version), voxel_size=card.preprocessing.voxel_size)
@@ -55,15 +53,16 @@ def pack_tiles(context: Context) -> None:
 
 @step
 def train_model(context: Context) -> None:
-    """From nothing or from another model, for so many minutes; goes on from the last epoch that was kept."""
-    model, version = _asked(context)
+    """Train from nothing or from another model, for so many minutes; go on from the last epoch that was kept."""
+    asked = _asked(context)
     folder, work = context.scratch / "run", blob_keys.model_work(context.job.job_id)
-    start = None if model.base is None else weights_of(kept_detector(context, model.base))
+    base = asked.model.base
+    start = None if base is None else weights_of(kept_detector(context, base))
     _fetch(context, folder)
     try:
         with context.catalog.blobs.local(blob_keys.model_tiles(context.job.job_id)) as tiles:
             train(
-                _settings(context, model, version, tiles),
+                _settings(context, asked, tiles),
                 tiles,
                 folder,
                 lambda _, share: context.report("training", share),
@@ -81,33 +80,42 @@ def train_model(context: Context) -> None:
 @step
 def finish_model(context: Context) -> None:
     """Choose the threshold on held-out tiles, write the model and its card, and encode the map with it."""
-    model, version = _asked(context)
+    asked = _asked(context)
     folder, blobs = context.scratch / "run", context.catalog.blobs
     _fetch(context, folder)
     context.report("calibrating", 0.0)
     try:
         with blobs.local(blob_keys.model_tiles(context.job.job_id)) as tiles:
-            made = _published(context, model, version, folder / BEST, tiles)
+            made = _published(context, asked, folder / BEST, tiles)
     except ValueError as error:  # files of an earlier release
         raise TrainingFailed(str(error)) from error
     card = read_card(made).model_copy(update={"licence": ""})
     weights = (made / str(card.weights)).read_bytes()
     blobs.put_bytes(blob_keys.model_weights(context.job.job_id), weights)
     blobs.put_file(blob_keys.model_log(context.job.job_id), folder / LOG)
-    encode_reference(context, version, make_detector(card, weights, context.settings.device), model.model)
+    detector = make_detector(card, weights, context.settings.device)
+    encode_reference(context, asked.version, detector, asked.model.model)
     context.catalog.models.save_card(context.job.job_id, card.model_dump(mode="json"))
     context.catalog.jobs.succeed(context.job.job_id)
     blobs.delete_prefix(blob_keys.model_work(context.job.job_id))
 
 
-def _asked(context: Context) -> tuple[ModelRecord, VersionRecord]:
+@dataclass(frozen=True, kw_only=True, slots=True)
+class _Asked:
+    """What is to be trained."""
+
+    model: ModelRecord
+    version: VersionRecord  #: of the map, that it is trained on
+    card: Card  #: of the model that is trained further, or of the one that the map was built for
+    detector: str  #: key of what is trained
+
+
+def _asked(context: Context) -> _Asked:
+    """Look up what the job asks for. Raises DetectorUnavailable, and TrainingFailed for a base that has no network."""
     model = context.catalog.models.of_job(context.job.job_id)
-    return model, context.catalog.versions.get(model.map_id, model.map_version)
-
-
-def _card(context: Context, model: ModelRecord, version: VersionRecord) -> Card:
-    """Return the card of the model that is trained further, or of the one that the map was built for."""
-    return card_that_fits(context, model.base or version.model, version.model)
+    version = context.catalog.versions.get(model.map_id, model.map_version)
+    card = card_that_fits(context, model.base or version.model, version.model)
+    return _Asked(model=model, version=version, card=card, detector=_detector_key(model, card))
 
 
 def _detector_key(model: ModelRecord, card: Card) -> str:
@@ -115,27 +123,26 @@ def _detector_key(model: ModelRecord, card: Card) -> str:
 
     Raises TrainingFailed.
     """
-    if card.detector in NETWORKS:
+    if card.detector in trainable_detectors():
         return card.detector
     if model.base is None:
         return SITE.detector
     raise TrainingFailed(
         f"model {model.base} cannot be trained further: nothing of a detector {card.detector!r} is trained; "
-        f"name a base of {' or '.join(sorted(NETWORKS))}, or none"
+        f"name a base of {' or '.join(trainable_detectors())}, or none"
     )
 
 
-def _settings(context: Context, model: ModelRecord, version: VersionRecord, tiles: Path) -> TrainSettings:
+def _settings(context: Context, asked: _Asked, tiles: Path) -> TrainSettings:
+    model, card = asked.model, asked.card
     device = resolve_device(context.settings.device).type
     share = held_out_share(load_tiles(tiles), min_separation=SITE.pairs.min_separation)
-    card = _card(context, model, version)
-    key = _detector_key(model, card)
     # else the network would be used on another input than it was trained on
-    own = settings_of(card) if key == card.detector else {}
+    own = settings_of(card) if asked.detector == card.detector else {}
     pairs = {name: own[name] for name in ("patch_points", "chamfer_points") if name in own}
     return replace(
         SITE,
-        detector=key,
+        detector=asked.detector,
         seed=own.get("seed", SITE.seed),
         epochs=model.epochs or SITE.epochs,
         minutes=model.minutes,
@@ -148,17 +155,15 @@ def _settings(context: Context, model: ModelRecord, version: VersionRecord, tile
     )
 
 
-def _published(context: Context, model: ModelRecord, version: VersionRecord, best: Path, tiles: Path) -> Path:
+def _published(context: Context, asked: _Asked, best: Path, tiles: Path) -> Path:
     """Return the folder of the model; beside its figures stand those of the model that it would replace.
 
     A base that ranks the held-out tiles no worse keeps its weights, and gets the threshold of this place.
     """
-    other = model.base or version.model
-    card = _card(context, model, version)
-    key = _detector_key(model, card)
-    title = replace(SITE, detector=key).network.title
-    asked = {"base": model.base, "minutes": model.minutes, "epochs": model.epochs}
-    about: dict[str, Any] = {"map_id": model.map_id, "map_version": model.map_version, "base": model.base}
+    model = asked.model
+    other = model.base or asked.version.model
+    title = replace(SITE, detector=asked.detector).network.title
+    wanted = {"base": model.base, "minutes": model.minutes, "epochs": model.epochs}
     return publish(
         best,
         tiles,
@@ -167,11 +172,11 @@ def _published(context: Context, model: ModelRecord, version: VersionRecord, bes
         version=str(model.version),
         summary=f"{title} trained on version {model.map_version} of map {model.map_id}"
         + ("" if model.base is None else f", from {model.base}"),
-        command=f"POST /maps/{model.map_id}/models {json.dumps(asked)}",
-        about=about,
+        command=f"POST /maps/{model.map_id}/models {json.dumps(wanted)}",
+        about={"map_id": model.map_id, "map_version": model.map_version, "base": model.base},
         beside={other: kept_detector(context, other)},
         base=model.base,
-        preprocessing=card.preprocessing,
+        preprocessing=asked.card.preprocessing,
     )
 
 
@@ -188,7 +193,7 @@ def _keep(context: Context, folder: Path) -> None:
 
 
 def _fetch(context: Context, folder: Path) -> None:
-    """What an earlier attempt kept; copies, for a log is written to."""
+    """Copy what an earlier attempt kept; a link would not do, for a log is written to."""
     folder.mkdir(parents=True, exist_ok=True)
     for name in KEPT:
         key = blob_keys.model_checkpoint(context.job.job_id, name)

@@ -72,7 +72,7 @@ def build_map(
     processes: int | None = None,
     progress: Progress = no_progress,
 ) -> BuiltMap:
-    """Stage 1: register the scans in one frame, fuse them, cut the map into tiles.
+    """Register the scans in one frame, fuse them, cut the map into tiles (stage 1).
 
     `pairs` keeps registered pairs, so that a build that was killed goes on; `processes` is one a core if None.
     Raises ScanError where no file can be read, MapFailed where no scan holds a pose, and NothingToTile.
@@ -99,7 +99,7 @@ def locate_survey(
     settings: PipelineSettings,
     progress: Progress = no_progress,
 ) -> LocatedSurvey:
-    """Stage 3, first half: register the scans to the map, fuse those accepted, set both side by side.
+    """Register the scans to the map, fuse those accepted, set both side by side (stage 3, first half).
 
     Raises ScanError where no file can be read, NoScanAccepted where none is left to compare.
     """
@@ -141,7 +141,7 @@ def detect(
     threshold: float | None = None,
     progress: Progress = no_progress,
 ) -> ChangeSet:
-    """Stage 3, second half: score the tiles, then decide; the threshold is the card's if None is given."""
+    """Score the tiles, then decide (stage 3, second half); the threshold is the card's if None is given."""
     detection = detector.detect(comparison, embedding=embedding, progress=progress)
     threshold = detector.card.threshold if threshold is None else threshold
     return decide(comparison.tile_pairs, detection, threshold=threshold)

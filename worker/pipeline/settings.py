@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from worker.cloud.settings import StrictModel
 from worker.cloud.tiling import TilingSettings
 from worker.detectors.card import Preprocessing
 from worker.pipeline.mapping.settings import JointRegistrationSettings, MapSettings
-from worker.pipeline.registration.settings import RegistrationSettings, with_values
+from worker.pipeline.registration.settings import RegistrationSettings
 
 
-class PipelineSettings(BaseModel):
+class PipelineSettings(StrictModel):
     """One settings class a stage."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     registration: RegistrationSettings = Field(default_factory=RegistrationSettings)
     mapping: MapSettings = Field(default_factory=MapSettings)
@@ -24,10 +23,8 @@ class PipelineSettings(BaseModel):
         """Return the same settings with what is tied to a model's weights put in its place."""
         voxels = {"voxel_size": needs.voxel_size}
         tiles = {"tile_size": needs.tile_size, "min_points": needs.min_points}
-        return with_values(
-            self,
-            registration=with_values(self.registration, **voxels),
-            tiling=with_values(self.tiling, **tiles),
+        return self.with_values(
+            registration=self.registration.with_values(**voxels), tiling=self.tiling.with_values(**tiles)
         )
 
     @property

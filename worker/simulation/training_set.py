@@ -7,10 +7,11 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 from scipy.ndimage import binary_dilation
 
 from worker.cloud.poses import inverse, transformed
+from worker.cloud.settings import StrictModel
 from worker.cloud.tiling import TilePairs, Tiles, TilingSettings, cut, grid_over, pair_tiles
 from worker.cloud.types import Bools, Matrix4, Points
 from worker.cloud.voxels import Voxels, merged_in_order
@@ -26,10 +27,8 @@ from worker.training.dataset import Observation, TileSet, joined
 MARGIN = 1e-4  #: metres that a synthetic change keeps from the tile's border, which belongs to the next tile
 
 
-class WalkSettings(BaseModel):
+class WalkSettings(StrictModel):
     """How each building is walked, and how well each scan of a visit is placed."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     stops: dict[BuildingKind, int] = Field(
         {"office": 14, "corridor": 24, "room": 5}, description="scans of the first visit"
@@ -60,10 +59,8 @@ class WalkSettings(BaseModel):
     tiling: TilingSettings = TilingSettings.model_validate({})
 
 
-class TrainingSetSettings(BaseModel):
+class TrainingSetSettings(StrictModel):
     """Which buildings are walked."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     offices: int = Field(14, ge=0, description="four rooms and a corridor each")
     corridors: int = Field(8, ge=0, description="L-shaped, about 170 tiles each")
@@ -90,7 +87,7 @@ def build_training_set(
     ]
     walks: dict[int, TileSet] = {}
     with open_processes(min(processes or default_processes(), len(tasks))) as pool:
-        for number, tiles in pool.each(_numbered_walk, tasks):
+        for number, tiles in pool.map_unordered(_numbered_walk, tasks):
             walks[number] = tiles
             progress("build training set", len(walks) / len(tasks))
     source = f"simulated visits: {settings.model_dump_json()}"

@@ -11,7 +11,7 @@ from worker.cloud.types import Points
 from worker.metrics import confusion, roc
 from worker.training.anomalies import OPERATIONS
 from worker.training.dataset import TileSet
-from worker.training.pairs import PairSettings, altered
+from worker.training.pairs import PairSettings, changed
 
 #: Share of changed tiles that the threshold is chosen for: of the simulated revisits 4% changed. The paper's
 #: experiments change 24 of 172, but nobody patrols a building of which a seventh changes between two rounds.
@@ -58,7 +58,6 @@ class SurveyFigures:
 def survey_pairs(tiles: TileSet, settings: PairSettings, *, seed: int) -> SurveyPairs:
     """Pair both ways round every tile of two visits, unchanged and changed, and every observation of another visit."""
     rng = np.random.default_rng((seed, 3))
-    half = (np.asarray(tiles.tile_size) / 2).astype(np.float32)
     reference: list[Points] = []
     current: list[Points] = []
     kinds: list[str] = []
@@ -68,8 +67,11 @@ def survey_pairs(tiles: TileSet, settings: PairSettings, *, seed: int) -> Survey
         for first, second in ((a, b), (b, a)):
             for kind in (UNCHANGED, *OPERATIONS):
                 operation = OPERATIONS.get(kind)
+                after = (
+                    changed(second, settings, tiles.half, rng, operation=operation) if operation else second
+                )
                 reference.append(first)
-                current.append(altered(second, operation, settings, half, rng) if operation else second)
+                current.append(after)
                 kinds.append(kind)
     for observation in tiles.observations:
         if not observation.rebuilt:

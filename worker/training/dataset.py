@@ -42,6 +42,11 @@ class TileSet:
     def __len__(self) -> int:
         return len(self.points_a)
 
+    @property
+    def half(self) -> NDArray[np.float32]:
+        """(3,) metres, half the tiles' size."""
+        return (np.asarray(self.tile_size) / 2).astype(np.float32)
+
     def subset(self, chosen: NDArray[np.bool_]) -> TileSet:
         """Return the tiles where `chosen` (T,) is true."""
         kept, place = np.flatnonzero(chosen).tolist(), np.cumsum(chosen) - 1

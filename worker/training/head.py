@@ -17,8 +17,9 @@ from worker.metrics import ClassFigures, class_figures
 from worker.progress import Progress, no_progress
 from worker.training.dataset import TileSet
 from worker.training.kept_pairs import Drawn, PairPool, keep_pairs
-from worker.training.log import HEAD_LOG, EpochRow, append_row, row_of
+from worker.training.log import HEAD_LOG, EpochRow, append_row
 from worker.training.settings import Schedule, TrainSettings
+from worker.training.steps import Steps
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -78,20 +79,13 @@ class _HeadRun:
         settings: TrainSettings,
     ) -> None:
         torch.manual_seed(settings.seed)
+        self._kind, self._head, self._settings = kind, head, settings
+        self._pool, self._held_out = pool, held_out
         self._device = next(head.parameters()).device
-        self._kind, self._head, self._pool, self._held_out, self._settings = (
-            kind,
-            head,
-            pool,
-            held_out,
-            settings,
-        )
         self._schedule = Schedule(
             epochs=settings.head_epochs, start=settings.head_learning_rate, end=settings.final_learning_rate
         )
-        self._optimizer = torch.optim.Adam(
-            head.parameters(), lr=settings.head_learning_rate, weight_decay=settings.weight_decay, fused=True
-        )
+        self._steps = Steps(head, rate=settings.head_learning_rate, weight_decay=settings.weight_decay)
         self.measured = self._validate()
         self.best, self.best_epoch = copy.deepcopy(head.state_dict()), 0
 
@@ -99,31 +93,16 @@ class _HeadRun:
         """Train on newly drawn pairs, and validate on the same held-out ones."""
         settings = self._settings
         rate = self._schedule.rate((number - 1) / settings.head_epochs)
-        for group in self._optimizer.param_groups:
-            group["lr"] = rate
         drawn = self._pool.draw(settings.train_pairs, np.random.default_rng((settings.seed, 7, number)))
         self._head.train()
-        losses, hits = [], []
         for rows in torch.split(torch.arange(len(drawn.labels)), settings.head_batch):
             logits, labels = self._answers(drawn, rows)
-            loss = self._kind.class_loss(logits, labels)
-            self._optimizer.zero_grad(set_to_none=True)
-            loss.backward()  # type: ignore[no-untyped-call]
-            self._optimizer.step()
-            losses.append(loss.item())
-            hits.append(float((logits.detach().argmax(dim=1) == labels).float().mean()))
+            self._steps.take(logits, labels, self._kind.class_loss(logits, labels), rate=rate)
         figures = self._validate()
         if figures.rank > self.measured.rank:
             self.measured, self.best_epoch = figures, number
             self.best = copy.deepcopy(self._head.state_dict())
-        return row_of(
-            figures,
-            epoch=number,
-            seconds=round(seconds, 1),
-            learning_rate=rate,
-            train_loss=float(np.mean(losses)),
-            train_accuracy=float(np.mean(hits)),
-        )
+        return self._steps.row(figures, epoch=number, seconds=seconds)
 
     @torch.no_grad()
     def _validate(self) -> ClassFigures:

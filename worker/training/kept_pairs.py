@@ -142,14 +142,15 @@ def keep_pairs(
 
 def _gathered(tiles: TileSet, settings: PairSettings, rng: np.random.Generator) -> _Gathering:
     gathering = _Gathering()
-    half = (np.asarray(tiles.tile_size) / 2).astype(np.float32)
     first = [gathering.cloud(points) for points in tiles.points_a]
     second = [gathering.cloud(points) if len(points) else None for points in tiles.points_b]
     for tile, (a, b) in enumerate(zip(first, second, strict=True)):
         gathering.pair("stored", a, a)
         if b is not None:
             gathering.pair("revisit", a, b)
-        after = changed(tiles.points_a[tile] if b is None else tiles.points_b[tile], settings, half, rng)
+        after = changed(
+            tiles.points_a[tile] if b is None else tiles.points_b[tile], settings, tiles.half, rng
+        )
         gathering.pair("synthetic", a, gathering.cloud(after))
     for observation in tiles.observations:
         here, a, b = gathering.cloud(observation.points), first[observation.tile], second[observation.tile]

@@ -5,12 +5,14 @@ from __future__ import annotations
 import csv
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
+from typing import Self
 
 from worker.files import write_atomically
 from worker.metrics import ClassFigures
 
 LOG = "epochs.csv"
 HEAD_LOG = "head_epochs.csv"  #: of what the head was trained on its own
+CLASSES = ("unchanged", "changed", "different")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -30,6 +32,16 @@ class EpochRow:
     recall_unchanged: float
     recall_changed: float
     recall_different: float
+
+    @classmethod
+    def of(cls, figures: ClassFigures, **others: float) -> Self:
+        """Return a row with the figures of the validation pairs; `others` are the columns up to them."""
+        by_class = {
+            f"{ratio}_{name}": value
+            for ratio in ("precision", "recall")
+            for name, value in zip(CLASSES, getattr(figures, ratio), strict=True)
+        }
+        return cls(validation_loss=figures.loss, accuracy=figures.accuracy, **by_class, **others)  # type: ignore[arg-type]
 
 
 def append_row(folder: Path, row: EpochRow, name: str = LOG) -> None:
@@ -58,11 +70,3 @@ def cut_log(folder: Path, epochs: int) -> None:
             writer.writerows(row for row in rows if int(row["epoch"]) <= epochs)
 
     write_atomically(path, write)
-
-
-def row_of(figures: ClassFigures, **others: float) -> EpochRow:
-    """Return a row with the figures of the validation pairs."""
-    classes = ("unchanged", "changed", "different")
-    by_class = {f"precision_{name}": value for name, value in zip(classes, figures.precision, strict=True)}
-    by_class |= {f"recall_{name}": value for name, value in zip(classes, figures.recall, strict=True)}
-    return EpochRow(validation_loss=figures.loss, accuracy=figures.accuracy, **by_class, **others)  # type: ignore[arg-type]

@@ -85,7 +85,6 @@ class PairMaker:
             raise ValueError(f"pairs need at least two tiles, there are {len(tiles)}")
         self._tiles = tiles
         self._settings = settings
-        self._half = (np.asarray(tiles.tile_size) / 2).astype(np.float32)
         self._edited, self._rebuilt, self._beside, self._untouched = (
             [
                 observation
@@ -144,7 +143,7 @@ class PairMaker:
         if observations.changed is not None:
             return self._sampled(*observations.changed, intensity, rng)
         first, second = observations.unchanged
-        return self._sampled(first, changed(second, settings, self._half, rng), intensity, rng)
+        return self._sampled(first, changed(second, settings, self._tiles.half, rng), intensity, rng)
 
     def _different(self, rng: np.random.Generator) -> tuple[Points, Points]:
         """Draw tiles of two buildings, or `min_separation` apart in one. Raises ValueError where no two are."""
@@ -225,19 +224,19 @@ def _stored_again(points: Points, rng: np.random.Generator) -> Points:
     return (points + rng.normal(scale=STORED_JITTER, size=points.shape)).astype(np.float32)
 
 
-def changed(points: Points, settings: PairSettings, half: Half, rng: np.random.Generator) -> Points:
-    """Change a tile (n, 3) by one of the operations, each as likely.
+def changed(
+    points: Points,
+    settings: PairSettings,
+    half: Half,
+    rng: np.random.Generator,
+    *,
+    operation: Operation | None = None,
+) -> Points:
+    """Change a tile (n, 3) by the operation, or by any of them, each as likely, where None is given.
 
     A change of which too little shows is drawn again, a dozen times at most: a tile may have no place for one.
     """
-    operation = OPERATIONS[str(rng.choice(list(OPERATIONS)))]
-    return altered(points, operation, settings, half, rng)
-
-
-def altered(
-    points: Points, operation: Operation, settings: PairSettings, half: Half, rng: np.random.Generator
-) -> Points:
-    """Change a tile as `changed` does, by the given operation."""
+    operation = operation or OPERATIONS[str(rng.choice(list(OPERATIONS)))]
     for _ in range(12):
         change = Change(magnitude=rng.uniform(*settings.magnitude), density=rng.uniform(*settings.density))
         result = operation(points, change, half, rng)

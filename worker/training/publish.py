@@ -10,9 +10,9 @@ import platform
 import shutil
 import sys
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -23,7 +23,7 @@ from worker.cloud.types import Arrays
 from worker.detectors.card import MODEL_STORE, Card, Preprocessing
 from worker.detectors.comparison import Comparison
 from worker.detectors.detector import Detector
-from worker.detectors.store import DETECTORS, WEIGHTS, weights_of, write_model
+from worker.detectors.store import WEIGHTS, detector_class, weights_of, write_model
 from worker.training.calibration import (
     PREVALENCE,
     SurveyPairs,
@@ -38,6 +38,14 @@ from worker.training.pairs import PairSettings
 from worker.training.settings import detector_settings, whole
 
 VOXEL_SIZE, MIN_POINTS = 0.05, 512  #: paper, Table 3; the training tiles are made with the same
+
+#: What a card says of the pairs that its figures are measured on.
+ABOUT_PAIRS = (
+    "two independent visits: nothing changed, a synthetic change (paper, Section 3.5.1), or whole things added, "
+    "removed and moved where the set has such; no augmentation. Recall, precision and F1 are of whole things where "
+    f"there are any, precision and F1 for {PREVALENCE:.0%} changed tiles; threshold of the highest F1 on the validation tiles"
+)
+CPU = torch.device("cpu")
 
 #: Of the pair settings, what says which synthetic changes there are.
 KEPT = ("magnitude", "density", "min_shown", "shown_distance")
@@ -97,55 +105,73 @@ def publish(
     left out. The training's log, where it lies beside the checkpoint, comes along.
     """
     state = torch.load(checkpoint, map_location="cpu", weights_only=True)
-    state["settings"] = settings = whole(state["settings"])
+    settings = state["settings"] = whole(state["settings"])
     training_set = load_tiles(tiles)
+    usual = Preprocessing(voxel_size=VOXEL_SIZE, tile_size=training_set.tile_size, min_points=MIN_POINTS)
     card = Card(
         name=name or settings["detector"],
         version=version,
         detector=settings["detector"],
         summary=summary,
         threshold=0.5,
-        preprocessing=preprocessing
-        or Preprocessing(voxel_size=VOXEL_SIZE, tile_size=training_set.tile_size, min_points=MIN_POINTS),
+        preprocessing=preprocessing or usual,
         detector_settings=detector_settings(settings),
         weights=WEIGHTS,
-        training={**_training(state, training_set, command), **(about or {})},
         licence="MIT",
         sources=("method: AI 2026, 7(4), 141, https://doi.org/10.3390/ai7040141",),
     )
     pairs = _pairs(split_tiles(training_set, share=settings["held_out"])[1], settings)
-    detector, network = _detector(card, state["network"]), state["network"]
-    scores = change_scores(detector, pairs)
-    others = {other: change_scores(one, pairs) for other, one in (beside or {}).items()}
-    if beside and base in others and area_under_roc(others[base], pairs) >= area_under_roc(scores, pairs):
-        kept = {
-            "kept": f"the weights of {base}: the training ranked the validation pairs no better",
-            "trained": area_under_roc(scores, pairs),
-        }
-        card = card.model_copy(update={"training": {**card.training, **kept}})
-        detector, scores = beside[base], others[base]
-        network = weights_of(detector)
-    chosen = best_threshold(scores, pairs)
-    evaluation: dict[str, Any] = {"validation": _measured(chosen.threshold, scores, pairs)}
-    for other, its_scores in others.items():
-        evaluation[other] = _measured((beside or {})[other].card.threshold, its_scores, pairs)
-    if unseen is not None:
-        unknown = _pairs(load_tiles(unseen), settings)
-        evaluation["unseen buildings"] = _measured(
-            chosen.threshold, change_scores(detector, unknown), unknown
-        )
-    evaluation["pairs"] = (
-        "two independent visits: nothing changed, a synthetic change (paper, Section 3.5.1), or whole things added, removed and moved "
-        "where the set has such; no augmentation. Recall, precision and F1 are of whole things where there are any, precision and F1 "
-        f"for {PREVALENCE:.0%} changed tiles; threshold of the highest F1 on the validation tiles"
-    )
-    folder = write_model(
-        model_store / card.name / version,
-        card.model_copy(update={"threshold": chosen.threshold, "evaluation": evaluation}),
-        network,
-    )
+    others = {other: _Scored.of(detector, pairs) for other, detector in (beside or {}).items()}
+    trained = _Scored.of(detector_class(card.detector).load(card, state["network"], CPU), pairs)
+    best, weights = trained, state["network"]
+    training = {**_training(state, training_set, command), **(about or {})}
+    if base in others and others[base].area >= trained.area:
+        best, weights = others[base], weights_of(others[base].detector)
+        training["kept"] = f"the weights of {base}: the training ranked the validation pairs no better"
+        training["trained"] = trained.area
+    threshold = best_threshold(best.scores, pairs).threshold
+    unknown = None if unseen is None else _pairs(load_tiles(unseen), settings)
+    evaluation = _evaluation(best, threshold, others, unknown)
+    final = {"threshold": threshold, "training": training, "evaluation": evaluation}
+    folder = write_model(model_store / card.name / version, card.model_copy(update=final), weights)
     _take_log(checkpoint.parent / LOG, folder / LOG)
     return folder
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class _Scored:
+    """A detector and its scores of some pairs."""
+
+    detector: Detector
+    pairs: SurveyPairs
+    scores: NDArray[np.float32]  #: (P,) probability of change
+
+    @classmethod
+    def of(cls, detector: Detector, pairs: SurveyPairs) -> Self:
+        """Score the pairs."""
+        return cls(detector=detector, pairs=pairs, scores=change_scores(detector, pairs))
+
+    @property
+    def area(self) -> float:
+        """Chance that a changed pair scores above an unchanged one."""
+        return area_under_roc(self.scores, self.pairs)
+
+    def measured(self, threshold: float) -> dict[str, Any]:
+        """Return the figures at a threshold, as the card has them."""
+        figures = asdict(figures_at(threshold, self.scores, self.pairs))
+        return {"pairs": len(self.pairs.kinds), "area_under_roc": self.area, **figures}
+
+
+def _evaluation(
+    best: _Scored, threshold: float, others: Mapping[str, _Scored], unseen: SurveyPairs | None
+) -> dict[str, Any]:
+    """Return what the card says that the model reaches, on validation pairs and on those of unseen buildings."""
+    evaluation: dict[str, Any] = {"validation": best.measured(threshold)}
+    for name, scored in others.items():
+        evaluation[name] = scored.measured(scored.detector.card.threshold)
+    if unseen is not None:
+        evaluation["unseen buildings"] = _Scored.of(best.detector, unseen).measured(threshold)
+    return {**evaluation, "pairs": ABOUT_PAIRS}
 
 
 def change_scores(detector: Detector, pairs: SurveyPairs) -> NDArray[np.float32]:
@@ -168,21 +194,9 @@ def change_scores(detector: Detector, pairs: SurveyPairs) -> NDArray[np.float32]
     return np.concatenate(scores)
 
 
-def _detector(card: Card, weights: dict[str, torch.Tensor]) -> Detector:
-    return DETECTORS[card.detector].load(card, weights, torch.device("cpu"))
-
-
 def _pairs(tiles: TileSet, settings: dict[str, Any]) -> SurveyPairs:
     kept = {name: value for name, value in settings["pairs"].items() if name in KEPT}
     return survey_pairs(tiles, PairSettings(**kept), seed=settings["seed"])
-
-
-def _measured(threshold: float, scores: NDArray[np.float32], pairs: SurveyPairs) -> dict[str, Any]:
-    return {
-        "pairs": len(pairs.kinds),
-        "area_under_roc": area_under_roc(scores, pairs),
-        **asdict(figures_at(threshold, scores, pairs)),
-    }
 
 
 def _training(state: dict[str, Any], tiles: TileSet, command: str) -> dict[str, Any]:
@@ -223,7 +237,7 @@ def _take_log(log: Path, place: Path) -> None:
 
 
 def main() -> None:
-    """`python -m worker.training.publish CHECKPOINT TILES`"""
+    """Publish from the command line: `python -m worker.training.publish CHECKPOINT TILES`."""
     parser = argparse.ArgumentParser(prog="python -m worker.training.publish")
     parser.add_argument("checkpoint", type=Path)
     parser.add_argument("tiles", type=Path, help="the training set that it was made with")

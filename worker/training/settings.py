@@ -6,8 +6,7 @@ import math
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from worker.detectors.networks import NETWORKS
-from worker.detectors.trainable import TrainableNetwork
+from worker.detectors.trainable import TrainableNetwork, network_class
 from worker.training.pairs import PAPER_PAIRS, SAMPLE_POINTS, PairSettings
 
 
@@ -39,7 +38,7 @@ class Schedule:
 class TrainSettings:
     """The paper's values, but for `minutes`."""
 
-    detector: str = "spicd-net"  #: key in worker.detectors.networks.NETWORKS
+    detector: str = "spicd-net"  #: key in worker.detectors.registry.DETECTORS
     epochs: int = 1000
     minutes: float | None = None  #: wall clock of the whole run, resumed parts included; None: epochs alone
     patience: int = 100  #: epochs without a better checkpoint
@@ -68,7 +67,7 @@ class TrainSettings:
     @property
     def network(self) -> TrainableNetwork[Any]:
         """What is trained. Raises KeyError for a detector that has no network."""
-        return NETWORKS[self.detector](**detector_settings(asdict(self)))
+        return network_class(self.detector)(**detector_settings(asdict(self)))
 
     @property
     def schedule(self) -> Schedule:

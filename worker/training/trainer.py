@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,10 +19,11 @@ from worker.metrics import ClassFigures, class_figures
 from worker.progress import Progress, no_progress
 from worker.training.dataset import TileSet, load_tiles, split_tiles
 from worker.training.head import train_head
-from worker.training.log import EpochRow, append_row, cut_log, row_of
+from worker.training.log import append_row, cut_log
 from worker.training.pairs import PairMaker
 from worker.training.prefetch import prefetched
 from worker.training.settings import TrainSettings, whole
+from worker.training.steps import Steps
 
 INITIALIZATION_PAIRS = 128  #: that the head is initialised by
 CHECKPOINT, BEST = "last.pt", "best.pt"
@@ -76,12 +77,7 @@ class Run:
         self._device = torch.device(settings.device)
         self._kind = settings.network
         self._network = self._kind.build(coarse_search=settings.coarse_search).to(self._device)
-        self._optimizer = torch.optim.Adam(
-            self._network.parameters(),
-            lr=settings.learning_rate,
-            weight_decay=settings.weight_decay,
-            fused=True,
-        )
+        self._steps = Steps(self._network, rate=settings.learning_rate, weight_decay=settings.weight_decay)
         self._makers = PairMaker(training, settings.pairs), PairMaker(validation, settings.pairs)
         if start is None and settings.start_from is not None:
             start = torch.load(settings.start_from, map_location=self._device, weights_only=True)["network"]
@@ -102,21 +98,19 @@ class Run:
         stale = self._epochs - self._best_epoch >= self._settings.patience
         return stale or self._settings.schedule.done(self._epochs, self._seconds) >= 1.0
 
-    def epoch(self, progress: Progress) -> EpochRow:
+    def epoch(self, progress: Progress) -> None:
         """Train on one epoch's pairs, validate, and keep both checkpoints and the log."""
         began = time.monotonic() - self._seconds
-        trained = self._train_pass(began, progress)
+        self._train_pass(began, progress)
         figures = self._validate(began, progress)
         self._epochs += 1
         self._seconds = time.monotonic() - began
         if figures.rank > self._best:
             self._best, self._best_epoch = figures.rank, self._epochs
             self._save(BEST, {"measured": asdict(figures)})
-        row = self._log(trained, figures)
-        self._save(
-            CHECKPOINT, {"optimizer": self._optimizer.state_dict(), "torch_rng": torch.get_rng_state()}
-        )
-        return row
+        append_row(self._out, self._steps.row(figures, epoch=self._epochs, seconds=self._seconds))
+        optimizer = self._steps.optimizer.state_dict()
+        self._save(CHECKPOINT, {"optimizer": optimizer, "torch_rng": torch.get_rng_state()})
 
     def finish_head(self, training: TileSet, validation: TileSet, progress: Progress) -> None:
         """Train the best network's head alone, unless that was done before."""
@@ -149,49 +143,31 @@ class Run:
         if _of_epochs(whole(state["settings"])) != _of_epochs(asdict(self._settings)):
             raise ValueError(f"{path} was made with other settings; use them, or another folder")
         self._network.load_state_dict(state["network"])
-        self._optimizer.load_state_dict(state["optimizer"])
+        self._steps.optimizer.load_state_dict(state["optimizer"])
         torch.set_rng_state(state["torch_rng"].cpu())
         self._epochs, self._seconds = state["epochs"], state["seconds"]
         self._best, self._best_epoch = tuple(state["best"]), state["best_epoch"]
 
-    def _train_pass(self, began: float, progress: Progress) -> _Trained:
-        """Take one epoch's steps; ends early when the time is up."""
+    def _train_pass(self, began: float, progress: Progress) -> None:
+        """Take one epoch's steps; end early when the time is up. Raises FloatingPointError for a loss of NaN."""
         settings, schedule = self._settings, self._settings.schedule
         steps = max(settings.train_pairs // settings.batch, 1)
         # Each epoch has its own stream, so that a resumed run sees the pairs that an unbroken one sees.
         rng = np.random.default_rng((settings.seed, 1, self._epochs))
         batches = self._batches(self._makers[0], settings.train_pairs, rng)
         self._network.train()
-        losses, hits, rate = [], [], schedule.start
         for step, batch in enumerate(prefetched(batches)):
             done = schedule.done(self._epochs + step / steps, time.monotonic() - began)
             if done >= 1.0:
                 break
             progress("train", done)
-            rate = schedule.rate(done)
-            loss, right = self._step(batch, rate)
-            losses.append(loss)
-            hits.append(right)
-        if not losses:
-            return _Trained(loss=float("nan"), accuracy=float("nan"), rate=rate)
-        return _Trained(loss=float(np.mean(losses)), accuracy=float(np.mean(hits)), rate=rate)
-
-    def _step(self, batch: Labelled, rate: float) -> tuple[float, float]:
-        """Return the loss before the step, and the share of pairs that the network had right."""
-        for group in self._optimizer.param_groups:
-            group["lr"] = rate
-        logits, loss = self._kind.answer(self._network, batch)
-        value = loss.item()
-        if not np.isfinite(value):
-            raise FloatingPointError(
-                f"epoch {self._epochs + 1}: the loss is {value}; lower the learning rate"
-            )
-        self._optimizer.zero_grad(set_to_none=True)
-        loss.backward()  # type: ignore[no-untyped-call]
-        self._optimizer.step()
-        return value, float(
-            (logits.detach().argmax(dim=1).cpu() == torch.from_numpy(batch.labels)).float().mean()
-        )
+            logits, loss = self._kind.answer(self._network, batch)
+            labels = torch.from_numpy(batch.labels)
+            value = self._steps.take(logits, labels, loss, rate=schedule.rate(done))
+            if not np.isfinite(value):
+                raise FloatingPointError(
+                    f"epoch {self._epochs + 1}: the loss is {value}; lower the learning rate"
+                )
 
     @torch.no_grad()
     def _validate(self, began: float, progress: Progress) -> ClassFigures:
@@ -226,28 +202,7 @@ class Run:
         }
         write_atomically(self._out / name, partial(torch.save, state))
 
-    def _log(self, trained: _Trained, figures: ClassFigures) -> EpochRow:
-        row = row_of(
-            figures,
-            epoch=self._epochs,
-            seconds=round(self._seconds, 1),
-            learning_rate=trained.rate,
-            train_loss=trained.loss,
-            train_accuracy=trained.accuracy,
-        )
-        append_row(self._out, row)
-        return row
-
 
 def _of_epochs(settings: dict[str, Any]) -> dict[str, Any]:
     """Leave out what only comes after the last epoch, and may be asked for then."""
     return {name: value for name, value in settings.items() if not name.startswith("head_")}
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class _Trained:
-    """What the steps of an epoch say."""
-
-    loss: float  #: mean; NaN where the time was up before the first step
-    accuracy: float
-    rate: float  #: the last one

@@ -153,7 +153,7 @@ class Form:
     """A form being received; `feed` and `finish` block on the disk and so run in a thread."""
 
     def __init__(self, boundary: bytes, folder: Path, kept: ExitStack, file_fields: frozenset[str]) -> None:
-        """Files of `file_fields` go to `folder`, and `kept` removes them at its end."""
+        """Keep files of `file_fields` in `folder`, where `kept` removes them at its end."""
         self.fields: dict[str, Any] = {}
         self.uploads: list[Upload] = []
         self._folder, self._kept, self._file_fields = folder, kept, file_fields

@@ -39,7 +39,7 @@ class MetricsMiddleware:
         self._app, self._metrics = app, metrics
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """ASGI."""
+        """Pass a request on (ASGI), and count its answer."""
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return

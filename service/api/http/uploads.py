@@ -38,7 +38,7 @@ class Incoming:
     """A file being written. Used as a context: what was not moved away by its end is removed."""
 
     def __init__(self, folder: Path, filename: str) -> None:
-        """`folder` exists; `filename` is the client's, is cut to one short line, and is not used as a path."""
+        """Open a file in `folder`; `filename` is the client's, is cut to one short line, and is not used as a path."""
         self.filename = _shown(filename)
         self._path = folder / f"{uuid4().hex}.part"
         self._file = self._path.open("wb")

@@ -88,13 +88,11 @@ def test_a_survey_saved_twice_has_its_tiles_once_and_counts_them(catalog: Catalo
         survey_id,
         tiles=[tile(0, 0), tile(1, 0, "unchanged", 0.1), tile(2, 0, "unobserved")],
         threshold=0.5,
-        counts={"points": 99},
     )
     assert [change.tile.tile_index[0] for change in catalog.changes.of_survey(survey_id)] == [0, 1, 2]
     found = catalog.surveys.get(survey_id)
     assert found.threshold == 0.5
     assert found.counts == {
-        "points": 99,
         "tiles": 3,
         "changed": 1,
         "unchanged": 1,

@@ -253,7 +253,7 @@ def test_names_that_look_like_markup_are_printed_as_they_are(
 @pytest.mark.parametrize("name", ["a[/]b.ply", "[old].ply"])
 def test_a_bar_shows_a_file_name_that_looks_like_markup_as_it_is(name: str) -> None:
     shown = Terminal(url="", as_json=False, err=Console(file=io.StringIO(), force_terminal=True))
-    with shown._bar(terminal._description()) as bar:
+    with shown._bar(terminal._title()) as bar:
         bar.add_task(name)
         column = bar.columns[0]
         assert isinstance(column, TextColumn)

@@ -9,7 +9,7 @@ from tests.support.detectors import CountingDetector
 from worker.benchmarks.methods import open_model
 from worker.benchmarks.speed import BenchSettings, bench, resized, scoring_bench, tables
 from worker.cloud.tiling import TileGrid, TilePairs, Tiles
-from worker.detectors import store
+from worker.detectors import registry
 from worker.detectors.card import Card, Preprocessing
 from worker.detectors.spicd_net.network import SpicdNetwork
 from worker.detectors.store import write_card, write_model
@@ -54,7 +54,8 @@ def test_any_detector_of_the_store_can_be_timed(tmp_path: Path, monkeypatch: pyt
     folder = tmp_path / "counting" / "1"
     folder.mkdir(parents=True)
     write_card(folder, CountingDetector.card)
-    monkeypatch.setitem(store.DETECTORS, "counting", CountingDetector)
+    entry = registry.Entry(detector=f"{__name__}:CountingDetector")
+    monkeypatch.setitem(registry.DETECTORS, "counting", entry)
     detector = open_model(tmp_path, "counting/1")
     figures = scoring_bench(made_pairs(), detector, repeats=2)
     assert list(figures["seconds"]) == ["c2c", "uncached", "cached"]

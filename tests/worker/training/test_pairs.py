@@ -19,7 +19,7 @@ from worker.training.augmentation import (
     turned_alike,
 )
 from worker.training.dataset import TileSet
-from worker.training.pairs import PAPER_PAIRS, PairMaker, PairSettings, altered, composition
+from worker.training.pairs import PAPER_PAIRS, PairMaker, PairSettings, changed, composition
 from worker.training.settings import TrainSettings
 
 STILL = Augmentation(jitter=0, dropout=0, shift=0, yaw=0)
@@ -129,7 +129,7 @@ def test_a_change_that_would_not_show_is_drawn_again(tiles):
     settings = replace(PLAIN, magnitude=(0.0, 0.4), density=(0.1, 0.1), min_shown=15)
     points = tiles.points_a[0]
     for seed in range(20):
-        result = altered(points, move_object, settings, HALF, np.random.default_rng(seed))
+        result = changed(points, settings, HALF, np.random.default_rng(seed), operation=move_object)
         moved = (result != points).any(axis=1)
         gone, come = points[moved], result[moved]
         far = [

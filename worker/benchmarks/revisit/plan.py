@@ -6,8 +6,9 @@ import hashlib
 from dataclasses import dataclass
 from typing import Literal, get_args
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from worker.cloud.settings import StrictModel
 from worker.pipeline.settings import PipelineSettings
 from worker.simulation.scenes import BUILDINGS, BuildingKind, Scene
 from worker.simulation.visits import DRIFT
@@ -20,10 +21,8 @@ TEST_SEED, VALIDATION_SEED = 700_000, 900_000  #: of the first building; trainin
 RECIPE = 1  #: raised when the same settings begin to give other visits: kept ones are then made anew
 
 
-class RevisitSettings(BaseModel):
+class RevisitSettings(StrictModel):
     """How the visits are made; with the seeds, all that they depend on."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     kinds: tuple[BuildingKind, ...] = Field(KINDS, min_length=1, description="of buildings, taken in turn")
     stops: dict[BuildingKind, int] = Field(

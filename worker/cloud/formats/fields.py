@@ -10,7 +10,6 @@ import mmap
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -139,6 +138,17 @@ def from_blocks(fields: Sequence[Field], block: NDArray[np.uint8], *, n: int) ->
     }
 
 
+def header_line(head: bytes, start: int, *, last: str) -> tuple[list[str], int]:
+    """Return the words of the header's line at `start`, and where the next one begins.
+
+    Raises ScanError where `head` ends first, which names the `last` line that was waited for.
+    """
+    end = head.find(b"\n", start)
+    if end < 0:
+        raise ScanError(f"no {last} in the first {len(head)} bytes; the header is cut off or too long")
+    return head[start:end].decode("latin-1").split(), end + 1
+
+
 def text_lines(buffer: mmap.mmap) -> Iterator[bytes]:
     """Yield the lines of `buffer` from where it stands, without the blank ones."""
     for line in iter(buffer.readline, b""):
@@ -242,12 +252,3 @@ def colors_of(columns: Columns) -> Colors | None:
         return None
     scaled: Colors = np.rint(colors * 255).astype(np.uint8)
     return scaled
-
-
-def write_whole(path: Path, header: str, rows: NDArray[Any]) -> None:
-    """Write an ASCII header and the bytes of `rows`, so that the file appears whole or not at all."""
-    aside = path.with_name(path.name + ".tmp")
-    with aside.open("wb") as file:
-        file.write(header.encode("ascii"))
-        file.write(rows.tobytes())
-    aside.replace(path)

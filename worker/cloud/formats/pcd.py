@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from worker.cloud.formats.fields import (
     FARTHEST,
@@ -24,13 +25,14 @@ from worker.cloud.formats.fields import (
     from_blocks,
     from_rows,
     from_text,
+    header_line,
     rows_size,
     stride,
     text_lines,
-    write_whole,
 )
 from worker.cloud.types import Colors, Matrix4, Points
 from worker.errors import ScanError
+from worker.files import write_bytes
 
 _KEYWORDS = (
     "VERSION", "FIELDS", "COLUMNS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS", "DATA",
@@ -53,7 +55,7 @@ class PcdHeader:
 
 
 def looks_like_pcd(head: bytes) -> bool:
-    """Whether a file that starts with `head` means to be PCD."""
+    """Tell whether a file that starts with `head` means to be PCD."""
     return re.match(rb"\s*(#[^\n]*\.PCD|(VERSION|FIELDS|COLUMNS)\s)", head) is not None
 
 
@@ -92,11 +94,7 @@ def _entries(head: bytes) -> tuple[dict[str, list[str]], int]:
     entries: dict[str, list[str]] = {}
     position = 0
     while "DATA" not in entries:
-        end = head.find(b"\n", position)
-        if end < 0:
-            raise ScanError(f"no DATA line in the first {len(head)} bytes; the header is cut off or too long")
-        words = head[position:end].decode("latin-1").split()
-        position = end + 1
+        words, position = header_line(head, position, last="DATA line")
         if not words or words[0].startswith("#"):
             continue
         if words[0] not in _KEYWORDS or words[0] in entries:
@@ -161,13 +159,8 @@ def _viewpoint(words: list[str]) -> Matrix4:
         raise ScanError(
             f"VIEWPOINT's quaternion has length {length:.3g}, not 1; without a pose write 1 0 0 0"
         )
-    w, x, y, z = numbers[3:] / length
     pose = np.eye(4)
-    pose[:3, :3] = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
+    pose[:3, :3] = Rotation.from_quat(np.roll(numbers[3:], -1)).as_matrix()  # SciPy writes x y z w
     pose[:3, 3] = numbers[:3]
     return pose
 
@@ -193,34 +186,34 @@ def _compressed(header: PcdHeader, buffer: mmap.mmap) -> Columns:
         raise ScanError(
             f"truncated: header declares {header.n} points, the file ends before the compressed data"
         )
-    packed, plain = (int(v) for v in np.frombuffer(buffer, "<u4", count=2, offset=header.size))
+    packed, unpacked = (int(v) for v in np.frombuffer(buffer, "<u4", count=2, offset=header.size))
     if len(buffer) - start < packed:
         raise ScanError(
             f"truncated: {packed} bytes of compressed data for {header.n} points are declared, "
             f"file holds {len(buffer) - start}; upload it again"
         )
-    if plain != needed or plain > packed * _LZF_GAIN:
+    if unpacked != needed or unpacked > packed * _LZF_GAIN:
         raise ScanError(
-            f"{packed} compressed bytes are said to hold {plain}, but {header.n} points take {needed} bytes"
+            f"{packed} compressed bytes are said to hold {unpacked}, but {header.n} points take {needed} bytes"
         )
     _refuse_leftovers(buffer, start + packed)
-    return from_blocks(header.fields, _decompress(buffer[start : start + packed], plain), n=header.n)
+    return from_blocks(header.fields, _decompress(buffer[start : start + packed], unpacked), n=header.n)
 
 
 def _decompress(packed: bytes, size: int) -> NDArray[np.uint8]:
     """Unpack an LZF block into exactly `size` bytes."""
     import imagecodecs  # noqa: PLC0415 - most scans are not compressed
 
-    plain = np.empty(size, np.uint8)
+    unpacked = np.empty(size, np.uint8)
     if size == 0:
-        return plain
+        return unpacked
     try:
-        filled = len(imagecodecs.lzf_decode(packed, out=plain.data))
+        filled = len(imagecodecs.lzf_decode(packed, out=unpacked.data))
     except imagecodecs.LzfError as error:
         raise ScanError(f"compressed data is damaged ({error}); upload it again") from None
     if filled != size:  # the decoder stops early without complaint
         raise ScanError(f"compressed data is damaged: it gives {filled} bytes instead of {size}")
-    return plain
+    return unpacked
 
 
 def _refuse_leftovers(buffer: mmap.mmap, end: int) -> None:
@@ -253,12 +246,10 @@ def write_pcd(
         f"WIDTH {len(rows)}\nHEIGHT 1\nVIEWPOINT {viewpoint}\n"
         f"POINTS {len(rows)}\nDATA binary\n"
     )
-    write_whole(path, header, rows)
+    write_bytes(path, header.encode("ascii"), rows.tobytes())
 
 
 def _viewpoint_words(pose: Matrix4) -> str:
     """Return `tx ty tz qw qx qy qz` of a rigid pose (4, 4)."""
-    from scipy.spatial.transform import Rotation  # noqa: PLC0415 - reading does not need it
-
     x, y, z, w = Rotation.from_matrix(pose[:3, :3]).as_quat()
     return " ".join(f"{value:.9g}" for value in (*pose[:3, 3], w, x, y, z))

@@ -25,12 +25,13 @@ from worker.cloud.formats.fields import (
     chosen_fields,
     from_rows,
     from_text,
+    header_line,
     rows_size,
     text_lines,
-    write_whole,
 )
 from worker.cloud.types import Colors, Points
 from worker.errors import ScanError
+from worker.files import write_bytes
 
 _SHORT_NAMES = {
     "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4",
@@ -87,7 +88,7 @@ class PlyHeader:
 
 
 def looks_like_ply(head: bytes) -> bool:
-    """Whether a file that starts with `head` means to be PLY."""
+    """Tell whether a file that starts with `head` means to be PLY."""
     return re.match(rb"ply[ \t]*\r?\n", head) is not None
 
 
@@ -133,13 +134,7 @@ def _lines(head: bytes) -> tuple[list[list[str]], int]:
     lines: list[list[str]] = []
     position = head.find(b"\n") + 1
     while True:
-        end = head.find(b"\n", position)
-        if end < 0:
-            raise ScanError(
-                f"no end_header in the first {len(head)} bytes; the header is cut off or too long"
-            )
-        words = head[position:end].decode("latin-1").split()
-        position = end + 1
+        words, position = header_line(head, position, last="end_header")
         if words == ["end_header"]:
             return lines, position
         if words and words[0] not in ("comment", "obj_info"):
@@ -270,7 +265,7 @@ def write_ply(
     rows = np.empty(len(points), np.dtype([(name, column.dtype) for name, column in columns.items()]))
     for name, column in columns.items():
         rows[name] = column
-    write_whole(path, "\n".join([*header, "end_header", ""]), rows)
+    write_bytes(path, "\n".join([*header, "end_header", ""]).encode("ascii"), rows.tobytes())
 
 
 def _scalar(name: str, values: NDArray[Any]) -> NDArray[Any]:

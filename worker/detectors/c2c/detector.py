@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 from scipy.spatial import cKDTree
 
+from worker.cloud.settings import StrictModel
 from worker.cloud.tiling import Tiles
 from worker.cloud.types import Arrays, Floats, Points
 from worker.detectors.card import Card
@@ -19,10 +20,8 @@ from worker.threads import query_threads
 FARTHEST = 1.0  #: metres; no nearest distance counts as more, and none is searched beyond
 
 
-class CloudToCloudSettings(BaseModel):
+class CloudToCloudSettings(StrictModel):
     """`detector_settings` of a card of this detector."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     half_distance: float = Field(gt=0, description="metres; a tile that far apart has the score 0.5")
     max_distance: float = Field(FARTHEST, gt=0, description="metres; no nearest distance counts as more")

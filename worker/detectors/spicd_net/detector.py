@@ -8,10 +8,11 @@ from typing import Self
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 from torch import Tensor
 
 from worker.cloud.patches import Patch, patch
+from worker.cloud.settings import StrictModel
 from worker.cloud.tiling import TilePairs, Tiles
 from worker.cloud.types import Arrays, Points
 from worker.detectors.card import Card
@@ -28,10 +29,8 @@ TILES_PER_REPORT = 8
 REFERENCE, CURRENT = 0, 1  #: streams of the Chamfer sample, so that two equal patches are not sampled alike
 
 
-class SpicdNetSettings(BaseModel):
+class SpicdNetSettings(StrictModel):
     """`detector_settings` of a card of this detector: what of the input is tied to the weights."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     patch_points: int = Field(gt=0, description="points of a patch after FPS and repetition")
     chamfer_points: int | None = Field(
@@ -116,7 +115,7 @@ class SpicdNet:
         )
 
     def _patches(self, tiles: Tiles, points: Sequence[Points], indices: NDArray[np.intp]) -> list[Patch]:
-        """Of the tiles at these indices, with these points (n, 3), metres, map frame."""
+        """Return patches of the tiles at these indices, with these points (n, 3), metres, map frame."""
         settings, centres = self._settings, tiles.grid.centers(tiles.indices)
         return [
             patch(
@@ -128,7 +127,7 @@ class SpicdNet:
         ]
 
     def _encoded(self, patches: Sequence[Patch], progress: Progress, stage: str) -> NDArray[np.float32]:
-        """(t, 1024)"""
+        """Return the descriptors (t, 1024)."""
         descriptors = np.empty((len(patches), DESCRIPTOR), dtype=np.float32)
         for row, prepared in enumerate(patches):
             if row % TILES_PER_REPORT == 0:
@@ -152,14 +151,14 @@ class SpicdNet:
             places = np.random.default_rng((settings.seed, stream)).choice(
                 settings.patch_points, settings.chamfer_points, replace=False
             )
-            clouds = [prepared.at(places) for prepared in patches]
+            clouds = [prepared.points_at(places) for prepared in patches]
         return [torch.from_numpy(cloud).to(self._device) for cloud in clouds]
 
     @torch.inference_mode()
     def _probabilities(
         self, reference: NDArray[np.float32], current: NDArray[np.float32], statistics: Tensor
     ) -> NDArray[np.float32]:
-        """Descriptors (t, 1024) of both sides and (t, 8) -> (t, 3)"""
+        """Classify descriptors (t, 1024) of both sides and statistics (t, 8): (t, 3)."""
         f_ref, f_cur = (torch.from_numpy(side).to(self._device) for side in (reference, current))
         logits: Tensor = self._network.head(f_ref, f_cur, statistics)
         probabilities: NDArray[np.float32] = logits.softmax(dim=1).cpu().numpy()

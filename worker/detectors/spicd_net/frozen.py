@@ -36,7 +36,7 @@ class FrozenTransform:
         self._from_pooled = net.from_pooled
 
     def matrix(self, x: Tensor, piece: int) -> Tensor:
-        """(m, k) -> (k, k)"""
+        """Return the transform of a cloud, (m, k) -> (k, k)."""
         highest = highest_of(x, (self.points1, self.points2), self.pooled, piece)
         return self._from_pooled(functional.relu(highest)[None])[0]
 
@@ -54,7 +54,7 @@ class FrozenEncoder:
 
     @torch.inference_mode()
     def __call__(self, points: Tensor, centroid: Tensor) -> Tensor:
-        """Distinct points (m, 3) and the padded patch's centroid (3,) -> descriptor (1024,)"""
+        """Encode distinct points (m, 3), with the padded patch's centroid (3,), as a descriptor (1024,)."""
         piece = CPU_PIECE if points.device.type == "cpu" else len(points)
         centred = points - centroid
         a3 = self.input_transform.matrix(centred, piece)

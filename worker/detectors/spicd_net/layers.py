@@ -48,7 +48,7 @@ class NormedLinear(nn.Module):
         return functional.linear(x, weight, bias)
 
     def folded(self, x: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Weight (outputs, inputs) and bias (outputs,) with the normalisation in them.
+        """Return weight (outputs, inputs) and bias (outputs,) with the normalisation in them.
 
         In training the statistics are those of `x` (..., inputs), which is then needed; otherwise the running
         ones.

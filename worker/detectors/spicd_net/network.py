@@ -147,7 +147,7 @@ class SpicdNetwork(nn.Module):
     def forward(
         self, points: Tensor, sizes: list[int], chamfer_points: Tensor, chamfer_sizes: list[int]
     ) -> PairOutput:
-        """B pairs as 2 B clouds of `sizes`, the references before the currents.
+        """Classify B pairs, given as 2 B clouds of `sizes`, the references before the currents.
 
         `points` is (P, 3) metres with each cloud's centroid at 0. What the Chamfer branch compares is (Q, 3) metres,
         tile-centre frame, as many clouds of `chamfer_sizes` in the same order. Both branches are one batch: the same

@@ -159,7 +159,9 @@ class _Build:
             for index, file in enumerate(self.files)
         ]
         prepared = {}
-        for count, (index, scan) in enumerate(self.workspace.processes.each(read_and_prepare, tasks)):
+        for count, (index, scan) in enumerate(
+            self.workspace.processes.map_unordered(read_and_prepare, tasks)
+        ):
             prepared[index] = scan
             self.progress("reading", count / len(tasks))
         self.progress("reading", 1.0)

@@ -94,7 +94,7 @@ def _linearize(
     ]
     linearized = {
         (pair.target, pair.source): pair
-        for batch in workspace.processes.each(linearize, tasks)
+        for batch in workspace.processes.map_unordered(linearize, tasks)
         for pair in batch
     }
     return [linearized[pair] for pair in pairs]

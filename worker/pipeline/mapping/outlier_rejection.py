@@ -34,7 +34,7 @@ def find_violations(
         FreeSpaceTask(folder=workspace.folder, target=(target, poses[target]), sources=tuple(sources))
         for target, sources in near.items()
     ]
-    batches = workspace.processes.each(check_free_space, tasks)
+    batches = workspace.processes.map_unordered(check_free_space, tasks)
     violations = (item for batch in batches for item in batch if item.share > settings.max_contradiction)
     return sorted(violations, key=lambda item: (item.target, item.source))
 

@@ -35,11 +35,9 @@ class PairCache(Protocol):
 
     def load(self) -> Iterable[PairResult]:
         """Load what an earlier run of this build left."""
-        ...
 
     def save(self, results: Iterable[PairResult]) -> None:
         """Keep a few more results; called seconds apart at most."""
-        ...
 
 
 class NullPairCache:
@@ -121,7 +119,7 @@ def _search(
             for first in range(0, len(targets), _TARGETS)
         ]
     results = []
-    for count, batch in enumerate(workspace.processes.each(search, tasks), start=1):
+    for count, batch in enumerate(workspace.processes.map_unordered(search, tasks), start=1):
         results += batch
         progress(count / len(tasks))
     return results
@@ -156,7 +154,7 @@ def register_planned(
         )
         for target, sources in sorted(by_target.items())
     ]
-    for count, batch in enumerate(workspace.processes.each(register_pairs, tasks), start=1):
+    for count, batch in enumerate(workspace.processes.map_unordered(register_pairs, tasks), start=1):
         pair_cache.save(batch)
         results |= {result.pair: result for result in batch}
         progress(count / len(tasks))

@@ -15,7 +15,7 @@ from worker.pipeline.registration.hypothesis import Hypothesis
 from worker.pipeline.registration.preprocessing import PreparedScan
 from worker.pipeline.registration.results import ScanRejected, ScanResult
 from worker.pipeline.registration.scan_to_map import register, registration_result
-from worker.pipeline.registration.settings import RegistrationSettings, with_values
+from worker.pipeline.registration.settings import RegistrationSettings
 from worker.pipeline.registration.verification import free_space_violation, rejected
 
 _FEW = 4  # registered scans up to which the whole search is worth its time
@@ -67,7 +67,7 @@ def relocalize(
     if len(poses) > _FEW:
         # one draw of features: these scans have been looked for in every registered scan already
         first = settings.search_resolutions[:1]
-        settings = with_values(settings, search_resolutions=first, search_seeds=1)
+        settings = settings.with_values(search_resolutions=first, search_seeds=1)
     priors = {index: scan.prior for index, scan in scans.items() if scan.prior is not None}
     reference_from_map = inverse(map_from_reference(poses, priors, reference))
     tasks = [
@@ -81,7 +81,7 @@ def relocalize(
         )
         for index in missing
     ]
-    return {attempt.index: attempt for attempt in workspace.processes.each(_relocalize_one, tasks)}
+    return {attempt.index: attempt for attempt in workspace.processes.map_unordered(_relocalize_one, tasks)}
 
 
 def _relocalize_one(task: _RelocalizeTask) -> Relocalized:

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from worker.cloud.settings import StrictModel
 from worker.pipeline.registration.settings import RegistrationSettings
 
 
-class MapSettings(BaseModel):
+class MapSettings(StrictModel):
     """Of overlap culling, the pose graph and the multi-view refinement (paper, Section 3.3.2, and what we add)."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     min_box_overlap: float = Field(
         0.2, ge=0, le=1, description="volume two bounding boxes share, of the smaller one"

@@ -170,7 +170,7 @@ class _Visit:
         return Refined(poses=poses, uncertainties=sigmas, free_space_violation=dict.fromkeys(poses, 0.0))
 
     def _disagreement(self, index: int, hypothesis: Hypothesis, refined: Refined) -> float:
-        """Measure how far the others contradict a scan, by free space or by where they would have it; 1 is the limit."""
+        """Measure how far others contradict a scan, by free space or by where they would have it; 1 is the limit."""
         apart, _ = difference(hypothesis.target_from_source, refined.poses[index])
         limit = self.workspace.settings.registration.max_free_space_violation_near_prior
         return max(refined.free_space_violation[index] / limit, apart / _DISAGREE)

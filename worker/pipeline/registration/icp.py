@@ -17,13 +17,15 @@ from worker.cloud.poses import exponential, transformed
 from worker.cloud.types import Floats, Matrix4
 from worker.pipeline.registration.surface import Surface, facing
 
+_CONVERGED = 1e-4  # radians and metres of one step
+
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class IcpResult:
     """Where ICP ended, in the terms of Open3D and small_gicp."""
 
     target_from_source: Matrix4  #: (4, 4) rigid
-    converged: bool  #: the last step was below the tolerance
+    converged: bool  #: the last step was below `_CONVERGED`
     iterations: int
     num_inliers: int
     fitness: float  #: inliers / source points, 0..1
@@ -37,14 +39,13 @@ def icp(
     *,
     max_correspondence_distance: float,
     max_iterations: int = 30,
-    tolerance: float = 1e-4,
     robust: bool = False,
     every: int = 1,
     tick: Callable[[], None] = lambda: None,
 ) -> IcpResult:
     """Minimise the squared distances of the source's points to the tangent planes of their nearest neighbours.
 
-    `start` is target_from_source; `tolerance` ends the loop, in radians and metres of one step. `robust` weighs pairs
+    `start` is target_from_source; a step below `_CONVERGED` ends the loop. `robust` weighs pairs
     by Tukey's biweight kernel, which is 0 at the correspondence distance: for wide ones, where many pairs are wrong.
     `every` takes one point of so many. `tick` is called before every iteration and may raise to stop the work. Pairs
     that face opposite ways are the two sides of one wall, and are left out.
@@ -57,15 +58,10 @@ def icp(
         points, index, distance = _correspondences(source, target, pose, max_correspondence_distance)
         if len(points) < 6:
             break
-        jacobian, residual = _linearized(points, target, index)
-        weighted = jacobian
-        if robust:
-            weighted = jacobian * ((1 - (distance / max_correspondence_distance) ** 2) ** 2)[:, None]
-        # 1e-9 keeps a degenerate scene solvable: the step in a free direction is zero
-        normal_matrix = weighted.T @ jacobian + 1e-9 * len(residual) * np.eye(6)
-        step: Floats = -np.linalg.solve(normal_matrix, weighted.T @ residual).astype(np.float64)
+        weights = (1 - (distance / max_correspondence_distance) ** 2) ** 2 if robust else None
+        step = _step(*_linearized(points, target, index), weights)
         pose = exponential(step) @ pose
-        converged = bool(np.abs(step).max() < tolerance)
+        converged = bool(np.abs(step).max() < _CONVERGED)
     distance, _ = target.nearest(transformed(source.points, pose), within=max_correspondence_distance)
     inliers = distance[np.isfinite(distance)]
     return IcpResult(
@@ -76,6 +72,15 @@ def icp(
         fitness=len(inliers) / max(len(source.points), 1),
         inlier_rmse=float(np.sqrt(np.mean(inliers**2))) if len(inliers) else float("inf"),
     )
+
+
+def _step(jacobian: Floats, residual: Floats, weights: Floats | None) -> Floats:
+    """Solve the normal equations of (K, 6) and (K,), with (K,) weights if given: the twist (6,) of one iteration."""
+    weighted = jacobian if weights is None else jacobian * weights[:, None]
+    # 1e-9 keeps a degenerate scene solvable: the step in a free direction is zero
+    normal_matrix = weighted.T @ jacobian + 1e-9 * len(residual) * np.eye(6)
+    step: Floats = -np.linalg.solve(normal_matrix, weighted.T @ residual).astype(np.float64)
+    return step
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -11,7 +11,7 @@ from worker.cloud.poses import difference
 from worker.cloud.types import Matrix4
 from worker.pipeline.registration.hypothesis import Hypothesis, better
 from worker.pipeline.registration.icp import icp
-from worker.pipeline.registration.settings import RegistrationSettings, with_values
+from worker.pipeline.registration.settings import RegistrationSettings
 from worker.pipeline.registration.surface import Surface
 from worker.pipeline.registration.verification import inlier_share, two_way_inliers
 
@@ -109,7 +109,7 @@ class Refinement:
 
     def with_distances(self, coarse_distances: tuple[float, ...]) -> Refinement:
         """Return the same with other coarse distances, metres."""
-        return replace(self, settings=with_values(self.settings, coarse_distances=coarse_distances))
+        return replace(self, settings=self.settings.with_values(coarse_distances=coarse_distances))
 
     def final(self, hypothesis: Hypothesis) -> Hypothesis:
         """Refine a few steps more with every point: hypotheses were told apart by some of them.

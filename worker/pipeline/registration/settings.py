@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TypeVar
+from pydantic import AliasChoices, Field
 
-from pydantic import AliasChoices, BaseModel, ConfigDict, Field
-
-Settings = TypeVar("Settings", bound=BaseModel)
+from worker.cloud.settings import StrictModel
 
 
-class RegistrationSettings(BaseModel):
+class RegistrationSettings(StrictModel):
     """Table 1 of the paper, and what we add to it."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     voxel_size: float = Field(0.05, gt=0, le=0.5, description="metres; the scan is sampled before ICP")
     max_correspondence_distance: float = Field(
@@ -65,13 +61,3 @@ class RegistrationSettings(BaseModel):
     max_free_space_violation_near_prior: float = Field(0.03, ge=0, le=1, description="the same near a prior")
     min_eigenvalue: float = Field(0.002, ge=0, description="smallest eigenvalue of the scene's normal matrix")
     min_points: int = Field(500, ge=6, description="voxels that a scan needs to be registered at all")
-
-
-def with_values(settings: Settings, **values: object) -> Settings:
-    """Return a copy with these values; unlike `model_copy`, it refuses unknown names and values out of bounds.
-
-    Raises ValueError.
-    """
-    if unknown := sorted(values.keys() - type(settings).model_fields.keys()):
-        raise ValueError(f"{type(settings).__name__} has no setting named {', '.join(unknown)}")
-    return type(settings).model_validate(dict(settings) | values)

@@ -119,7 +119,8 @@ def require_accepted(name: str, hypothesis: Hypothesis, settings: RegistrationSe
         hypothesis,
         f"fitness {hypothesis.fitness:.2f} (over {settings.min_fitness:g} is accepted), "
         f"inlier RMSE {hypothesis.inlier_rmse * 100:.1f} cm, inlier ratio {hypothesis.two_way_inlier_ratio:.2f} "
-        f"(at least {hypothesis.required_inlier_ratio(settings):g}) over {hypothesis.overlap:.0%} of the scan; {advice}",
+        f"(at least {hypothesis.required_inlier_ratio(settings):g}) over {hypothesis.overlap:.0%} of the scan; "
+        + advice,
     )
 
 

@@ -73,7 +73,10 @@ def dress(figure: Figure, axes: Axes, extent: Extent, changes: ChangeSet, title:
         fontsize=8,
         frameon=False,
     )
-    note = "seen from above, between 0.15 and 2 m over the floor; of tiles above each other the first in this list is drawn"
+    note = (
+        "seen from above, between 0.15 and 2 m over the floor; "
+        "of tiles above each other the first in this list is drawn"
+    )
     figure.text(0.5, 0.14 / above, note, fontsize=6.5, color=QUIET, ha="center", va="center")
 
 
@@ -133,7 +136,7 @@ def _extent(changes: ChangeSet) -> Extent:
 
 
 def _draw_walls(axes: Axes, reference: Points, current: Points, extent: Extent) -> None:
-    """How much stands above each spot between knee and head, so that furniture and walls show."""
+    """Draw how much stands above each spot between knee and head, so that furniture and walls show."""
     floor = float(np.percentile(reference[:, 2], 1))
     before, now = (_standing(points, floor, extent) for points in (reference, current))
     shade = np.clip(before / 12.0, 0, 1) * _DARKEST_WALL

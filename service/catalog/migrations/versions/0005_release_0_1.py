@@ -24,36 +24,36 @@ def upgrade() -> None:
     _make(
         "scans",
         ("id",),
-        *_texts("id filename format sha256 key"),
+        *_needed(sa.String(), "id filename format sha256 key"),
         sa.Column("size", sa.BigInteger(), nullable=False),
         sa.Column("device_id", sa.String()),
         sa.Column("captured_at", UtcDateTime()),
         _json("pose"),
-        *_instants("created"),
+        *_needed(UtcDateTime(), "created"),
         sa.Column("resent", UtcDateTime()),
     )
     _index("scans", "created", "id")
     _make(
         "maps",
         ("id",),
-        *_texts("id model"),
+        *_needed(sa.String(), "id model"),
         sa.Column("name", sa.String()),
         _json("settings", nullable=False),
         _json("anchor"),
-        *_instants("created updated"),
+        *_needed(UtcDateTime(), "created updated"),
     )
     _index("maps", "created", "id")
     _make(
         "map_versions",
         ("job_id",),
-        *_texts("job_id map_id status"),
-        *_integers("number"),
+        *_needed(sa.String(), "job_id map_id status"),
+        *_needed(sa.Integer(), "number"),
         sa.Column("base_version", sa.Integer()),
         sa.Column("survey_id", sa.String()),
         _json("bounds"),
         _json("counts", nullable=False),
         _json("registration"),
-        *_instants("created updated"),
+        *_needed(UtcDateTime(), "created updated"),
         _foreign_key("map_versions", "map_id", "maps.id"),
         sa.UniqueConstraint("map_id", "number", name=op.f("uq_map_versions_map_id_number")),
     )
@@ -61,12 +61,12 @@ def upgrade() -> None:
     _make(
         "surveys",
         ("id",),
-        *_texts("id map_id status model job_id"),
+        *_needed(sa.String(), "id map_id status model job_id"),
         sa.Column("map_version", sa.Integer(), nullable=False, server_default="1"),
         sa.Column("threshold", sa.Double()),
         sa.Column("device_id", sa.String()),
         _json("counts", nullable=False),
-        *_instants("captured_at created updated"),
+        *_needed(UtcDateTime(), "captured_at created updated"),
         _foreign_key("surveys", "map_id", "maps.id"),
     )
     _index("surveys", "map_id", "captured_at", "id")
@@ -74,8 +74,8 @@ def upgrade() -> None:
     _make(
         "survey_tiles",
         ("survey_id", "tile_id"),
-        *_texts("survey_id tile_id state"),
-        *_integers("i j k n_reference n_current"),
+        *_needed(sa.String(), "survey_id tile_id state"),
+        *_needed(sa.Integer(), "i j k n_reference n_current"),
         *(sa.Column(name, sa.Double(), nullable=False) for name in _BOX),
         *(sa.Column(name, sa.Double()) for name in ("score", "p_unchanged", "p_changed", "p_different")),
         _foreign_key("survey_tiles", "survey_id", "surveys.id"),
@@ -86,13 +86,13 @@ def upgrade() -> None:
     _make(
         "models",
         ("job_id",),
-        *_texts("job_id map_id name status"),
-        *_integers("map_version number"),
+        *_needed(sa.String(), "job_id map_id name status"),
+        *_needed(sa.Integer(), "map_version number"),
         sa.Column("base", sa.String()),
         sa.Column("minutes", sa.Double(), nullable=False),
         sa.Column("epochs", sa.Integer()),
         _json("card"),
-        *_instants("created updated"),
+        *_needed(UtcDateTime(), "created updated"),
         _foreign_key("models", "map_id", "maps.id"),
         sa.UniqueConstraint("name", "number", name=op.f("uq_models_name_number")),
     )
@@ -100,13 +100,13 @@ def upgrade() -> None:
     _make(
         "jobs",
         ("id",),
-        *_texts("id kind map_id status message"),
+        *_needed(sa.String(), "id kind map_id status message"),
         sa.Column("survey_id", sa.String()),
         sa.Column("model", sa.String()),
-        *_integers("progress"),
+        *_needed(sa.Integer(), "progress"),
         _json("problem"),
         sa.Column("attempts", sa.Integer(), nullable=False, server_default="0"),
-        *_instants("created updated"),
+        *_needed(UtcDateTime(), "created updated"),
         sa.Column("started", UtcDateTime()),
         sa.Column("finished", UtcDateTime()),
         _foreign_key("jobs", "map_id", "maps.id"),
@@ -115,14 +115,6 @@ def upgrade() -> None:
     _index("jobs", "created", "id")
     for column in ("map_id", "survey_id", "status"):
         _index("jobs", column)
-
-
-def downgrade() -> None:
-    """Drop every table."""
-    for name in ("jobs", "models", "survey_scans", "version_scans", "survey_tiles", "surveys"):
-        op.drop_table(name)
-    for name in ("map_versions", "maps", "scans"):
-        op.drop_table(name)
 
 
 _BOX = ("min_x", "min_y", "min_z", "max_x", "max_y", "max_z")
@@ -137,8 +129,8 @@ def _make_outcomes(table: str, owner: str, target: str) -> None:
     _make(
         table,
         (owner, "scan_id"),
-        *_texts(f"{owner} scan_id"),
-        *_integers("ordinal"),
+        *_needed(sa.String(), f"{owner} scan_id"),
+        *_needed(sa.Integer(), "ordinal"),
         sa.Column("accepted", sa.Boolean()),
         *(
             sa.Column(name, sa.Double())
@@ -153,16 +145,9 @@ def _make_outcomes(table: str, owner: str, target: str) -> None:
     _index(table, "scan_id")
 
 
-def _texts(names: str) -> list[sa.Column[Any]]:
-    return [sa.Column(name, sa.String(), nullable=False) for name in names.split()]
-
-
-def _integers(names: str) -> list[sa.Column[Any]]:
-    return [sa.Column(name, sa.Integer(), nullable=False) for name in names.split()]
-
-
-def _instants(names: str) -> list[sa.Column[Any]]:
-    return [sa.Column(name, UtcDateTime(), nullable=False) for name in names.split()]
+def _needed(kind: sa.types.TypeEngine[Any], names: str) -> list[sa.Column[Any]]:
+    """Return columns of one type that are never NULL."""
+    return [sa.Column(name, kind, nullable=False) for name in names.split()]
 
 
 def _json(name: str, *, nullable: bool = True) -> sa.Column[Any]:

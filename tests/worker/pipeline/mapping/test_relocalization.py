@@ -13,7 +13,7 @@ from worker.cloud.types import Matrix4
 from worker.pipeline.mapping.relocalization import Relocalized, relocalize
 from worker.pipeline.mapping.tasks import ValidScan, Workspace, forget_loaded, lay_together
 from worker.pipeline.registration.preprocessing import PreparedScan, prepare
-from worker.pipeline.registration.settings import RegistrationSettings, with_values
+from worker.pipeline.registration.settings import RegistrationSettings
 from worker.processes import Processes
 from worker.simulation.scenes import random_room
 from worker.simulation.visits import visit
@@ -27,7 +27,7 @@ def work(room: Room, tmp_path: Path) -> Workspace:
     """Four scans of the room, prepared; what was loaded from another test's folder is forgotten."""
     forget_loaded()
     folder, _ = prepared_folder(tmp_path, dict(enumerate(room.before)))
-    settings = joint_settings(with_values(QUICK, search_resolutions=()))
+    settings = joint_settings(QUICK.with_values(search_resolutions=()))
     return Workspace(folder=folder, processes=Processes(None), settings=settings)
 
 

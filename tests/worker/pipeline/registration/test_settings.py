@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 from pydantic import ValidationError
 
-from worker.pipeline.registration.settings import RegistrationSettings, with_values
+from worker.pipeline.registration.settings import RegistrationSettings
 
 SETTINGS = RegistrationSettings()
 
@@ -15,18 +15,18 @@ def test_the_inlier_ratio_is_understood_under_its_own_and_under_the_apis_name() 
 
 
 def test_with_values_changes_what_is_named_and_nothing_else() -> None:
-    changed = with_values(SETTINGS, min_inlier_ratio=0.9, coarse_distances=(0.3,))
+    changed = SETTINGS.with_values(min_inlier_ratio=0.9, coarse_distances=(0.3,))
     assert (changed.min_inlier_ratio, changed.coarse_distances) == (0.9, (0.3,))
-    assert with_values(changed, min_inlier_ratio=0.8, coarse_distances=(0.6, 0.3, 0.1)) == SETTINGS
+    assert changed.with_values(min_inlier_ratio=0.8, coarse_distances=(0.6, 0.3, 0.1)) == SETTINGS
 
 
 @pytest.mark.parametrize("name", ["min_inlier_ration", "min_agreement"])
 def test_with_values_refuses_a_name_that_no_setting_has(name: str) -> None:
     """`model_copy` would accept it silently; so would validation an alias beside the name."""
     with pytest.raises(ValueError, match=f"RegistrationSettings has no setting named {name}"):
-        with_values(SETTINGS, **{name: 0.9})
+        SETTINGS.with_values(**{name: 0.9})
 
 
 def test_with_values_refuses_a_value_out_of_bounds() -> None:
     with pytest.raises(ValidationError, match="min_overlap"):
-        with_values(SETTINGS, min_overlap=1.5)
+        SETTINGS.with_values(min_overlap=1.5)
