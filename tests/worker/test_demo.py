@@ -19,7 +19,12 @@ from worker.demo.story import OFFICE, Story, edits, tell
 from worker.simulation.scenes import small_office
 from worker.simulation.truth import TileTruth
 
-MANIFEST = {"tile_origin": [0.0, 0.0, 0.0], "tile_size": [1.5, 1.5, 1.0], "n_tiles_grid": [7, 6, 3]}
+MANIFEST = {
+    "tile_origin": [0.0, 0.0, 0.0],
+    "tile_size": [1.5, 1.5, 1.0],
+    "n_tiles_grid": [7, 6, 3],
+    "tile_lowest_idx": [0, 0, 0],
+}
 
 
 @pytest.fixture(scope="module")

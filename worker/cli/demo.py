@@ -10,11 +10,6 @@ import typer
 from worker.cli import terminal
 
 
-def register(commands: typer.Typer) -> None:
-    """Add `demo` to the command line."""
-    commands.command("demo")(demo)
-
-
 def demo(
     out: Annotated[Path, typer.Option(help="Folder for scans, results and the service's data.")] = Path(
         "demo"

@@ -10,14 +10,10 @@ import typer
 from rich.table import Table
 
 from worker.cli import terminal
+from worker.cli.options import AsJson
 
 
-def register(commands: typer.Typer) -> None:
-    """Add `register` to the command line."""
-    commands.command("register")(register_files)
-
-
-def register_files(
+def register(
     reference: Annotated[Path, typer.Argument(help="PLY or PCD that sets the frame.")],
     current: Annotated[Path, typer.Argument(help="PLY or PCD to be placed in it.")],
     start: Annotated[
@@ -26,7 +22,7 @@ def register_files(
     truth: Annotated[
         Path | None, typer.Option(help="4x4 text file of the same kind: the error is given too.")
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Results as JSON on stdout.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Register CURRENT to REFERENCE as a survey is registered to a map."""
     # Not at the head of the file: Open3D takes a second, which `--help` need not wait for.
@@ -66,10 +62,7 @@ def register_files(
     if truth is not None:
         metres, radians = difference(np.loadtxt(truth), registration.map_from_scan)
         result["error"] = {"metres": metres, "degrees": float(np.degrees(radians))}
-    if as_json:
-        terminal.print_json(result)
-    else:
-        terminal.output().print(_table(result), highlight=False)
+    terminal.show(result, _table, as_json=as_json)
 
 
 def _table(result: dict[str, Any]) -> Table:

@@ -18,7 +18,7 @@ from worker.processes import default_processes, open_processes
 from worker.progress import Progress, no_progress
 from worker.simulation.scenes import BUILDINGS, BuildingKind, Scene, rigid
 from worker.simulation.sensor import SimulatedScan
-from worker.simulation.truth import TileTruth, true_changes
+from worker.simulation.truth import true_changes
 from worker.simulation.visits import edited, visit
 from worker.training.anomalies import OPERATIONS, Change
 from worker.training.dataset import Observation, TileSet, joined
@@ -73,11 +73,8 @@ class TrainingSetSettings(BaseModel):
 
     def kinds(self) -> list[BuildingKind]:
         """List the kind of every building, in the order of their seeds."""
-        counts: dict[BuildingKind, int] = {
-            "office": self.offices,
-            "corridor": self.corridors,
-            "room": self.rooms,
-        }
+        counts: dict[BuildingKind, int]
+        counts = {"office": self.offices, "corridor": self.corridors, "room": self.rooms}
         return [kind for kind, count in counts.items() for _ in range(count)]
 
 
@@ -185,8 +182,8 @@ def _truth(walk: _Walk, after: Scene, scans: Sequence[SimulatedScan]) -> tuple[B
         walk.scene, after, grid, map_from_world=walk.map_from_world, first=first, second=second
     )
     near = binary_dilation(exists.changed, np.ones((3, 3, 3), bool))
-    touched = TileTruth(grid=grid, cells=exists.cells, min_cells=1).of(indices)
-    beside: Bools = near[tuple(indices.T)] & ~touched
+    touched = exists.cells_of(indices).any(axis=1)
+    beside: Bools = near.ravel()[grid.cells(indices)] & ~touched
     return visible.of(indices), beside
 
 

@@ -85,7 +85,7 @@ def _groups(result: Document) -> Table:
     table = titled_table("changes found; false alarms", "tiles", *(row["name"] for row in methods))
     for by, title in TITLES.items():
         table.add_section()
-        table.add_row(f"[bold]{title}")
+        table.add_row(title, style="bold")
         for group in methods[0]["groups"][by]:
             cells = [_cell(row["groups"][by][group]) for row in methods]
             if any(cells):

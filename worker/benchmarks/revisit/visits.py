@@ -20,8 +20,8 @@ from worker.benchmarks.revisit.plan import RevisitSettings, SitePlan, VisitPlan
 from worker.benchmarks.timing import StageClock
 from worker.benchmarks.trajectory import PlacedScan, map_frame, placed_scans, scan_files
 from worker.cloud import npz
-from worker.cloud.tiling import TileGrid, TilePairs, pair_tiles
-from worker.cloud.types import Bools, Floats, Indices, Matrix4
+from worker.cloud.tiling import TilePairs, pair_tiles
+from worker.cloud.types import Bools, Floats, Matrix4
 from worker.pipeline.flow import BuiltMap, NoScanAccepted, build_map, locate_survey
 from worker.pipeline.registration.results import ScanFile, ScanResult
 from worker.progress import Progress, no_progress
@@ -208,25 +208,17 @@ def walk_again(
         first=[scan.true for scan in site.scans],
         second=[scan.true for scan in scans],
     )
-    index = tuple((indices - grid.lowest).T)
     return Revisit(
         name=plan.name,
         pairs=pairs,
-        cells=exists.cells[index],
-        in_sight=visible.cells[index],
-        outside=int((exists.changed & ~kept_tiles(grid, indices)).sum()),
+        cells=exists.cells_of(indices),
+        in_sight=visible.cells_of(indices),
+        outside=int(exists.changed.sum() - exists.of(indices).sum()),
         misalignment=residual_misalignments(site.scans, scans, grid, indices),
         sigma=stated_sigmas(scans, grid, indices),
         first=site.errors,
         second=ScanErrors.of(scans, len(taken)),
     )
-
-
-def kept_tiles(grid: TileGrid, indices: Indices) -> Bools:
-    """Mark the tiles of the grid that the map has: (I, J, K)"""
-    marked = np.zeros(grid.shape, dtype=np.bool_)
-    marked[tuple((indices - grid.lowest).T)] = True
-    return marked
 
 
 def _located(

@@ -42,13 +42,9 @@ def small_office(seed: int) -> Scene:
         draft.keep_clear((door - 0.1, edge), (door + DOOR + 0.1, edge + 1.0))
         _fit_out(draft, room, number)
     fittings.hang_lamps(draft, corridor, "lamps-corridor")
-    for kind in ("cabinet", "bin", "plant"):
-        pieces = {
-            "cabinet": furniture.cabinet(0.8, 0.35, 1.0),
-            "bin": furniture.bin_(),
-            "plant": furniture.plant(),
-        }
-        draft.against_wall(corridor, kind, pieces[kind])
+    draft.against_wall(corridor, "cabinet", furniture.cabinet(0.8, 0.35, 1.0))
+    draft.against_wall(corridor, "bin", furniture.bin_())
+    draft.against_wall(corridor, "plant", furniture.plant())
     return draft.finish(rooms=(*rooms, corridor), route=_round(rooms, doors, (south + north) / 2))
 
 

@@ -45,14 +45,14 @@ def pipe_along(room: Room, *, radius: float, inset: float, z: float) -> Mesh:
     return pipe.placed(rigid(x + inset, y + 0.02, z, roll=-90))
 
 
-def shell(draft: Draft, rooms: tuple[Room, ...], *, tag: str = "") -> None:
-    """Floor and ceiling slabs, under and over each room."""
+def shell(draft: Draft, rooms: tuple[Room, ...]) -> None:
+    """Put floor and ceiling slabs, under and over each room."""
     for number, room in enumerate(rooms, start=1):
         low = (room.low[0] - OUTER, room.low[1] - OUTER)
         high = (room.high[0] + OUTER, room.high[1] + OUTER)
-        draft.building(f"floor{tag}-{number}", block((*low, -SLAB), (*high, 0.0)))
+        draft.building(f"floor-{number}", block((*low, -SLAB), (*high, 0.0)))
         top = room.height + SLAB
-        draft.building(f"ceiling{tag}-{number}", block((*low, room.height), (*high, top)))
+        draft.building(f"ceiling-{number}", block((*low, room.height), (*high, top)))
 
 
 def niche_wall(

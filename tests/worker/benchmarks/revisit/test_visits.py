@@ -8,8 +8,7 @@ import numpy as np
 
 from worker.benchmarks.revisit import visits
 from worker.benchmarks.revisit.plan import RevisitSettings, plan_visits
-from worker.benchmarks.revisit.visits import kept_tiles, make_visits
-from worker.cloud.tiling import TileGrid
+from worker.benchmarks.revisit.visits import make_visits
 
 
 def test_poses_come_from_registration_and_are_near_the_truth(walked):
@@ -53,12 +52,6 @@ def test_visits_that_are_there_are_not_made_again(visits_folder: Path):
     settings = RevisitSettings(kinds=("room",), stops={"room": 3}, edits={"room": 3}, standing_s=2.0)
     _, made = make_visits(plan_visits(3, settings, first_seed=51), settings, visits_folder)
     assert made == 0
-
-
-def test_tiles_that_the_map_keeps_are_marked():
-    grid = TileGrid(origin=np.zeros(3), size=np.ones(3), shape=(2, 2, 1), lowest=(0, 0, 0))
-    kept = kept_tiles(grid, np.array([[0, 1, 0]], np.int32))
-    assert kept[..., 0].tolist() == [[False, True], [False, False]]
 
 
 def test_a_tile_is_changed_from_forty_cells_of_all_kinds_together(made_visit):
