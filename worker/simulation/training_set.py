@@ -236,12 +236,11 @@ def _injected(
     points: Points, tiles: Tiles, tile: int, settings: WalkSettings, rng: np.random.Generator
 ) -> Points:
     """Put a synthetic change into one tile of a scan (n, 3), map frame."""
-    grid = tiles.grid
-    lower = grid.lower(tiles.indices[tile])
-    inside = np.all((points >= lower) & (points < lower + grid.size), axis=1)
+    grid, index = tiles.grid, tiles.indices[[tile]]
+    inside = grid.locate(points) == grid.cells(index)
     if not inside.any():
         return points
-    centre, half = lower + grid.size / 2, (grid.size / 2 - MARGIN).astype(np.float32)
+    centre, half = grid.centers(index)[0], (grid.size / 2 - MARGIN).astype(np.float32)
     change = Change(magnitude=rng.uniform(*settings.magnitude), density=rng.uniform(*settings.density))
     operation = OPERATIONS[str(rng.choice(list(OPERATIONS)))]
     after = operation((points[inside] - centre).astype(np.float32), change, half, rng).points
@@ -260,7 +259,10 @@ def _tile_set(matched: TilePairs, observations: Sequence[Observation], settings:
     return TileSet(
         points_a=tuple(centred(points, tile) for tile, points in enumerate(tiles.points)),
         points_b=tuple(centred(points, tile) for tile, points in enumerate(matched.current)),
-        observations=tuple(replace(look, points=centred(look.points, look.tile)) for look in observations),
+        observations=tuple(
+            replace(observation, points=centred(observation.points, observation.tile))
+            for observation in observations
+        ),
         centres=centres,
         buildings=np.zeros(len(centres), np.int32),
         tile_size=settings.tiling.tile_size,

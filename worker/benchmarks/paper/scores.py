@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from worker.benchmarks.methods import CachedDetector, Method, TileScore, change_scores, encode_reference
 from worker.benchmarks.paper.experiments import Trial
-from worker.cloud.tiling import TilePairs, Tiles
+from worker.cloud.tiling import Tiles
 from worker.cloud.types import Bools, Floats
 
 UNCHANGED_A_TRIAL = 15  #: of the many that are rightly left alone; the others are drawn all
@@ -53,15 +53,11 @@ def scored_by_detector(name: str, cached: CachedDetector, trials: Sequence[Trial
 
 def scored_by_baseline(baseline: Method, trials: Sequence[Trial]) -> MethodScores:
     """Score every trial by a baseline; its seconds are the median."""
-    seconds: list[float] = []
-
-    def timed(pairs: TilePairs) -> TileScore:
+    scores, seconds = [], []
+    for trial in trials:
         begun = time.perf_counter()
-        scores = baseline.score(pairs)
+        scores.append(baseline.score(trial.pairs))
         seconds.append(time.perf_counter() - begun)
-        return scores
-
-    scores = [timed(trial.pairs) for trial in trials]
     return _method_scores(baseline.name, scores, trials, float(np.median(seconds)))
 
 

@@ -166,9 +166,7 @@ def _baseline(
         for scan, outcome in enumerate(run.built.outcomes)
         if outcome.registration
     }
-    true: list[Matrix4] = [
-        pose for pose in run.scenario.true if pose is not None
-    ]  # of all: none is out of place
+    true = [pose for pose in run.scenario.true if pose is not None]  # all: none is out of place
     compared = baseline.compare(theirs, ours, kept, true)
     return {
         **compared,

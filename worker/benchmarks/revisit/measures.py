@@ -119,9 +119,8 @@ class Measured:
     roc_area: float
     average_precision: float
     groups: Mapping[str, Mapping[str, Confusion]]  #: at the chosen threshold
-    alarms_on_slight: (
-        int  #: false alarms at the chosen threshold where something changed, but too little to count
-    )
+    #: false alarms at the chosen threshold where something changed, but too little to count
+    alarms_on_slight: int
     unchanged_visits: int
     unchanged_visits_with_alarm: int
     seconds: float  #: to score the test visits
