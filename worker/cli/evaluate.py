@@ -25,7 +25,7 @@ def bench(
     model: Model = DEFAULT_MODEL,
     model_store: ModelStore = MODEL_STORE,
 ) -> None:
-    """Seconds in each stage of a map and of a survey on a simulated corridor, and what scoring costs."""
+    """Measure seconds in each stage of a map and of a survey on a simulated corridor, and what scoring costs."""
     from worker.benchmarks import speed  # noqa: PLC0415
     from worker.benchmarks.documents import write_json  # noqa: PLC0415
 
@@ -158,7 +158,7 @@ def revisit(
     ] = Path("bench/revisit"),
     as_json: AsJson = False,
 ) -> None:
-    """Two independent visits, whole objects added, removed, moved between them: the model and what else there is.
+    """Compare two independent visits, whole objects added, removed, moved between them: by the model and what else there is.
 
     Simulating and registering the visits takes minutes and is done once: another model on the same visits takes one.
     """

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.table import Table
 
 from worker.cli import terminal
 from worker.cli.options import AsJson
+
+if TYPE_CHECKING:
+    from worker.pipeline.registration.results import RegistrationResult
 
 
 def register(
@@ -47,8 +50,17 @@ def register(
     registration = outcome.registration
     if registration is None:
         raise ScanRejected(str(outcome.reason))
+    result = document(registration, seconds)
+    if truth is not None:
+        metres, radians = difference(np.loadtxt(truth), registration.map_from_scan)
+        result["error"] = {"metres": metres, "degrees": float(np.degrees(radians))}
+    terminal.show(result, _table, as_json=as_json)
+
+
+def document(registration: RegistrationResult, seconds: float) -> dict[str, Any]:
+    """Return the registration, JSON-ready; metres and radians."""
     sigma = registration.uncertainty
-    result: dict[str, Any] = {
+    return {
         "reference_from_current": registration.map_from_scan.tolist(),
         "fitness": registration.fitness,
         "inlier_rmse": registration.inlier_rmse,
@@ -59,10 +71,6 @@ def register(
         "rotation_sigma": None if sigma is None else sigma.rotation,
         "seconds": seconds,
     }
-    if truth is not None:
-        metres, radians = difference(np.loadtxt(truth), registration.map_from_scan)
-        result["error"] = {"metres": metres, "degrees": float(np.degrees(radians))}
-    terminal.show(result, _table, as_json=as_json)
 
 
 def _table(result: dict[str, Any]) -> Table:

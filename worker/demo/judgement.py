@@ -75,7 +75,7 @@ def grid_of(manifest: dict[str, Any]) -> TileGrid:
 def judge(
     features: Sequence[dict[str, Any]], truth: TileTruth, edits: Sequence[tuple[str, TileTruth]]
 ) -> Judgement:
-    """Hold every feature of `/surveys/{id}/tiles` against the truth; `edits` names each edit with its own truth."""
+    """Compare every feature of `/surveys/{id}/tiles` with the truth; `edits` names each edit with its own truth."""
     tiles = [feature["properties"] for feature in features]
     indices = np.array([tile["tile_index"] for tile in tiles], np.int32).reshape(-1, 3)
     flagged = indices[[tile["state"] == "changed" for tile in tiles]]

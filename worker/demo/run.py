@@ -17,7 +17,7 @@ from rich.text import Text
 from service.client import Client, ClientError, Document
 from worker.demo.judgement import Judgement, grid_of, judge, placement_line, show_judgement
 from worker.demo.service import DemoFailed, ServiceChild
-from worker.demo.story import Story, tell
+from worker.demo.story import DemoSettings, Story, tell
 from worker.simulation.sensor import SimulatedScan
 
 MAP_ID = "office"
@@ -28,16 +28,6 @@ RESULTS = {
     "cloud": ("/surveys/{survey_id}/cloud.ply", "cloud.ply"),
     "picture": ("/surveys/{survey_id}/picture.png", "picture.png"),
 }
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class DemoSettings:
-    """How long the robot works."""
-
-    seed: int = 1
-    stops: tuple[int, int] = (22, 16)  #: scans of both visits; with fewer, rooms hang together by too little
-    duration_s: float = 5.0  #: seconds of standing at each
-    prior_error: tuple[float, float] = (0.1, 2.0)  #: sigma of the robot's odometry, metres and degrees
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -114,13 +104,7 @@ def _through_the_service(
     child: ServiceChild, out: Path, settings: DemoSettings, progress: Progress
 ) -> tuple[DemoResult, Story]:
     with _step(progress, "simulate two visits to an office"):
-        story = tell(
-            seed=settings.seed,
-            stops=settings.stops,
-            duration_s=settings.duration_s,
-            prior_error=settings.prior_error,
-            folder=out / "demo-scans",
-        )
+        story = tell(settings, folder=out / "demo-scans")
     with _step(progress, "start the service"):
         url = child.await_ready()["url"]
     with Client(url) as client:

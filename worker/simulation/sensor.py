@@ -48,7 +48,6 @@ class SimulatedScan:
 
     points: Points  #: (N, 3) float32, metres, sensor frame: x ahead, y left, z up
     object_ids: NDArray[np.int32]  #: (N,) object that the middle of the beam met
-    origin: Floats  #: (3,) where the rays start, sensor frame: 0
     world_from_sensor: Matrix4  #: (4, 4) the true pose
     #: (4, 4) world_from_sensor as the robot believes it; the true pose unless a visit drifts it
     prior: Matrix4
@@ -100,7 +99,6 @@ def scan(
     return SimulatedScan(
         points=(reported[kept] * noisy[kept, None]).astype(np.float32),
         object_ids=hit.object_ids[:count][kept],
-        origin=np.zeros(3),
         world_from_sensor=world_from_sensor,
         prior=world_from_sensor,
     )

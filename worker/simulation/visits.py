@@ -136,7 +136,7 @@ def _off_by(pose: Matrix4, shift: Floats, *, yaw: float) -> Matrix4:
 
 
 def _free_place(scene: Scene, wanted: Floats, rng: np.random.Generator) -> Floats:
-    """The first random place (x, y) near the wanted one with room for a robot, looking ever farther away."""
+    """Return the first random place (x, y) near the wanted one with room for a robot, looking ever farther away."""
     for reach in np.linspace(0.2, 1.5, 60):
         place: Floats = wanted + rng.uniform(-reach, reach, 2)
         if _has_room(scene, place):

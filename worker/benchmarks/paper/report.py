@@ -18,6 +18,7 @@ from worker.benchmarks.paper.benchmark import MethodResult, PaperResult
 from worker.benchmarks.paper.experiments import published
 from worker.benchmarks.paper.figures import pictures
 from worker.benchmarks.paper.robustness import chosen_trials
+from worker.benchmarks.paper.site import Site
 from worker.benchmarks.plots import png
 from worker.metrics import pooled, precision_recall, roc
 from worker.simulation.scenes import ChangeKind
@@ -46,15 +47,8 @@ def document(result: PaperResult) -> Document:
             "validation_seed": settings.validation_seed,
             "everywhere": settings.everywhere,
         },
-        "map": {
-            "scans": len(result.site.scans),
-            "tiles": len(result.site.tiles.points),
-            "points": len(result.site.points),
-        },
-        "validation_map": {
-            "scans": len(result.validation.scans),
-            "tiles": len(result.validation.tiles.points),
-        },
+        "map": {**_map(result.site), "points": len(result.site.points)},
+        "validation_map": _map(result.validation),
         "thresholds": {
             "validation": result.detector.threshold,
             "test": result.detector.test_threshold,
@@ -74,6 +68,10 @@ def document(result: PaperResult) -> Document:
         "seconds": round(result.seconds, 1),
         "machine": result.machine,
     }
+
+
+def _map(site: Site) -> Document:
+    return {"scans": len(site.scans), "tiles": len(site.tiles.points)}
 
 
 def _experiments(result: PaperResult) -> list[Document]:
@@ -109,16 +107,11 @@ def _method(method: MethodResult, ours: bool) -> Document:
 
 def _kind(result: PaperResult, kind: ChangeKind) -> Document:
     """Return the F1 of every method, micro-aggregated over the experiments of one operation."""
+    tests = [test for test, trial in enumerate(result.trials) if trial.experiment.operation == kind]
     rows = {}
     for method in result.methods:
-        chosen, best = (
-            pooled(
-                counts
-                for counts, trial in zip(method.counts(threshold), result.trials, strict=True)
-                if trial.experiment.operation == kind
-            )
-            for threshold in _both(method)
-        )
+        ways = (method.counts(threshold) for threshold in _both(method))
+        chosen, best = (pooled(counts[test] for test in tests) for counts in ways)
         rows[method.test.name] = {"f1": _known(chosen.f1), "f1_at_test_threshold": _known(best.f1)}
     return rows
 

@@ -79,8 +79,6 @@ class Embedding:
     places: Floats  #: (P, 2)
     explained: tuple[float, float]  #: share of the variance along each
     outcomes: NDArray[np.str_]  #: (P,) TP, FP, FN or TN
-    distances: Floats  #: (P,) between both descriptors
-    scores: Floats  #: (P,)
 
 
 def embed(
@@ -91,7 +89,7 @@ def embed(
     if known is None:
         return None
     rng = np.random.default_rng(SEED)
-    vectors, outcomes, distances, scores = [], [], [], []
+    vectors, outcomes = [], []
     for trial, score in zip(trials, method.scores, strict=True):
         outcome = outcomes_of(score, trial.truth, threshold)
         chosen = _chosen(outcome, trial.pairs.observed, rng)
@@ -101,17 +99,9 @@ def embed(
         current = Tiles(grid=pair.reference.grid, indices=pair.reference.indices, points=pair.current)
         reference, now = known[chosen], encode_reference(cached.detector, current)["descriptors"]
         vectors.append(np.hstack([np.abs(reference - now), reference * now]))
-        distances.append(np.linalg.norm(reference - now, axis=1))
         outcomes.append(outcome[chosen])
-        scores.append(score[chosen])
     places, explained = principal(np.concatenate(vectors))
-    return Embedding(
-        places=places,
-        explained=explained,
-        outcomes=np.concatenate(outcomes),
-        distances=np.concatenate(distances),
-        scores=np.concatenate(scores),
-    )
+    return Embedding(places=places, explained=explained, outcomes=np.concatenate(outcomes))
 
 
 def outcomes_of(scores: Floats, truth: NDArray[np.bool_], threshold: float) -> NDArray[np.str_]:

@@ -49,11 +49,9 @@ class BaselineSettings:
 class BaselineEdge:
     """A pair that was accepted."""
 
-    pair: tuple[int, int]  #: i, j: indices of the files, i < j
+    pair: Pair
     i_from_j: Matrix4  #: (4, 4)
     information: Floats  #: (6, 6), as Open3D weighs edges
-    fitness: float
-    inlier_rmse: float  #: metres
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
@@ -157,13 +155,7 @@ def _edge(
     if result.fitness <= MIN_FITNESS or result.inlier_rmse >= MAX_RMSE:
         return None
     information = _registration.get_information_matrix_from_point_clouds(source, target, distances[-1], pose)
-    return BaselineEdge(
-        pair=pair,
-        i_from_j=np.asarray(pose),
-        information=np.asarray(information),
-        fitness=result.fitness,
-        inlier_rmse=result.inlier_rmse,
-    )
+    return BaselineEdge(pair=pair, i_from_j=np.asarray(pose), information=np.asarray(information))
 
 
 def _fused(files: Sequence[ScanFile], poses: dict[int, Matrix4]) -> int:
@@ -262,7 +254,7 @@ def _apart(differences: Sequence[tuple[float, float]]) -> Document:
 
 
 def _to_the_truth(poses: Poses, true: Sequence[Matrix4]) -> Document:
-    """Hold a map against the truth as the table of our own map does; centimetres and degrees."""
+    """Compare a map with the truth as the table of our own map does; centimetres and degrees."""
     frame = align(list(poses.values()), [true[scan] for scan in poses])
     off = [difference(true[scan], frame @ pose) for scan, pose in poses.items()]
     return {"wrong": sum(metres > WRONG for metres, _ in off), **pose_spread(off, "median", "worst")}

@@ -195,27 +195,25 @@ def time_survey(
         folder=folder,
         name="survey",
     )
-    path = folder / "survey.pcd"
     map_from_true = inverse(true_from_map)
     surface, prior = reference.surface(), map_from_true @ simulated.prior
-    reading, registering, processor = [], [], []
+    seconds = []
     for _ in range(REPEATS + 1):
         begun, used = time.perf_counter(), time.process_time()
-        scan = read_scan(path)
+        scan = read_scan(folder / "survey.pcd")
         read = time.perf_counter()
         hypothesis = register(prepare(scan, settings), surface, prior=prior, settings=settings)
-        reading.append(read - begun)
-        registering.append(time.perf_counter() - read)
-        processor.append(time.process_time() - used)
+        seconds.append((read - begun, time.perf_counter() - read, time.process_time() - used))
+    reading, registering, processor = np.array(seconds[1:]).T
     metres, radians = difference(map_from_true @ simulated.world_from_sensor, hypothesis.target_from_source)
     return {
         "points": len(scan.points),
         "map_points": len(reference.points),
-        "read_seconds": float(np.median(reading[1:])),
-        "register_seconds": float(np.median(registering[1:])),
-        "register_least": min(registering[1:]),
-        "register_most": max(registering[1:]),
-        "processor_seconds": float(np.median(processor[1:])),
+        "read_seconds": float(np.median(reading)),
+        "register_seconds": float(np.median(registering)),
+        "register_least": float(registering.min()),
+        "register_most": float(registering.max()),
+        "processor_seconds": float(np.median(processor)),
         "centimetres": 100 * metres,
         "degrees": float(np.degrees(radians)),
     }

@@ -113,7 +113,7 @@ class MappedSite:
 def make_visits(
     plans: Sequence[VisitPlan], settings: RevisitSettings, folder: Path, progress: Progress = no_progress
 ) -> tuple[Path, int]:
-    """See to it that the folder has every visit; return where it lies, and how many had to be made.
+    """Make the visits that the folder lacks; return where it lies, and how many had to be made.
 
     Visits made with other settings lie beside them under another name. A map is built anew where a visit to it is
     missing. Raises MapFailed, and OSError for the folder.
