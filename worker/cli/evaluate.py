@@ -47,10 +47,10 @@ def registration(
     scans: Annotated[int, typer.Option(min=2, help="Stops of the walk.")] = 42,
     foreign: Annotated[int, typer.Option(min=1, max=17, help="Out-of-place scans, of another building.")] = 5,
     standing: Annotated[float, typer.Option(min=0.1, help="Seconds at each stop.")] = 5.0,
-    plain: Annotated[
+    baseline: Annotated[
         bool, typer.Option("--plain", help="Also the baseline: all pairs in one process with Open3D's ICP.")
     ] = False,
-    plain_pairs: Annotated[
+    baseline_pairs: Annotated[
         int | None,
         typer.Option("--plain-pairs", min=1, help="So many random pairs, the rest of the time extrapolated."),
     ] = None,
@@ -72,8 +72,8 @@ def registration(
         walk=WalkSettings(building=building, scans=scans, foreign=foreign, duration_s=standing),
         seeds=_numbers(seeds),
         kinds=kinds_named(scenarios),
-        plain=plain or plain_pairs is not None,
-        plain_pairs=plain_pairs,
+        baseline=baseline or baseline_pairs is not None,
+        baseline_pairs=baseline_pairs,
         survey=survey,
         real=real,
         out=out,

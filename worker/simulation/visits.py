@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 
@@ -21,12 +21,8 @@ DRIFT = (0.25, 4.0)
 DRAWS, NEXT_DRAW = 20, 100_000_000
 
 
-class Drift(Protocol):
-    """How a belief about a pose comes to be off: the pose, how far (metres, degrees), the random numbers."""
-
-    def __call__(
-        self, world_from_sensor: Matrix4, error: tuple[float, float], rng: np.random.Generator
-    ) -> Matrix4: ...
+#: How a belief about a pose comes to be off: from the pose, how far (metres, degrees), and random numbers.
+Drift = Callable[[Matrix4, tuple[float, float], np.random.Generator], Matrix4]
 
 
 def stops(scene: Scene, count: int, *, seed: int) -> tuple[Matrix4, ...]:
