@@ -122,7 +122,10 @@ class M3c2:
         return "M3C2"
 
     def score(self, pairs: TilePairs) -> Floats:
-        """Return the share of each tile's core points that changed. Raises ModuleNotFoundError where py4dgeo is not installed."""
+        """Return the share of each tile's core points that changed.
+
+        Raises ModuleNotFoundError where py4dgeo is not installed.
+        """
         reference = np.concatenate(pairs.reference.points).astype(np.float64)
         current = np.concatenate(pairs.current).astype(np.float64)
         tile = np.repeat(np.arange(len(pairs.current)), [len(part) for part in pairs.reference.points])

@@ -40,9 +40,10 @@ def out_of_place(card: Card) -> list[str]:
 
 
 def paper_figures(document: Figures, sha256: str) -> Figures:
-    """Return the figures of `evaluate paper`, at the threshold that was chosen on another corridor unless the name says otherwise.
+    """Return the figures of `evaluate paper`, JSON-ready.
 
-    Raises KeyError, and ValueError for other weights or a part of the experiments.
+    They are at the threshold that was chosen on another corridor, unless the name says otherwise. Raises
+    KeyError, and ValueError for other weights or a part of the experiments.
     """
     if document["sha256"] != sha256:
         raise ValueError(f"measured with weights {document['sha256']}, and not with the card's {sha256}")
@@ -71,9 +72,10 @@ def paper_figures(document: Figures, sha256: str) -> Figures:
 
 
 def revisit_figures(document: Figures, sha256: str) -> Figures:
-    """Return the figures of `evaluate revisit`, at the threshold chosen on other buildings unless the name says otherwise.
+    """Return the figures of `evaluate revisit`, JSON-ready.
 
-    Raises KeyError, and ValueError where no method had these weights.
+    They are at the threshold that was chosen on other buildings, unless the name says otherwise. Raises KeyError,
+    and ValueError where no method had these weights.
     """
     measured = [row["sha256"] for row in document["methods"] if row["sha256"] is not None]
     if sha256 not in measured:

@@ -158,7 +158,7 @@ def revisit(
     ] = Path("bench/revisit"),
     as_json: AsJson = False,
 ) -> None:
-    """Compare two independent visits, whole objects added, removed, moved between them: by the model and what else there is.
+    """Compare two independent visits, whole objects added, removed, moved between them, by the model and baselines.
 
     Simulating and registering the visits takes minutes and is done once: another model on the same visits takes one.
     """

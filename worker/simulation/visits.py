@@ -20,7 +20,6 @@ DRIFT = (0.25, 4.0)
 #: Draws of edits, and what lies between the seeds of two: no visit's is as high.
 DRAWS, NEXT_DRAW = 20, 100_000_000
 
-
 #: How a belief about a pose comes to be off: from the pose, how far (metres, degrees), and random numbers.
 Drift = Callable[[Matrix4, tuple[float, float], np.random.Generator], Matrix4]
 

@@ -86,7 +86,7 @@ def niche_wall(
 
 
 def openings(rng: np.random.Generator, length: float) -> tuple[tuple[float, float], ...]:
-    """Choose where doors are along a wall, about one in 4 m, none in the last metre of either end; metres, (from, to)."""
+    """Choose the doors of a wall, about one in 4 m, none in the last metre of either end; metres, (from, to)."""
     count = int(length // 4)
     spans = [(number * length / count, (number + 1) * length / count) for number in range(count)]
     firsts = [float(rng.uniform(low + 1.0, high - 1.0 - DOOR)) for low, high in spans]

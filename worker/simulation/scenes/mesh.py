@@ -35,7 +35,7 @@ class Mesh:
 def rigid(
     x: float = 0.0, y: float = 0.0, z: float = 0.0, *, yaw: float = 0.0, pitch: float = 0.0, roll: float = 0.0
 ) -> Matrix4:
-    """Return target_from_source (4, 4): roll about x, then pitch about y, then yaw about z (degrees), then the shift."""
+    """Return target_from_source (4, 4): roll about x, pitch about y, yaw about z (degrees), then the shift."""
     angles = np.radians([roll, pitch, yaw])
     (cr, cp, cy), (sr, sp, sy) = np.cos(angles), np.sin(angles)
     target_from_source = np.eye(4)

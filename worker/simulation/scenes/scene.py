@@ -121,7 +121,7 @@ class Scene:
     def shifted(
         self, name: str, *, dx: float = 0.0, dy: float = 0.0, yaw: float = 0.0
     ) -> tuple[Scene, Change]:
-        """Move a solid as `moved`: turned by `yaw` degrees about the vertical through the middle of its box, then shifted."""
+        """Move a solid: turn it by `yaw` degrees about the vertical through the middle of its box, then shift it."""
         x, y, _ = self[name].mesh.bounds.mean(axis=0)
         return self.moved(name, rigid(x + dx, y + dy, yaw=yaw) @ rigid(-x, -y))
 
