@@ -1,7 +1,7 @@
 """What users would do without a network: distances between the two clouds, one score a tile, no training.
 
 Distances are taken between the whole clouds, not tile by tile, so that the border of a tile is no change. A
-tile that was not observed gets NaN. Scores are in metres or shares; each has a threshold of its own.
+tile that was not observed gets NaN, a higher score is more change. Scores are in metres or shares; each has a threshold of its own.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 from dataclasses import dataclass, field
 from importlib.util import find_spec
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,19 +30,6 @@ from worker.threads import query_threads
 
 FAR = 0.10  #: metres; two voxels of the fused maps
 NORMAL_RADIUS, NORMAL_NEIGHBORS = 0.15, 30  #: metres; of the plane that M3C2-approx puts through a point
-
-
-class Baseline(Protocol):
-    """A method that needs no training."""
-
-    @property
-    def name(self) -> str:
-        """As tables call it."""
-        ...
-
-    def score(self, pairs: TilePairs) -> Floats:
-        """(T,) the higher the more changed; NaN where the tile was not observed."""
-        ...
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -96,8 +83,8 @@ class M3c2Approximation:
 
     def _normals(self, reference: Tiles, points: Points) -> Normals:
         if self._known is None or self._known[0] is not reference:
-            found = estimate_normals(points, radius=NORMAL_RADIUS, max_neighbors=NORMAL_NEIGHBORS)
-            self._known = (reference, found)
+            normals = estimate_normals(points, radius=NORMAL_RADIUS, max_neighbors=NORMAL_NEIGHBORS)
+            self._known = (reference, normals)
         return self._known[1]
 
 
@@ -109,7 +96,7 @@ PACKAGE = "py4dgeo"
 
 
 def m3c2_is_installed() -> bool:
-    """Whether `M3c2` can be used."""
+    """Tell whether `M3c2` can be used."""
     return find_spec(PACKAGE) is not None
 
 
@@ -118,7 +105,8 @@ class M3c2:
     """Signed distances along local normals, each with its level of detection.
 
     The score of a tile is the share of its core points that changed: those whose distance is significant at
-    95%, and those with points of one cloud only in their cylinder, for something is gone. Core points are every `every`th of the reference.
+    95%, and those with points of one cloud only in their cylinder, for something is gone. Core points are every
+    `every`th of the reference.
     """
 
     every: int = 4
@@ -134,7 +122,10 @@ class M3c2:
         return "M3C2"
 
     def score(self, pairs: TilePairs) -> Floats:
-        """Raises ModuleNotFoundError where py4dgeo is not installed."""
+        """Return the share of each tile's core points that changed.
+
+        Raises ModuleNotFoundError where py4dgeo is not installed.
+        """
         reference = np.concatenate(pairs.reference.points).astype(np.float64)
         current = np.concatenate(pairs.current).astype(np.float64)
         tile = np.repeat(np.arange(len(pairs.current)), [len(part) for part in pairs.reference.points])
@@ -161,7 +152,7 @@ class M3c2:
 
 
 def _library() -> Any:
-    """py4dgeo, kept from writing to stdout and from leaving a log file in the working folder."""
+    """Import py4dgeo, kept from writing to stdout and from leaving a log file in the working folder."""
     import py4dgeo  # noqa: PLC0415 (optional, and three seconds to import)
 
     logger = logging.getLogger(PACKAGE)
@@ -170,6 +161,9 @@ def _library() -> Any:
         logger.removeHandler(handler)
     logger.setLevel(logging.ERROR)
     return py4dgeo
+
+
+Baseline = CloudToCloud | M3c2Approximation | M3c2
 
 
 def installed_baselines() -> tuple[Baseline, ...]:

@@ -34,15 +34,16 @@ def record_figures(model_store: Path, model: str, files: Mapping[str, Path]) -> 
 
 
 def out_of_place(card: Card) -> list[str]:
-    """The benchmarks whose figures on this card were measured with other weights than it vouches for."""
+    """Return the benchmarks whose figures on this card were measured with other weights than it vouches for."""
     measured = {name: card.evaluation[name] for name in SECTIONS if name in card.evaluation}
     return [name for name, section in measured.items() if section.get("sha256") != card.sha256]
 
 
 def paper_figures(document: Figures, sha256: str) -> Figures:
-    """Of `evaluate paper`, at the threshold that was chosen on another corridor unless the name says otherwise.
+    """Return the figures of `evaluate paper`, JSON-ready.
 
-    Raises KeyError, and ValueError for other weights or a part of the experiments.
+    They are at the threshold that was chosen on another corridor, unless the name says otherwise. Raises
+    KeyError, and ValueError for other weights or a part of the experiments.
     """
     if document["sha256"] != sha256:
         raise ValueError(f"measured with weights {document['sha256']}, and not with the card's {sha256}")
@@ -71,9 +72,10 @@ def paper_figures(document: Figures, sha256: str) -> Figures:
 
 
 def revisit_figures(document: Figures, sha256: str) -> Figures:
-    """Of `evaluate revisit`, at the threshold chosen on other buildings unless the name says otherwise.
+    """Return the figures of `evaluate revisit`, JSON-ready.
 
-    Raises KeyError, and ValueError where no method had these weights.
+    They are at the threshold that was chosen on other buildings, unless the name says otherwise. Raises KeyError,
+    and ValueError where no method had these weights.
     """
     measured = [row["sha256"] for row in document["methods"] if row["sha256"] is not None]
     if sha256 not in measured:
@@ -116,7 +118,7 @@ def _operating(row: Figures, threshold: float | None = None) -> Figures:
 
 
 def _quiet(experiments: list[Figures]) -> Figures:
-    """False positives of the experiment without a change, at both thresholds."""
+    """Return the false positives of the experiment without a change, at both thresholds."""
     row = next(row for row in experiments if row["operation"] is None)
     return {
         "validation_threshold": row["false_positives"],
@@ -125,7 +127,7 @@ def _quiet(experiments: list[Figures]) -> Figures:
 
 
 def _visited(row: Figures) -> Figures:
-    """What stands beside each other of every method of the revisits."""
+    """Return what stands side by side for every method of the revisits."""
     return {
         **_picked(row["chosen"], ("threshold", *RATIOS, "false_positive_rate", "f1_interval")),
         **_picked(row, (*AREAS, "unchanged_visits", "unchanged_visits_with_false_alarm")),

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,6 +15,7 @@ from worker import files
 from worker.cloud.types import Floats
 
 Document = dict[str, Any]  #: JSON-ready
+Name = TypeVar("Name", bound=str)
 
 STATISTICS: Mapping[str, Callable[[Floats], Any]] = {
     "median": np.median,
@@ -32,9 +33,7 @@ def spread(values: ArrayLike, *names: str, digits: int | None = None) -> dict[st
     if not len(known):
         return None
     statistics = {name: float(STATISTICS[name](known)) for name in names}
-    return (
-        statistics if digits is None else {name: round(value, digits) for name, value in statistics.items()}
-    )
+    return {name: value if digits is None else round(value, digits) for name, value in statistics.items()}
 
 
 def pose_spread(errors: Sequence[tuple[float, float]], *names: str) -> Document:
@@ -55,14 +54,29 @@ def write_bytes(path: Path, content: bytes) -> None:
     files.write_bytes(path, content)
 
 
-def titled_table(title: str, *columns: str) -> Table:
+def titled_table(
+    title: str, columns: Sequence[str], rows: Iterable[Sequence[str]] = (), *, caption: str | None = None
+) -> Table:
     """Make a table for a terminal, numbers to the right of the first column; no columns, no head."""
-    table = Table(title=title, title_justify="left", title_style="bold", show_header=bool(columns))
+    table = Table(
+        title=title, title_justify="left", title_style="bold", show_header=bool(columns), caption=caption
+    )
     for number, column in enumerate(columns):
         table.add_column(column, justify="right" if number else "left")
+    for row in rows:
+        table.add_row(*row)
     return table
 
 
-def shown(value: float | None, form: str, *, missing: str = "") -> str:
-    """Write a figure in a format, as in `.2f`; `missing` where there is none."""
-    return missing if value is None else format(value, form)
+def names_among(words: str, known: Sequence[Name], what: str) -> tuple[Name, ...]:
+    """Read a list of names with commas, in the order given. Raises ValueError for a name that is not known."""
+    names = [word.strip() for word in words.split(",")]
+    unknown = [name for name in names if name not in known]
+    if unknown:
+        raise ValueError(f"no {what} {', '.join(unknown)}; there are {', '.join(known)}")
+    return tuple(known[known.index(name)] for name in names)
+
+
+def shown(value: float | None, form: str, *, unit: str = "", missing: str = "") -> str:
+    """Write a figure in a format, as in `.2f`, and its unit; `missing` where there is none."""
+    return missing if value is None else format(value, form) + unit

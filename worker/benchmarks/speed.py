@@ -68,7 +68,7 @@ def bench(settings: BenchSettings, progress: Progress = no_progress) -> Document
         first, second = (_visit(settings, number, folder) for number in range(2))
         clock = StageClock(progress)
         built = build_map(scan_files(first), settings=pipeline, progress=clock)
-        clock("describe", 0.0)
+        clock("encode", 0.0)
         embedding = encode_reference(detector, built.tiles)
         map_seconds = clock.seconds()
         frame = map_frame(built.outcomes, first)
@@ -94,11 +94,7 @@ def bench(settings: BenchSettings, progress: Progress = no_progress) -> Document
             "tiles": len(built.tiles.points),
         },
         "map": map_seconds,
-        "map_poses": {
-            "accepted": len(errors),
-            "of": len(first),
-            **pose_spread(errors, "median", "most"),
-        },
+        "map_poses": {"accepted": len(errors), "of": len(first), **pose_spread(errors, "median", "most")},
         "survey_with_prior": with_prior,
         "survey_without_prior": without,
         "network": scoring,
@@ -199,15 +195,13 @@ def tables(figures: Document) -> Group:
     """Show the seconds of each stage and each way of scoring on a terminal."""
     scene, poses = figures["scene"], figures["map_poses"]
     title = f"{scene['scans']} scans of {scene['points_per_scan']:,} points, {scene['tiles']} tiles"
-    stages = titled_table(title, "seconds of a stage", "map", "survey, drifted prior", "survey, no prior")
+    head = ("seconds of a stage", "map", "survey, drifted prior", "survey, no prior")
     columns = [figures["map"], figures["survey_with_prior"], figures["survey_without_prior"]]
-    names = dict.fromkeys(
-        name for column in columns for name, value in column.items() if isinstance(value, float)
-    )
-    for name in [*(name for name in names if name != "total"), "total"]:
-        stages.add_row(name, *(shown(column.get(name), ".2f") for column in columns))
+    names = {name: None for column in columns for name, value in column.items() if isinstance(value, float)}
+    order = [*(name for name in names if name != "total"), "total"]
+    rows = ((name, *(shown(column.get(name), ".2f") for column in columns)) for name in order)
     return Group(
-        stages,
+        titled_table(title, head, rows),
         _scoring_table(figures["network"]),
         f"scans placed: {poses['accepted']} of {poses['of']}, off by {poses['centimetres']['median']:.1f} cm "
         f"(most {poses['centimetres']['most']:.1f}) and {poses['degrees']['median']:.2f} degrees "
@@ -218,12 +212,18 @@ def tables(figures: Document) -> Group:
 
 def _scoring_table(scoring: Document) -> Table:
     title = f"{scoring['tiles']} tiles, {scoring['distinct_points_per_tile']} distinct points each"
-    table = titled_table(title, "scoring", "seconds (median)", "least to most", "times C2C")
     names = {"c2c": "C2C by k-d tree", "uncached": "detector", "cached": "detector, map encoded before"}
-    for name, seconds in scoring["seconds"].items():
-        least_to_most = f"{seconds['least']:.2f} to {seconds['most']:.2f}"
-        ratio = f"{scoring['times_c2c'][name]:.1f}"
-        table.add_row(names[name], f"{seconds['median']:.2f}", least_to_most, ratio)
-    difference = scoring["largest_score_difference"]
-    table.caption = f"largest difference between the detector's scores: {difference:.1e}"
-    return table
+    rows = (
+        (
+            names[name],
+            f"{seconds['median']:.2f}",
+            f"{seconds['least']:.2f} to {seconds['most']:.2f}",
+            f"{scoring['times_c2c'][name]:.1f}",
+        )
+        for name, seconds in scoring["seconds"].items()
+    )
+    difference = (
+        f"largest difference between the detector's scores: {scoring['largest_score_difference']:.1e}"
+    )
+    head = ("scoring", "seconds (median)", "least to most", "times C2C")
+    return titled_table(title, head, rows, caption=difference)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +12,12 @@ import typer
 PLACES = ("out", "model_store", "as_json")
 
 
-def command_line(context: typer.Context, *, without: Collection[str] = PLACES) -> str:
+def command_line(context: typer.Context) -> str:
     """Return the command with every option that differs from its default, also one that the environment set."""
     words = [context.command_path]
     for option in context.command.params:
         value = context.params.get(str(option.name))
-        if option.name in context.params and option.name not in without and value != option.default:
+        if option.name in context.params and option.name not in PLACES and value != option.default:
             words += _spelled(option, value)
     return " ".join(words)
 

@@ -10,11 +10,6 @@ import typer
 from worker.cli import terminal
 
 
-def register(commands: typer.Typer) -> None:
-    """Add `demo` to the command line."""
-    commands.command("demo")(demo)
-
-
 def demo(
     out: Annotated[Path, typer.Option(help="Folder for scans, results and the service's data.")] = Path(
         "demo"
@@ -23,6 +18,7 @@ def demo(
 ) -> None:
     """Simulate two visits to a small building, run the whole service on them, and show what it found."""
     # Not at the head of the file: Open3D takes a second, which `--help` need not wait for.
-    from worker.demo.run import DemoSettings, run  # noqa: PLC0415
+    from worker.demo.run import run  # noqa: PLC0415
+    from worker.demo.story import DemoSettings  # noqa: PLC0415
 
     run(out, DemoSettings(seed=seed), out_console=terminal.output(), err_console=terminal.messages())

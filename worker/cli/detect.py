@@ -3,21 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import typer
 from rich.console import Group
 from rich.table import Table
 
 from worker.cli import terminal
+from worker.cli.options import DEFAULT_MODEL, AsJson, Device, Model, ModelStore
 from worker.detectors.card import MODEL_STORE
 
 MOST_ROWS = 20  #: changed tiles in the table; the file has all
-
-
-def register(commands: typer.Typer) -> None:
-    """Add `detect` to the command line."""
-    commands.command("detect")(detect)
 
 
 def detect(
@@ -29,17 +25,13 @@ def detect(
     out: Annotated[Path, typer.Option(help="Folder for tiles.geojson, cloud.ply and picture.png.")] = Path(
         "changes"
     ),
-    model: Annotated[str, typer.Option(envvar="SPICD_MODEL", help="name/version")] = "spicd-net/1",
-    model_store: Annotated[
-        Path, typer.Option("--model-store", envvar="SPICD_MODEL_STORE", help="Folder of the models.")
-    ] = MODEL_STORE,
+    model: Model = DEFAULT_MODEL,
+    model_store: ModelStore = MODEL_STORE,
     threshold: Annotated[
         float | None, typer.Option(min=0, max=1, help="Probability of change; left out: the model's own.")
     ] = None,
-    device: Annotated[Literal["auto", "cpu", "cuda"], typer.Option(envvar="SPICD_DEVICE")] = "auto",
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Results as JSON on stdout, nothing else there.")
-    ] = False,
+    device: Device = "auto",
+    as_json: AsJson = False,
 ) -> None:
     """Say what changed between the earlier and the later files, with no service at all."""
     # Not at the head of the file: torch, Open3D and Matplotlib take seconds, which `--help` need not wait for.
@@ -53,19 +45,11 @@ def detect(
         )
         progress("writing", 0.0)
         files = write_results(visits, out, map_id=reference.name, survey_id=current[0].name, model=model)
-    result = document(visits, files, model=model)
-    if as_json:
-        terminal.print_json(result)
-    else:
-        _show(result)
+    terminal.show(document(visits, files, model=model), summary, as_json=as_json)
 
 
-def _show(result: dict[str, Any]) -> None:
-    # Names of files are printed as they are, brackets and all.
-    terminal.output().print(_summary(result), highlight=False, markup=False)
-
-
-def _summary(result: dict[str, Any]) -> Group:
+def summary(result: dict[str, Any]) -> Group:
+    """Show the scans, the changed tiles most certain first, and the files."""
     counts = ", ".join(f"{count} {state}" for state, count in result["counts"].items())
     changed = result["changed"]
     return Group(

@@ -1,4 +1,4 @@
-"""`spicd-worker evaluate`: the benchmarks, each a command of its own, and one that puts their figures on a card.
+"""`spicd-worker bench` and `evaluate`: the benchmarks, and a command that puts their figures on a card.
 
 What a command needs of the benchmarks is imported within it: torch, Open3D and Matplotlib take seconds, which `--help`
 need not wait for.
@@ -18,14 +18,22 @@ from worker.cli.options import DEFAULT_MODEL, AsJson, Model, ModelStore
 from worker.detectors.card import MODEL_STORE
 
 
-def register(commands: typer.Typer) -> None:
-    """Add `evaluate` and its commands to the command line."""
-    group = typer.Typer(
-        name="evaluate", no_args_is_help=True, help="How good it is, measured where the truth is known."
-    )
-    for command in (registration, paper, revisit, record):
-        group.command(command.__name__)(command)
-    commands.add_typer(group)
+def bench(
+    out: Annotated[Path, typer.Option(help="Where the figures are saved.")] = Path("bench/bench.json"),
+    scans: Annotated[int, typer.Option(min=2, help="Of the simulated corridor's map.")] = 25,
+    repeats: Annotated[int, typer.Option(min=1, help="Of each way of scoring.")] = 3,
+    model: Model = DEFAULT_MODEL,
+    model_store: ModelStore = MODEL_STORE,
+) -> None:
+    """Measure seconds in each stage of a map and of a survey on a simulated corridor, and what scoring costs."""
+    from worker.benchmarks import speed  # noqa: PLC0415
+    from worker.benchmarks.documents import write_json  # noqa: PLC0415
+
+    settings = speed.BenchSettings(scans=scans, repeats=repeats, model=model, model_store=model_store)
+    with terminal.progress_bar() as progress:
+        figures = speed.bench(settings, progress)
+    write_json(out, figures)
+    terminal.show(figures, speed.tables, f"saved in {out}")
 
 
 def registration(
@@ -39,10 +47,10 @@ def registration(
     scans: Annotated[int, typer.Option(min=2, help="Stops of the walk.")] = 42,
     foreign: Annotated[int, typer.Option(min=1, max=17, help="Out-of-place scans, of another building.")] = 5,
     standing: Annotated[float, typer.Option(min=0.1, help="Seconds at each stop.")] = 5.0,
-    plain: Annotated[
+    baseline: Annotated[
         bool, typer.Option("--plain", help="Also the baseline: all pairs in one process with Open3D's ICP.")
     ] = False,
-    plain_pairs: Annotated[
+    baseline_pairs: Annotated[
         int | None,
         typer.Option("--plain-pairs", min=1, help="So many random pairs, the rest of the time extrapolated."),
     ] = None,
@@ -64,8 +72,8 @@ def registration(
         walk=WalkSettings(building=building, scans=scans, foreign=foreign, duration_s=standing),
         seeds=_numbers(seeds),
         kinds=kinds_named(scenarios),
-        plain=plain or plain_pairs is not None,
-        plain_pairs=plain_pairs,
+        baseline=baseline or baseline_pairs is not None,
+        baseline_pairs=baseline_pairs,
         survey=survey,
         real=real,
         out=out,
@@ -74,10 +82,7 @@ def registration(
         result = evaluate(settings, progress)
     if out is not None:
         write_json(out / "registration.json", result)
-    if as_json:
-        terminal.print_json(result)
-    else:
-        terminal.output().print(tables(result), highlight=False)
+    terminal.show(result, tables, as_json=as_json)
 
 
 def paper(
@@ -127,13 +132,8 @@ def paper(
     with terminal.progress_bar() as progress:
         measured = evaluate(settings, progress)
         result = {"command": command_line(context), **document(measured)}
-        report = None if out is None else write_report(measured, result, out)
-    if as_json:
-        terminal.print_json(result)
-        return
-    terminal.output().print(tables(result), highlight=False)
-    if report is not None:
-        terminal.output().print(f"report: {report}", highlight=False)
+        notes = [] if out is None else [f"report: {write_report(measured, result, out)}"]
+    terminal.show(result, tables, *notes, as_json=as_json)
 
 
 def revisit(
@@ -158,7 +158,7 @@ def revisit(
     ] = Path("bench/revisit"),
     as_json: AsJson = False,
 ) -> None:
-    """Two independent visits, whole objects added, removed, moved between them: the model and what else there is.
+    """Compare two independent visits, whole objects added, removed, moved between them, by the model and baselines.
 
     Simulating and registering the visits takes minutes and is done once: another model on the same visits takes one.
     """
@@ -179,11 +179,7 @@ def revisit(
     with terminal.progress_bar() as progress:
         result = {"command": command_line(context), **evaluate(settings, progress)}
     write_json(out / "revisit.json", result)
-    if as_json:
-        terminal.print_json(result)
-        return
-    terminal.output().print(tables(result), highlight=False)
-    terminal.output().print(f"saved in {out}", highlight=False)
+    terminal.show(result, tables, f"saved in {out}", as_json=as_json)
 
 
 def record(

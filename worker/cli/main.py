@@ -6,7 +6,11 @@ import sys
 
 import typer
 
-from worker.cli import bench, demo, detect, evaluate, register, terminal, train
+from worker.cli import evaluate, terminal
+from worker.cli.demo import demo
+from worker.cli.detect import detect
+from worker.cli.register import register
+from worker.cli.train import train, with_training_options
 from worker.demo.service import DemoFailed
 from worker.errors import PipelineError
 from worker.threads import wait_passively
@@ -33,6 +37,10 @@ def _commands() -> typer.Typer:
         pretty_exceptions_enable=False,
         help="Compares LiDAR scans of a space on this machine, trains the detector, and shows the whole service.",
     )
-    for part in (detect, register, train, demo, bench, evaluate):
-        part.register(commands)
+    for command in (detect, register, with_training_options(train), demo, evaluate.bench):
+        commands.command()(command)
+    measuring = typer.Typer(no_args_is_help=True, help="How good it is, measured where the truth is known.")
+    for command in (evaluate.registration, evaluate.paper, evaluate.revisit, evaluate.record):
+        measuring.command()(command)
+    commands.add_typer(measuring, name="evaluate")
     return commands

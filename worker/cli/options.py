@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -11,5 +11,6 @@ Model = Annotated[str, typer.Option(envvar="SPICD_MODEL", help="name/version")]
 ModelStore = Annotated[
     Path, typer.Option("--model-store", envvar="SPICD_MODEL_STORE", help="Folder of the models.")
 ]
-AsJson = Annotated[bool, typer.Option("--json", help="Figures as JSON on stdout.")]
+Device = Annotated[Literal["auto", "cpu", "cuda"], typer.Option(envvar="SPICD_DEVICE")]
+AsJson = Annotated[bool, typer.Option("--json", help="Results as JSON on stdout, nothing else there.")]
 DEFAULT_MODEL = "spicd-net/1"

@@ -4,20 +4,19 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.table import Table
 
 from worker.cli import terminal
+from worker.cli.options import AsJson
+
+if TYPE_CHECKING:
+    from worker.pipeline.registration.results import RegistrationResult
 
 
-def register(commands: typer.Typer) -> None:
-    """Add `register` to the command line."""
-    commands.command("register")(register_files)
-
-
-def register_files(
+def register(
     reference: Annotated[Path, typer.Argument(help="PLY or PCD that sets the frame.")],
     current: Annotated[Path, typer.Argument(help="PLY or PCD to be placed in it.")],
     start: Annotated[
@@ -26,7 +25,7 @@ def register_files(
     truth: Annotated[
         Path | None, typer.Option(help="4x4 text file of the same kind: the error is given too.")
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Results as JSON on stdout.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Register CURRENT to REFERENCE as a survey is registered to a map."""
     # Not at the head of the file: Open3D takes a second, which `--help` need not wait for.
@@ -51,8 +50,17 @@ def register_files(
     registration = outcome.registration
     if registration is None:
         raise ScanRejected(str(outcome.reason))
+    result = document(registration, seconds)
+    if truth is not None:
+        metres, radians = difference(np.loadtxt(truth), registration.map_from_scan)
+        result["error"] = {"metres": metres, "degrees": float(np.degrees(radians))}
+    terminal.show(result, _table, as_json=as_json)
+
+
+def document(registration: RegistrationResult, seconds: float) -> dict[str, Any]:
+    """Return the registration, JSON-ready; metres and radians."""
     sigma = registration.uncertainty
-    result: dict[str, Any] = {
+    return {
         "reference_from_current": registration.map_from_scan.tolist(),
         "fitness": registration.fitness,
         "inlier_rmse": registration.inlier_rmse,
@@ -63,13 +71,6 @@ def register_files(
         "rotation_sigma": None if sigma is None else sigma.rotation,
         "seconds": seconds,
     }
-    if truth is not None:
-        metres, radians = difference(np.loadtxt(truth), registration.map_from_scan)
-        result["error"] = {"metres": metres, "degrees": float(np.degrees(radians))}
-    if as_json:
-        terminal.print_json(result)
-    else:
-        terminal.output().print(_table(result), highlight=False)
 
 
 def _table(result: dict[str, Any]) -> Table:

@@ -6,18 +6,14 @@ import functools
 import inspect
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import typer
 
 from worker.cli import terminal
+from worker.cli.options import Device
 from worker.progress import Progress
 from worker.training.options import OPTIONS, Option, with_options
-
-
-def register(commands: typer.Typer) -> None:
-    """Add `train` to the command line."""
-    commands.command("train")(with_training_options(train))
 
 
 def train(
@@ -32,7 +28,7 @@ def train(
     offices: Annotated[int | None, typer.Option(min=0, help="Simulated offices of a new set.")] = None,
     corridors: Annotated[int | None, typer.Option(min=0, help="Simulated corridors.")] = None,
     rooms: Annotated[int | None, typer.Option(min=0, help="Simulated single rooms.")] = None,
-    device: Annotated[Literal["auto", "cpu", "cuda"], typer.Option(envvar="SPICD_DEVICE")] = "auto",
+    device: Device = "auto",
     threads: Annotated[int | None, typer.Option(min=1, help="Of the CPU.")] = None,
     **options: Any,
 ) -> None:

@@ -15,7 +15,7 @@ from rich.text import Text
 
 from worker.cloud.poses import difference
 from worker.cloud.tiling import TileGrid
-from worker.cloud.types import Floats, Matrix4
+from worker.cloud.types import Floats, Indices, Matrix4
 from worker.simulation.sensor import SimulatedScan
 from worker.simulation.truth import TileTruth
 
@@ -67,41 +67,36 @@ class Judgement:
 
 def grid_of(manifest: dict[str, Any]) -> TileGrid:
     """Read the grid of a map's tile manifest."""
-    i, j, k = manifest["n_tiles_grid"]
     origin, size = (np.array(manifest[name], np.float64) for name in ("tile_origin", "tile_size"))
-    return TileGrid(origin=origin, size=size, shape=(i, j, k))
+    shape, lowest = (tuple(manifest[name]) for name in ("n_tiles_grid", "tile_lowest_idx"))
+    return TileGrid(origin=origin, size=size, shape=shape, lowest=lowest)
 
 
 def judge(
     features: Sequence[dict[str, Any]], truth: TileTruth, edits: Sequence[tuple[str, TileTruth]]
 ) -> Judgement:
-    """Hold every feature of `/surveys/{id}/tiles` against the truth; `edits` names each edit with its own truth."""
-    tiles = tuple(_judged(feature["properties"], truth, edits) for feature in features)
-    kept = {tuple(feature["properties"]["tile_index"]) for feature in features}
-    flagged = {
-        tuple(f["properties"]["tile_index"]) for f in features if f["properties"]["state"] == "changed"
-    }
+    """Compare every feature of `/surveys/{id}/tiles` with the truth; `edits` names each edit with its own truth."""
+    tiles = [feature["properties"] for feature in features]
+    indices = np.array([tile["tile_index"] for tile in tiles], np.int32).reshape(-1, 3)
+    flagged = indices[[tile["state"] == "changed" for tile in tiles]]
+    changed = truth.of(indices)
     return Judgement(
-        tiles=tiles,
-        edits=tuple(
-            JudgedEdit(sentence=sentence, tiles=len(own & kept), found=len(own & flagged))
-            for sentence, own in ((sentence, _changed(own)) for sentence, own in edits)
+        tiles=tuple(
+            JudgedTile(
+                tile_id=tile["tile_id"],
+                center=tuple(tile["center"]),
+                score=tile["score"],
+                state=tile["state"],
+                truth=_main_edit(index, edits) if is_changed else None,
+                verdict=_verdict(tile["state"], is_changed),
+            )
+            for tile, index, is_changed in zip(tiles, indices, changed.tolist(), strict=True)
         ),
-        outside=len(_changed(truth) - kept),
-    )
-
-
-def _judged(tile: dict[str, Any], truth: TileTruth, edits: Sequence[tuple[str, TileTruth]]) -> JudgedTile:
-    index = tuple(tile["tile_index"])
-    changed = bool(truth.changed[index])
-    x, y, z = tile["center"]
-    return JudgedTile(
-        tile_id=tile["tile_id"],
-        center=(x, y, z),
-        score=tile["score"],
-        state=tile["state"],
-        truth=_what(index, edits) if changed else None,
-        verdict=_verdict(tile["state"], changed),
+        edits=tuple(
+            JudgedEdit(sentence=sentence, tiles=int(own.of(indices).sum()), found=int(own.of(flagged).sum()))
+            for sentence, own in edits
+        ),
+        outside=int(truth.changed.sum() - changed.sum()),
     )
 
 
@@ -113,14 +108,10 @@ def _verdict(state: str, changed: bool) -> Verdict:
     return Verdict.UNOBSERVED if state == "unobserved" else Verdict.MISS
 
 
-def _what(index: tuple[int, ...], edits: Sequence[tuple[str, TileTruth]]) -> str:
+def _main_edit(index: Indices, edits: Sequence[tuple[str, TileTruth]]) -> str:
     """Name the edit that changed most of the tile."""
-    cells = [int(own.cells[index].sum()) for _, own in edits]
-    return edits[int(np.argmax(cells))][0]
-
-
-def _changed(truth: TileTruth) -> set[tuple[int, ...]]:
-    return {tuple(index) for index in np.argwhere(truth.changed).tolist()}
+    sentence, _ = max(edits, key=lambda edit: edit[1].cells_of(index[None]).sum())
+    return sentence
 
 
 _STYLE = {

@@ -17,26 +17,17 @@ from rich.text import Text
 from service.client import Client, ClientError, Document
 from worker.demo.judgement import Judgement, grid_of, judge, placement_line, show_judgement
 from worker.demo.service import DemoFailed, ServiceChild
-from worker.demo.story import Story, tell
+from worker.demo.story import DemoSettings, Story, tell
 from worker.simulation.sensor import SimulatedScan
 
 MAP_ID = "office"
+#: What is fetched: its path on the service, and the file that it is written to.
 RESULTS = {
-    "changes": "changes.geojson",
-    "tiles": "tiles.geojson",
-    "cloud": "cloud.ply",
-    "picture": "picture.png",
+    "changes": (f"/maps/{MAP_ID}/changes?limit=10000", "changes.geojson"),
+    "tiles": ("/surveys/{survey_id}/tiles", "tiles.geojson"),
+    "cloud": ("/surveys/{survey_id}/cloud.ply", "cloud.ply"),
+    "picture": ("/surveys/{survey_id}/picture.png", "picture.png"),
 }
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class DemoSettings:
-    """How long the robot works."""
-
-    seed: int = 1
-    stops: tuple[int, int] = (22, 16)  #: scans of both visits; with fewer, rooms hang together by too little
-    duration_s: float = 5.0  #: seconds of standing at each
-    prior_error: tuple[float, float] = (0.1, 2.0)  #: sigma of the robot's odometry, metres and degrees
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -83,12 +74,12 @@ class _Step:
     def __init__(self, progress: Progress, name: str) -> None:
         self._progress, self._task = progress, progress.add_task(name, total=1.0, stage="")
 
-    def at(self, stage: str, share: float) -> None:
+    def show(self, stage: str, share: float) -> None:
         self._progress.update(self._task, stage=stage, completed=share)
 
     def follow(self, job: Document) -> None:
         """Listen to `Client.wait`."""
-        self.at(job["message"], (job["progress"] or 0) / 100)
+        self.show(job["message"], (job["progress"] or 0) / 100)
 
 
 @contextmanager
@@ -96,7 +87,7 @@ def _step(progress: Progress, name: str) -> Iterator[_Step]:
     """Show a line for a step, with its time."""
     step = _Step(progress, name)
     yield step
-    step.at("", 1.0)
+    step.show("", 1.0)
 
 
 def _progress(console: Console) -> Progress:
@@ -113,13 +104,7 @@ def _through_the_service(
     child: ServiceChild, out: Path, settings: DemoSettings, progress: Progress
 ) -> tuple[DemoResult, Story]:
     with _step(progress, "simulate two visits to an office"):
-        story = tell(
-            seed=settings.seed,
-            stops=settings.stops,
-            duration_s=settings.duration_s,
-            prior_error=settings.prior_error,
-            folder=out / "demo-scans",
-        )
+        story = tell(settings, folder=out / "demo-scans")
     with _step(progress, "start the service"):
         url = child.await_ready()["url"]
     with Client(url) as client:
@@ -135,7 +120,10 @@ def _through_the_service(
             client.wait(accepted["job_id"], step.follow)
         survey_id = accepted["survey_id"]
         with _step(progress, "fetch the results"):
-            files = _downloaded(client, survey_id, out)
+            files = {
+                what: client.download(path.format(survey_id=survey_id), out / name)
+                for what, (path, name) in RESULTS.items()
+            }
             survey, built = client.survey(survey_id), client.map(MAP_ID)
             judgement = _judged(client, survey_id, story, out)
     return DemoResult(map=built, survey=survey, judgement=judgement, files=files), story
@@ -147,26 +135,16 @@ def _uploaded(client: Client, scans: Sequence[SimulatedScan], step: _Step) -> li
     for number, scan in enumerate(scans):
         if scan.path is None:
             raise ValueError("the visit was simulated without files")
-        step.at(scan.path.name, number / len(scans))
+        step.show(scan.path.name, number / len(scans))
         sent = client.upload_scan(scan.path, device_id="demo-robot", pose=scan.prior.tolist())
         ids.append(sent["scan_id"])
     return ids
 
 
-def _downloaded(client: Client, survey_id: str, out: Path) -> dict[str, Path]:
-    here = f"/surveys/{survey_id}"
-    paths = {
-        "changes": f"/maps/{MAP_ID}/changes?limit=10000",
-        "tiles": f"{here}/tiles",
-        "cloud": f"{here}/cloud.ply",
-        "picture": f"{here}/picture.png",
-    }
-    return {what: client.download(path, out / RESULTS[what]) for what, path in paths.items()}
-
-
 def _judged(client: Client, survey_id: str, story: Story, out: Path) -> Judgement:
     manifest = json.loads(client.download(f"/maps/{MAP_ID}/manifest", out / "manifest.json").read_text())
     grid = grid_of(manifest)
-    names = [edit.sentence for edit in story.edits]
-    edits = list(zip(names, story.truth_of_each(grid), strict=True))
+    edits = [
+        (edit.sentence, truth) for edit, truth in zip(story.edits, story.truth_of_each(grid), strict=True)
+    ]
     return judge(client.tiles(survey_id)["features"], story.truth(grid), edits)

@@ -57,7 +57,7 @@ class ServiceChild:
         return self
 
     def await_ready(self) -> dict[str, Any]:
-        """`url` and the rest of the ready file. Raises DemoFailed where the service does not come up."""
+        """Return `url` and the rest of the ready file. Raises DemoFailed where the service does not come up."""
         until = time.monotonic() + STARTS_WITHIN_S
         while not self._ready.exists():
             if self._started.poll() is not None:

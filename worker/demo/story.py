@@ -16,6 +16,16 @@ from worker.simulation.visits import visit
 OFFICE = 2  #: seed of the building
 
 
+@dataclass(frozen=True, kw_only=True, slots=True)
+class DemoSettings:
+    """How long the robot works."""
+
+    seed: int = 1
+    stops: tuple[int, int] = (22, 16)  #: scans of both visits; with fewer, rooms hang together by too little
+    duration_s: float = 5.0  #: seconds of standing at each
+    prior_error: tuple[float, float] = (0.1, 2.0)  #: sigma of the robot's odometry, metres and degrees
+
+
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
 class Edit:
     """One change and the scene on either side of it."""
@@ -38,7 +48,7 @@ class Story:
         return self._between(self.edits[0].before, self.edits[-1].after, grid)
 
     def truth_of_each(self, grid: TileGrid) -> tuple[TileTruth, ...]:
-        """Likewise for each edit alone."""
+        """Tell it for each edit alone."""
         return tuple(self._between(edit.before, edit.after, grid) for edit in self.edits)
 
     def _between(self, before: Scene, after: Scene, grid: TileGrid) -> TileTruth:
@@ -81,24 +91,17 @@ def _big_crate() -> Mesh:
     return crate(0.7, 0.5, 0.6)
 
 
-def tell(
-    *,
-    seed: int,
-    stops: tuple[int, int],
-    duration_s: float,
-    prior_error: tuple[float, float],
-    folder: Path | None = None,
-) -> Story:
-    """Walk the office before and after, with so many stops; `prior_error` is the sigma in metres and degrees."""
+def tell(settings: DemoSettings, folder: Path | None = None) -> Story:
+    """Walk the office before and after the edits; with a folder the scans are written there."""
     made = edits(small_office(OFFICE))
     scenes = {"first": made[0].before, "second": made[-1].after}
     first, second = (
         visit(
             scene,
-            stops[number],
-            seed=10 * seed + number,
-            prior_error=prior_error,
-            duration_s=duration_s,
+            settings.stops[number],
+            seed=10 * settings.seed + number,
+            prior_error=settings.prior_error,
+            duration_s=settings.duration_s,
             folder=folder,
             name=f"{name}-{{:02d}}",
         )

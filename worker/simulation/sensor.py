@@ -25,9 +25,7 @@ class SensorModel:
     lines_per_second: float = 180.0  #: Hz, sweeps of the mirror from edge to edge of the field
     rate_jitter: float = 0.02  #: share, sigma of the turn between two lines
     field_deg: float = 180.0  #: degrees swept by a line through the axis; 180 is 90 degrees to either side
-    axis_elevation_deg: float = (
-        30.0  #: degrees of the axis above the sensor's x, in which the field is centred
-    )
+    axis_elevation_deg: float = 30.0  #: of the axis above the sensor's x, in which the field is centred
     min_range: float = 0.05  #: metres
     max_range: float = 15.0  #: metres
     range_sigma: float = 0.015  #: metres, each point
@@ -38,9 +36,7 @@ class SensorModel:
     mixing: float = 0.5  #: share of the points on an edge of depth that fall between both surfaces
     mixing_depth: float = 0.6  #: metres, surfaces farther apart give two pulses, of which the first counts
     certain_range: float = 4.0  #: metres, every return arrives up to here
-    faint_range: float = (
-        10.0  #: metres, `faint_share` of the returns arrives here; the fall is a straight line
-    )
+    faint_range: float = 10.0  #: metres, `faint_share` of the returns arrives here; the fall is linear
     faint_share: float = 0.2
     loss: float = 0.06  #: share lost at random
     grazing_deg: float = 75.0  #: degrees from the normal from which returns grow fewer, down to none at 90
@@ -52,11 +48,9 @@ class SimulatedScan:
 
     points: Points  #: (N, 3) float32, metres, sensor frame: x ahead, y left, z up
     object_ids: NDArray[np.int32]  #: (N,) object that the middle of the beam met
-    origin: Floats  #: (3,) where the rays start, sensor frame: 0
     world_from_sensor: Matrix4  #: (4, 4) the true pose
-    prior: (
-        Matrix4  #: (4, 4) world_from_sensor as the robot believes it; the true pose unless a visit drifts it
-    )
+    #: (4, 4) world_from_sensor as the robot believes it; the true pose unless a visit drifts it
+    prior: Matrix4
     path: Path | None = None  #: of the PCD file with these points, where a visit was asked to write one
 
     @property
@@ -105,14 +99,13 @@ def scan(
     return SimulatedScan(
         points=(reported[kept] * noisy[kept, None]).astype(np.float32),
         object_ids=hit.object_ids[:count][kept],
-        origin=np.zeros(3),
         world_from_sensor=world_from_sensor,
         prior=world_from_sensor,
     )
 
 
 def directions(sensor: SensorModel, duration_s: float, rng: np.random.Generator) -> Floats:
-    """(N, 3) unit vectors, sensor frame, in the order in which they are fired.
+    """Return unit vectors (N, 3), sensor frame, in the order in which they are fired.
 
     A line sweeps the field through the axis while the head turns on; its phase and the turn to the next line
     are jittered, so that no two scans, nor two lines, meet the same spots.
@@ -133,7 +126,7 @@ def directions(sensor: SensorModel, duration_s: float, rng: np.random.Generator)
 
 
 def _perturbed(rays: Floats, sigma_deg: float, rng: np.random.Generator) -> Floats:
-    """The rays tilted at random; what the noise adds along the ray is lost in the normalisation."""
+    """Tilt the rays at random; what the noise adds along the ray is lost in the normalisation."""
     tilted = rays + rng.normal(0.0, np.radians(sigma_deg), rays.shape)
     unit: Floats = tilted / np.linalg.norm(tilted, axis=1, keepdims=True)
     return unit
@@ -142,7 +135,7 @@ def _perturbed(rays: Floats, sigma_deg: float, rng: np.random.Generator) -> Floa
 def _mixed(
     first: Floats, other: Floats, cosines: Floats, sensor: SensorModel, rng: np.random.Generator
 ) -> Floats:
-    """(N,) ranges; where the beam straddles an edge, some lie between both surfaces."""
+    """Return ranges (N,); where the beam straddles an edge, some lie between both surfaces."""
     gap = np.abs(other - first)
     # On one plane the range changes by about r * angle * tan(incidence) across the beam: that is no edge.
     cosines = np.clip(cosines, 0.05, 1.0)
@@ -155,7 +148,7 @@ def _mixed(
 def _returned(
     ranges: Floats, cosines: Floats, sensor: SensorModel, rng: np.random.Generator
 ) -> NDArray[np.bool_]:
-    """(N,) which rays come back at all."""
+    """Tell which rays come back at all: (N,)"""
     slope = (1 - sensor.faint_share) / (sensor.faint_range - sensor.certain_range)
     far = np.clip(1 - slope * (ranges - sensor.certain_range), 0.0, 1.0)
     grazing = np.cos(np.radians(sensor.grazing_deg))

@@ -19,7 +19,7 @@ from worker.processes import default_processes, open_processes
 from worker.progress import Progress, no_progress
 from worker.simulation.scenes import BUILDINGS, BuildingKind, Scene, rigid
 from worker.simulation.sensor import SimulatedScan
-from worker.simulation.truth import TileTruth, true_changes
+from worker.simulation.truth import true_changes
 from worker.simulation.visits import edited, visit
 from worker.training.anomalies import OPERATIONS, Change
 from worker.training.dataset import Observation, TileSet, joined
@@ -70,11 +70,8 @@ class TrainingSetSettings(StrictModel):
 
     def kinds(self) -> list[BuildingKind]:
         """List the kind of every building, in the order of their seeds."""
-        counts: dict[BuildingKind, int] = {
-            "office": self.offices,
-            "corridor": self.corridors,
-            "room": self.rooms,
-        }
+        counts: dict[BuildingKind, int]
+        counts = {"office": self.offices, "corridor": self.corridors, "room": self.rooms}
         return [kind for kind, count in counts.items() for _ in range(count)]
 
 
@@ -182,8 +179,8 @@ def _truth(walk: _Walk, after: Scene, scans: Sequence[SimulatedScan]) -> tuple[B
         walk.scene, after, grid, map_from_world=walk.map_from_world, first=first, second=second
     )
     near = binary_dilation(exists.changed, np.ones((3, 3, 3), bool))
-    touched = TileTruth(grid=grid, cells=exists.cells, min_cells=1).of(indices)
-    beside: Bools = near[tuple(indices.T)] & ~touched
+    touched = exists.cells_of(indices).any(axis=1)
+    beside: Bools = near.ravel()[grid.cells(indices)] & ~touched
     return visible.of(indices), beside
 
 
@@ -236,12 +233,11 @@ def _injected(
     points: Points, tiles: Tiles, tile: int, settings: WalkSettings, rng: np.random.Generator
 ) -> Points:
     """Put a synthetic change into one tile of a scan (n, 3), map frame."""
-    grid = tiles.grid
-    lower = grid.lower(tiles.indices[tile])
-    inside = np.all((points >= lower) & (points < lower + grid.size), axis=1)
+    grid, index = tiles.grid, tiles.indices[[tile]]
+    inside = grid.locate(points) == grid.cells(index)
     if not inside.any():
         return points
-    centre, half = lower + grid.size / 2, (grid.size / 2 - MARGIN).astype(np.float32)
+    centre, half = grid.centers(index)[0], (grid.size / 2 - MARGIN).astype(np.float32)
     change = Change(magnitude=rng.uniform(*settings.magnitude), density=rng.uniform(*settings.density))
     operation = OPERATIONS[str(rng.choice(list(OPERATIONS)))]
     after = operation((points[inside] - centre).astype(np.float32), change, half, rng).points
@@ -260,7 +256,10 @@ def _tile_set(matched: TilePairs, observations: Sequence[Observation], settings:
     return TileSet(
         points_a=tuple(centred(points, tile) for tile, points in enumerate(tiles.points)),
         points_b=tuple(centred(points, tile) for tile, points in enumerate(matched.current)),
-        observations=tuple(replace(look, points=centred(look.points, look.tile)) for look in observations),
+        observations=tuple(
+            replace(observation, points=centred(observation.points, observation.tile))
+            for observation in observations
+        ),
         centres=centres,
         buildings=np.zeros(len(centres), np.int32),
         tile_size=settings.tiling.tile_size,

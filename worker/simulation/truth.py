@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -16,9 +17,8 @@ from worker.simulation.scenes.scene import ChangeKind, Scene, SceneObject
 CELL = 0.05  #: metres, the voxel of the fused maps
 SAMPLES_PER_M2 = 4 / 0.025**2  #: four in each square of 2.5 cm, so that hardly a cell is missed
 FAR = 0.075  #: metres; a surface this near to one of the other visit is not new: one and a half voxels
-MIN_CELLS = (
-    40  #: changed cells that make a changed tile: 0.1 m2 of surface, a sheet of A3 paper less a margin
-)
+#: Changed cells that make a changed tile: 0.1 m2 of surface, a sheet of A3 paper less a margin.
+MIN_CELLS = 40
 SEEN_WITHIN = 10.0  #: metres, beyond which hardly a return arrives
 KINDS: tuple[ChangeKind, ...] = ("add", "remove", "move")
 
@@ -29,7 +29,7 @@ class TileTruth:
 
     grid: TileGrid
     cells: NDArray[np.int32]  #: (I, J, K, 3) changed cells of 5 cm, by kind of change as in KINDS
-    min_cells: int
+    min_cells: int = MIN_CELLS
 
     @property
     def changed(self) -> Bools:
@@ -37,14 +37,14 @@ class TileTruth:
         enough: Bools = self.cells.sum(axis=-1) >= self.min_cells
         return enough
 
-    def of(self, indices: Indices) -> Bools:
-        """(T,) whether the tiles at these indices (T, 3) truly changed."""
-        wanted: Bools = self.changed[tuple(indices.T)]
-        return wanted
+    def cells_of(self, indices: Indices) -> NDArray[np.int32]:
+        """Return the changed cells of the tiles at these indices (T, 3), by kind of change: (T, 3)"""
+        return self.cells.reshape(-1, len(KINDS))[self.grid.cells(indices)]
 
-    def kind(self, index: tuple[int, int, int]) -> ChangeKind | None:
-        """The kind with most changed cells in a tile; None if the tile did not change."""
-        return KINDS[int(self.cells[index].argmax())] if self.changed[index] else None
+    def of(self, indices: Indices) -> Bools:
+        """Tell whether the tiles at these indices (T, 3) truly changed: (T,)"""
+        enough: Bools = self.cells_of(indices).sum(axis=1) >= self.min_cells
+        return enough
 
 
 def changed_tiles(
@@ -67,12 +67,15 @@ def changed_tiles(
     old = {item.name: item for item in before.objects}
     new = {item.name: item for item in after.objects}
     edited = {name for name in old.keys() & new.keys() if not _same(old[name], new[name])}
-    for kind, gone in (("remove", old.keys() - new.keys()), ("move", edited)):
-        surfaces = [old[name].mesh for name in sorted(gone)]
-        _count(cells[..., KINDS.index(kind)], surfaces, before, after, sensors_before, grid)
-    for kind, come in (("add", new.keys() - old.keys()), ("move", edited)):
-        surfaces = [new[name].mesh for name in sorted(come)]
-        _count(cells[..., KINDS.index(kind)], surfaces, after, before, sensors_after, grid)
+    for kind, names, own, other, sensors in (
+        ("remove", old.keys() - new.keys(), before, after, sensors_before),
+        ("move", edited, before, after, sensors_before),
+        ("add", new.keys() - old.keys(), after, before, sensors_after),
+        ("move", edited, after, before, sensors_after),
+    ):
+        if names:
+            surfaces = [own[name].mesh for name in sorted(names)]
+            cells[..., KINDS.index(kind)] += _new_cells(surfaces, own, other, sensors, grid)
     return TileTruth(grid=grid, cells=cells, min_cells=min_cells)
 
 
@@ -97,7 +100,7 @@ def true_changes(
 
 
 def sampled(mesh: Mesh, rng: np.random.Generator) -> Floats:
-    """(N, 3) points uniformly on the surface."""
+    """Draw points uniformly on the surface: (N, 3)"""
     a, b, c = (mesh.vertices[mesh.triangles[:, corner]] for corner in range(3))
     areas = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
     counts = rng.poisson(areas * SAMPLES_PER_M2)
@@ -107,17 +110,10 @@ def sampled(mesh: Mesh, rng: np.random.Generator) -> Floats:
     return points
 
 
-def _count(
-    cells: NDArray[np.int32],
-    surfaces: list[Mesh],
-    own: Scene,
-    other: Scene,
-    sensors: Sequence[Matrix4],
-    grid: TileGrid,
-) -> None:
-    """Add to `cells` (I, J, K) the cells of these surfaces that the other scene does not have."""
-    if not surfaces:
-        return
+def _new_cells(
+    surfaces: list[Mesh], own: Scene, other: Scene, sensors: Sequence[Matrix4], grid: TileGrid
+) -> NDArray[np.int64]:
+    """Count, in each tile, the cells of these surfaces that the other scene does not have: (I, J, K)"""
     rng = np.random.default_rng(0)
     points = np.concatenate([sampled(mesh, rng) for mesh in surfaces])
     distance = other.caster.distances(points)
@@ -125,18 +121,12 @@ def _count(
     if len(sensors):
         points = points[_reached(points, own, sensors)]
     voxels = np.unique(np.floor((points - grid.origin) / CELL).astype(np.int64), axis=0)
-    _count_by_tile(cells, CELL * (voxels + 0.5).astype(np.float64), grid)
-
-
-def _count_by_tile(cells: NDArray[np.int32], centres: Floats, grid: TileGrid) -> None:
-    """Add one to the tile of each centre (N, 3), metres from the grid's origin; centres outside are left out."""
-    tiles = np.floor(centres / grid.size).astype(np.int64)
-    inside = np.all((tiles >= 0) & (tiles < np.array(grid.shape)), axis=1)
-    np.add.at(cells, tuple(tiles[inside].T), 1)
+    tiles = grid.locate(grid.origin + CELL * (voxels + 0.5))
+    return np.bincount(tiles[tiles >= 0], minlength=math.prod(grid.shape)).reshape(grid.shape)
 
 
 def _reached(points: Floats, scene: Scene, sensors: Sequence[Matrix4]) -> Bools:
-    """(N,) whether a straight line from any sensor ends on the point."""
+    """Tell whether a straight line from any sensor ends on each point: (N,)"""
     reached = np.zeros(len(points), dtype=bool)
     for world_from_sensor in sensors:
         rays = points - world_from_sensor[:3, 3]

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 
@@ -20,13 +20,8 @@ DRIFT = (0.25, 4.0)
 #: Draws of edits, and what lies between the seeds of two: no visit's is as high.
 DRAWS, NEXT_DRAW = 20, 100_000_000
 
-
-class Drift(Protocol):
-    """How a belief about a pose comes to be off: the pose, how far (metres, degrees), the random numbers."""
-
-    def __call__(
-        self, world_from_sensor: Matrix4, error: tuple[float, float], rng: np.random.Generator
-    ) -> Matrix4: ...
+#: How a belief about a pose comes to be off: from the pose, how far (metres, degrees), and random numbers.
+Drift = Callable[[Matrix4, tuple[float, float], np.random.Generator], Matrix4]
 
 
 def stops(scene: Scene, count: int, *, seed: int) -> tuple[Matrix4, ...]:
@@ -136,7 +131,7 @@ def _off_by(pose: Matrix4, shift: Floats, *, yaw: float) -> Matrix4:
 
 
 def _free_place(scene: Scene, wanted: Floats, rng: np.random.Generator) -> Floats:
-    """The first random place (x, y) near the wanted one with room for a robot, looking ever farther away."""
+    """Return the first random place (x, y) near the wanted one with room for a robot, looking ever farther away."""
     for reach in np.linspace(0.2, 1.5, 60):
         place: Floats = wanted + rng.uniform(-reach, reach, 2)
         if _has_room(scene, place):

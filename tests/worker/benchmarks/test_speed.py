@@ -39,7 +39,7 @@ def test_bench_times_every_stage_and_finds_the_same_scores_each_way(model_store:
     assert figures["network"]["largest_score_difference"] < 1e-4
     assert list(figures["network"]["seconds"]) == ["c2c", "uncached", "cached"]
     assert figures["network"]["times_c2c"]["c2c"] == 1.0
-    assert all(figures["map"][stage] > 0 for stage in ("fusing", "tiling", "describe", "total"))
+    assert all(figures["map"][stage] > 0 for stage in ("fusing", "tiling", "encode", "total"))
     parts = [seconds for stage, seconds in figures["map"].items() if stage != "total"]
     assert sum(parts) == pytest.approx(figures["map"]["total"])
     survey = figures["survey_with_prior"]  # with so few scans it may well be refused

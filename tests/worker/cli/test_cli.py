@@ -15,7 +15,7 @@ import pytest
 from tests.support import toy
 from tests.support.models import make_untrained
 from worker.benchmarks.plots import draw_curves
-from worker.cli import detect, main
+from worker.cli import detect, main, terminal
 from worker.cloud.formats.pcd import write_pcd
 from worker.cloud.formats.scan import read_scan
 from worker.detectors.card import MODEL_STORE
@@ -189,7 +189,7 @@ def test_the_summary_prints_names_that_look_like_markup_as_they_are(
         "changed": [],
         "files": {"tiles": "[new]/tiles.geojson"},
     }
-    detect._show(result)
+    terminal.show(result, detect.summary)
     shown = capsys.readouterr().out
     assert all(name in shown for name in ("[old]/hall.pcd", "a[/]b.pcd", "[new]/tiles.geojson"))
 

@@ -13,18 +13,23 @@ from rich.console import Console
 from tests.support.models import make_untrained
 from worker.cloud.tiling import TileGrid
 from worker.demo.judgement import Verdict, grid_of, judge, placement_line, show_judgement
-from worker.demo.run import DemoSettings, run
+from worker.demo.run import run
 from worker.demo.service import DemoFailed, ServiceChild
-from worker.demo.story import OFFICE, Story, edits, tell
+from worker.demo.story import OFFICE, DemoSettings, Story, edits, tell
 from worker.simulation.scenes import small_office
 from worker.simulation.truth import TileTruth
 
-MANIFEST = {"tile_origin": [0.0, 0.0, 0.0], "tile_size": [1.5, 1.5, 1.0], "n_tiles_grid": [7, 6, 3]}
+MANIFEST = {
+    "tile_origin": [0.0, 0.0, 0.0],
+    "tile_size": [1.5, 1.5, 1.0],
+    "n_tiles_grid": [7, 6, 3],
+    "tile_lowest_idx": [0, 0, 0],
+}
 
 
 @pytest.fixture(scope="module")
 def story() -> Story:
-    return tell(seed=1, stops=(3, 2), duration_s=0.5, prior_error=(0.1, 2.0))
+    return tell(DemoSettings(stops=(3, 2), duration_s=0.5))
 
 
 def test_every_piece_that_comes_or_is_moved_finds_a_free_place() -> None:

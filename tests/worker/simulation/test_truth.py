@@ -8,7 +8,7 @@ import pytest
 from worker.cloud.tiling import TileGrid
 from worker.simulation.scenes import rigid
 from worker.simulation.scenes.mesh import block, box
-from worker.simulation.truth import changed_tiles, true_changes
+from worker.simulation.truth import KINDS, changed_tiles, true_changes
 
 GRID = TileGrid(origin=np.zeros(3), size=np.array([1.5, 1.5, 1.0]), shape=(4, 3, 3))  # fills the bare room
 
@@ -25,8 +25,8 @@ def test_a_box_added_in_the_middle_of_one_tile_marks_exactly_that_tile(bare_room
     after, _ = bare_room.with_added("carton", box(0.5, 0.5, 0.5).at(2.25, 3.75))
     truth = changed_tiles(bare_room, after, GRID)
     assert marked(truth) == [(1, 2, 0)]
-    assert truth.kind((1, 2, 0)) == "add"
-    assert truth.kind((0, 0, 0)) is None
+    assert truth.cells[1, 2, 0].nonzero()[0].tolist() == [KINDS.index("add")]
+    assert not truth.cells[0, 0, 0].any()
     assert truth.of(np.array([[1, 2, 0], [1, 2, 1]], dtype=np.int32)).tolist() == [True, False]
 
 
@@ -41,7 +41,7 @@ def test_a_removed_box_marks_the_place_where_it_stood(bare_room):
     before, _ = bare_room.with_added("carton", box(0.5, 0.5, 0.5).at(2.25, 3.75))
     truth = changed_tiles(before, before.without("carton")[0], GRID)
     assert marked(truth) == [(1, 2, 0)]
-    assert truth.kind((1, 2, 0)) == "remove"
+    assert truth.cells[1, 2, 0].nonzero()[0].tolist() == [KINDS.index("remove")]
 
 
 def test_a_moved_box_marks_both_places(bare_room):
@@ -49,7 +49,7 @@ def test_a_moved_box_marks_both_places(bare_room):
     after, _ = before.shifted("carton", dx=1.5)
     truth = changed_tiles(before, after, GRID)
     assert marked(truth) == [(1, 2, 0), (2, 2, 0)]
-    assert truth.kind((2, 2, 0)) == "move"
+    assert truth.cells[2, 2, 0].nonzero()[0].tolist() == [KINDS.index("move")]
 
 
 def test_a_shift_within_the_tolerance_is_no_change(bare_room):
@@ -77,6 +77,18 @@ def test_changes_outside_the_grid_are_left_out(bare_room):
     after, _ = bare_room.with_added("carton", box(0.5, 0.5, 0.5).at(2.25, 3.75))
     elsewhere = TileGrid(origin=np.array([0.0, 0.0, 1.0]), size=GRID.size, shape=(4, 3, 2))
     assert marked(changed_tiles(bare_room, after, elsewhere)) == []
+
+
+def test_a_tile_keeps_its_index_in_a_grid_that_grew_below_zero(bare_room):
+    after, _ = bare_room.with_added("carton", box(0.5, 0.5, 0.5).at(2.25, 3.75))
+    grown = TileGrid(origin=GRID.origin, size=GRID.size, shape=(6, 4, 3), lowest=(-2, -1, 0))
+    truth = changed_tiles(bare_room, after, grown)
+    assert marked(truth) == [(3, 3, 0)]
+    indices = np.array([[1, 2, 0], [3, 2, 0], [-1, -1, 0]], np.int32)
+    assert truth.of(indices).tolist() == [True, False, False]
+    assert (
+        truth.cells_of(indices)[0].tolist() == changed_tiles(bare_room, after, GRID).cells[1, 2, 0].tolist()
+    )
 
 
 def test_the_truth_follows_the_scene_into_the_frame_of_the_map(bare_room):

@@ -112,9 +112,8 @@ def evaluate(settings: PaperSettings, progress: Progress = no_progress) -> Paper
     baselines = _baselines(carried_out, progress)
     disturbed: tuple[RobustnessPoint, ...] = ()
     if settings.robustness:
-        disturbed = sweep_disturbances(
-            sites[0], chosen_trials(carried_out[0]), caches[0], ours.threshold, progress
-        )
+        swept = chosen_trials(carried_out[0])
+        disturbed = sweep_disturbances(sites[0], swept, caches[0], ours.threshold, progress)
     progress("embedding", 0.0)
     return PaperResult(
         settings=settings,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,7 +13,7 @@ from matplotlib.figure import Figure
 from worker.benchmarks.paper.benchmark import PaperResult
 from worker.benchmarks.paper.experiments import published
 from worker.benchmarks.paper.robustness import LEVELS, chosen_trials
-from worker.benchmarks.paper.scores import Embedding, outcomes_of
+from worker.benchmarks.paper.scores import outcomes_of
 from worker.benchmarks.plots import (
     COLORS,
     QUIET,
@@ -30,6 +31,15 @@ from worker.metrics import PAPER_SWEEP, sweep
 from worker.simulation.truth import KINDS
 
 OUTCOMES = {"TP": "#2e7d32", "FN": "#1565c0", "FP": "#c62828", "TN": "#bdbdbd"}  #: the paper's colours
+#: Why a picture cannot be drawn, where it cannot.
+MISSING = {
+    "figure-08": "no log of the training lies beside the weights",
+    "figure-09": "none of its experiments was run",
+    "figure-10": "none of its experiments was run",
+    "figure-11": "it was not asked for",
+    "figure-12": "the detector has no descriptors",
+    "figure-14": "no change was missed",
+}
 PREFERRED = "magnitude_15cm"  #: of the paper's Figure 13
 
 
@@ -50,63 +60,42 @@ class Picture:
 
 def pictures(result: PaperResult) -> list[Picture]:
     """Draw Figures 5 to 15, and a ROC, in the order of the paper; say why one cannot be drawn."""
-    types = ("type_add", "type_remove", "type_move")
-    borders = ("baseline_no_change", "challenge_easy", "challenge_hard")
-    not_run = "none of its experiments was run"
     disturbed = ", ".join(trial.experiment.name for trial in chosen_trials(result.trials))
-    return [
-        Picture("figure-05", "Figure 5: sensitivity to the threshold.", threshold_sensitivity(result)),
-        Picture("figure-06", "Figure 6: precision and recall.", precision_recall_curves(result)),
-        Picture("roc", "Section 4.3: ROC.", roc_curves(result)),
-        Picture("figure-07", "Figure 7: sensitivity by kind of change.", sensitivity_by_kind(result)),
-        Picture(
-            "figure-08",
-            "Figure 8: the training behind the weights.",
-            None if result.training is None else training_curves(result.training),
-            "no log of the training lies beside the weights",
-        ),
-        Picture(
-            "figure-09",
-            "Figure 9: the type series.",
-            confusion_matrices(result, types, "Type series"),
-            not_run,
-        ),
-        Picture(
-            "figure-10",
-            "Figure 10: baseline and challenges.",
-            confusion_matrices(result, borders, "Baseline and challenges"),
-            not_run,
-        ),
-        Picture(
-            "figure-11",
-            f"Figure 11: robustness, over {disturbed}; a shifted map is not registered again. "
-            "Diamonds: F1 as far as the paper's text tells it, on experiments that it does not name.",
-            robustness(result) if result.robustness else None,
-            "it was not asked for",
-        ),
-        Picture(
-            "figure-12",
-            "Figure 12: fused embeddings; of the true negatives 15 an experiment.",
-            embedding(result.embedding) if result.embedding else None,
-            "the detector has no descriptors",
-        ),
-        Picture(
-            "figure-13",
-            "Figure 13: tiles from above; green found, blue missed, red false alarms.",
-            tiles_from_above(result),
-        ),
-        Picture(
-            "figure-14",
-            "Figure 14: the missed change with the highest score.",
-            failure_case(result),
-            "no change was missed",
-        ),
-        Picture(
-            "figure-15",
-            "Figure 15: scores of changed and unchanged tiles.",
-            score_distributions(result),
-        ),
-    ]
+    robust = (
+        f"Figure 11: robustness, over {disturbed}; a shifted map is not registered again. "
+        "Diamonds: F1 as far as the paper's text tells it, on experiments that it does not name."
+    )
+    rows: tuple[tuple[str, Callable[[PaperResult], Figure | None], str], ...] = (
+        ("figure-05", threshold_sensitivity, "Figure 5: sensitivity to the threshold."),
+        ("figure-06", precision_recall_curves, "Figure 6: precision and recall."),
+        ("roc", roc_curves, "Section 4.3: ROC."),
+        ("figure-07", sensitivity_by_kind, "Figure 7: sensitivity by kind of change."),
+        ("figure-08", training, "Figure 8: the training behind the weights."),
+        ("figure-09", type_series, "Figure 9: the type series."),
+        ("figure-10", baseline_and_challenges, "Figure 10: baseline and challenges."),
+        ("figure-11", robustness, robust),
+        ("figure-12", embedding, "Figure 12: fused embeddings; of the true negatives 15 an experiment."),
+        ("figure-13", tiles_from_above, "Figure 13: tiles from above; green found, blue missed, red false alarms."),
+        ("figure-14", failure_case, "Figure 14: the missed change with the highest score."),
+        ("figure-15", score_distributions, "Figure 15: scores of changed and unchanged tiles."),
+    )  # fmt: skip
+    return [Picture(name, caption, draw(result), MISSING.get(name, "")) for name, draw, caption in rows]
+
+
+def training(result: PaperResult) -> Figure | None:
+    """Draw Figure 8; None where no log was kept."""
+    return None if result.training is None else training_curves(result.training)
+
+
+def type_series(result: PaperResult) -> Figure | None:
+    """Draw Figure 9; None where none of its experiments was run."""
+    return confusion_matrices(result, ("type_add", "type_remove", "type_move"), "Type series")
+
+
+def baseline_and_challenges(result: PaperResult) -> Figure | None:
+    """Draw Figure 10; None where none of its experiments was run."""
+    names = ("baseline_no_change", "challenge_easy", "challenge_hard")
+    return confusion_matrices(result, names, "Baseline and challenges")
 
 
 def threshold_sensitivity(result: PaperResult) -> Figure:
@@ -205,8 +194,10 @@ def confusion_matrices(result: PaperResult, names: tuple[str, ...], title: str) 
     return figure
 
 
-def robustness(result: PaperResult) -> Figure:
-    """Draw Figure 11."""
+def robustness(result: PaperResult) -> Figure | None:
+    """Draw Figure 11; None where nothing was disturbed."""
+    if not result.robustness:
+        return None
     figure = Figure(figsize=(10, 6), dpi=100, layout="constrained")
     for place, what in enumerate(LEVELS, start=1):
         axes = figure.add_subplot(2, 2, place)
@@ -217,20 +208,18 @@ def robustness(result: PaperResult) -> Figure:
             axes.plot(levels, values, "o-", markersize=3, color=color, label=name.replace("_", " "))
         if what == "dropout (%)":
             paper = published()["robustness"]["dropout"]
-            axes.plot(
-                [100 * float(level) for level in paper],
-                list(paper.values()),
-                "D",
-                color="#555",
-                label="paper, F1",
-            )
+            shares = [100 * float(level) for level in paper]
+            axes.plot(shares, list(paper.values()), "D", color="#555", label="paper, F1")
         axes.set_ylim(-0.03, 1.03)
         label(axes, what, "share")
     return figure
 
 
-def embedding(projected: Embedding) -> Figure:
-    """Draw Figure 12."""
+def embedding(result: PaperResult) -> Figure | None:
+    """Draw Figure 12; None for a detector without descriptors."""
+    projected = result.embedding
+    if projected is None:
+        return None
     figure, axes = single("Fused embeddings, first two principal directions")
     for outcome, color in OUTCOMES.items():
         x, y = projected.places[projected.outcomes == outcome].T
@@ -262,10 +251,20 @@ def tiles_from_above(result: PaperResult) -> Figure:
 
 def failure_case(result: PaperResult) -> Figure | None:
     """Draw Figure 14: the missed tile of the highest score, if possible a removed one; None where none was missed."""
-    missed = _missed(result)
-    if missed is None:
+    threshold = result.detector.threshold
+    missed = [
+        (trial.experiment.operation == "remove", float(scores[tile]), place, int(tile))
+        for place, (trial, scores) in enumerate(zip(result.trials, result.detector.test.scores, strict=True))
+        for tile in np.flatnonzero(trial.truth & (scores <= threshold))
+    ]
+    if not missed:
         return None
-    place, tile, score = missed
+    _, score, place, tile = max(missed)
+    return _tile_before_and_after(result, place, tile, f"score {score:.3f}, threshold {threshold:.2f}")
+
+
+def _tile_before_and_after(result: PaperResult, place: int, tile: int, words: str) -> Figure:
+    """Draw a tile of the trial at a place in the order as the map and as the survey has it."""
     trial = result.trials[place]
     traces = [trace for trace in trial.traces if trace.tile == tile]
     gone = np.concatenate([trace.vanished for trace in traces])
@@ -274,11 +273,7 @@ def failure_case(result: PaperResult) -> Figure | None:
     index, size = result.site.tiles.indices[tile], result.site.tiles.grid.size
     corner, name = result.site.tiles.grid.lower(index), tile_id(index)
     figure.suptitle(
-        f"{trial.experiment.name}, {name}: score {score:.3f}, threshold {result.detector.threshold:.2f}",
-        x=0.01,
-        ha="left",
-        fontsize=11,
-        weight="bold",
+        f"{trial.experiment.name}, {name}: {words}", x=0.01, ha="left", fontsize=11, weight="bold"
     )
     sides = (
         ("reference; red: removed from a scan", trial.pairs.reference.points[tile], gone, "#c62828"),
@@ -288,25 +283,9 @@ def failure_case(result: PaperResult) -> Figure | None:
         axes: Any = figure.add_subplot(1, 2, number, projection="3d")
         axes.scatter(*points.T, s=4, color="#1565c0", alpha=0.6, linewidths=0)
         axes.scatter(*marked.T, s=3, color=color, alpha=0.5, linewidths=0)
-        for set_limits, low, edge in zip(
-            (axes.set_xlim, axes.set_ylim, axes.set_zlim), corner, size, strict=True
-        ):
-            set_limits(low, low + edge)
+        limits = np.stack([corner, corner + size]).T
+        axes.set(xlim=limits[0], ylim=limits[1], zlim=limits[2])
         axes.set_title(title, fontsize=9)
         axes.set_box_aspect(size)
         axes.tick_params(labelsize=6)
     return figure
-
-
-def _missed(result: PaperResult) -> tuple[int, int, float] | None:
-    """Trial, tile and score."""
-    threshold = result.detector.threshold
-    cases = [
-        (trial.experiment.operation == "remove", float(scores[tile]), place, int(tile))
-        for place, (trial, scores) in enumerate(zip(result.trials, result.detector.test.scores, strict=True))
-        for tile in np.flatnonzero(trial.truth & (scores <= threshold))
-    ]
-    if not cases:
-        return None
-    _, score, place, tile = max(cases)
-    return place, tile, score

@@ -12,11 +12,13 @@ import numpy as np
 from rich.console import Group
 from rich.table import Table
 
+from worker.benchmarks.card_figures import COUNTS, RATIOS
 from worker.benchmarks.documents import Document, shown, titled_table, write_bytes, write_json
 from worker.benchmarks.paper.benchmark import MethodResult, PaperResult
 from worker.benchmarks.paper.experiments import published
 from worker.benchmarks.paper.figures import pictures
 from worker.benchmarks.paper.robustness import chosen_trials
+from worker.benchmarks.paper.site import Site
 from worker.benchmarks.plots import png
 from worker.metrics import pooled, precision_recall, roc
 from worker.simulation.scenes import ChangeKind
@@ -24,8 +26,6 @@ from worker.simulation.truth import KINDS
 
 #: The name in the paper's Table 6 of each of ours that it has.
 IN_TABLE_6 = {"C2C (mean)": "C2C", "M3C2-approx": "M3C2-approx"}
-COUNTS = ("true_positives", "false_positives", "false_negatives", "true_negatives")
-RATIOS = ("precision", "recall", "f1", "accuracy")
 STYLE = """body{font:15px/1.5 system-ui,sans-serif;max-width:62rem;margin:2rem auto;padding:0 1rem;color:#1a1a1a}
 table{border-collapse:collapse;font-size:13px;display:block;overflow-x:auto}
 th,td{padding:.2rem .6rem;text-align:right;border-bottom:1px solid #ddd}
@@ -47,15 +47,8 @@ def document(result: PaperResult) -> Document:
             "validation_seed": settings.validation_seed,
             "everywhere": settings.everywhere,
         },
-        "map": {
-            "scans": len(result.site.scans),
-            "tiles": len(result.site.tiles.points),
-            "points": len(result.site.points),
-        },
-        "validation_map": {
-            "scans": len(result.validation.scans),
-            "tiles": len(result.validation.tiles.points),
-        },
+        "map": {**_map(result.site), "points": len(result.site.points)},
+        "validation_map": _map(result.validation),
         "thresholds": {
             "validation": result.detector.threshold,
             "test": result.detector.test_threshold,
@@ -75,6 +68,10 @@ def document(result: PaperResult) -> Document:
         "seconds": round(result.seconds, 1),
         "machine": result.machine,
     }
+
+
+def _map(site: Site) -> Document:
+    return {"scans": len(site.scans), "tiles": len(site.tiles.points)}
 
 
 def _experiments(result: PaperResult) -> list[Document]:
@@ -110,16 +107,11 @@ def _method(method: MethodResult, ours: bool) -> Document:
 
 def _kind(result: PaperResult, kind: ChangeKind) -> Document:
     """Return the F1 of every method, micro-aggregated over the experiments of one operation."""
+    tests = [test for test, trial in enumerate(result.trials) if trial.experiment.operation == kind]
     rows = {}
     for method in result.methods:
-        chosen, best = (
-            pooled(
-                counts
-                for counts, trial in zip(method.counts(threshold), result.trials, strict=True)
-                if trial.experiment.operation == kind
-            )
-            for threshold in _both(method)
-        )
+        ways = (method.counts(threshold) for threshold in _both(method))
+        chosen, best = (pooled(counts[test] for test in tests) for counts in ways)
         rows[method.test.name] = {"f1": _known(chosen.f1), "f1_at_test_threshold": _known(best.f1)}
     return rows
 
@@ -138,17 +130,10 @@ Rows = list[list[str]]  #: the columns' names first
 def tables(figures: Document) -> Group:
     """Show Tables 5 and 6 on a terminal, with the paper's figures beside ours."""
     threshold = figures["thresholds"]["validation"]
+    first = f"Table 5: {figures['model']} above {threshold:.2f}, chosen on another corridor"
+    second = "Table 6: all experiments; in brackets at the threshold that is best on them, as the paper's"
     return Group(
-        _table(
-            f"Table 5: {figures['model']} above {threshold:.2f}, chosen on another corridor",
-            _table_5(figures),
-            total=True,
-        ),
-        _table(
-            "Table 6: all experiments; in brackets at the threshold that is best on them, as the paper's",
-            _table_6(figures),
-        ),
-        _summary(figures),
+        _table(first, _table_5(figures), total=True), _table(second, _table_6(figures)), _summary(figures)
     )
 
 
@@ -189,9 +174,8 @@ def _summary(figures: Document) -> str:
 
 
 def _table(title: str, rows: Rows, *, total: bool = False) -> Table:
-    table = titled_table(title, *rows[0])
-    for number, row in enumerate(rows[1:], start=1):
-        table.add_row(*row, style="bold" if total and number == len(rows) - 1 else "")
+    table = titled_table(title, rows[0], rows[1:])
+    table.rows[-1].style = "bold" if total else ""
     return table
 
 
@@ -202,11 +186,13 @@ def _ratio(value: float | None) -> str:
 def write_report(result: PaperResult, figures: Document, folder: Path) -> Path:
     """Write `report.html`, `paper.json` and a PNG a figure into the folder; return the report. Raises OSError."""
     every = pictures(result)
-    drawn = [(picture.caption, picture.name, png(picture.figure)) for picture in every if picture.figure]
-    for _, name, content in drawn:
-        write_bytes(folder / f"{name}.png", content)
+    images = []
+    for picture in every:
+        if picture.figure is not None:
+            content = png(picture.figure)
+            write_bytes(folder / f"{picture.name}.png", content)
+            images.append((picture.caption, content))
     write_json(folder / "paper.json", figures)
-    images = [(caption, content) for caption, _, content in drawn]
     page = _page(figures, images, [picture.left_out for picture in every if picture.figure is None])
     write_bytes(folder / "report.html", page.encode())
     return folder / "report.html"
@@ -220,16 +206,11 @@ def _page(figures: Document, drawn: Sequence[tuple[str, bytes]], left_out: Seque
         for caption, picture in drawn
     )
     thresholds = figures["thresholds"]
-    poses = (
-        "true poses"
-        if figures["settings"]["true_poses"]
-        else "poses found by registration, modified scans registered again"
-    )
-    where = (
-        "in all scans of a tile"
-        if figures["settings"]["everywhere"]
-        else "in the modified scan alone, as in the paper"
-    )
+    settings = figures["settings"]
+    poses = "poses found by registration, modified scans registered again"
+    poses = "true poses" if settings["true_poses"] else poses
+    where = "in the modified scan alone, as in the paper"
+    where = "in all scans of a tile" if settings["everywhere"] else where
     return (
         '<!doctype html><html lang="en"><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width">'
@@ -248,8 +229,8 @@ def _page(figures: Document, drawn: Sequence[tuple[str, bytes]], left_out: Seque
 
 
 def _html(rows: Rows) -> str:
-    head, *body = [[html.escape(cell) for cell in row] for row in rows]
-    lines = ["<tr>" + "".join(f"<td>{cell}</td>" for cell in row) + "</tr>" for row in body]
-    return (
-        "<table><tr>" + "".join(f"<th>{cell}</th>" for cell in head) + "</tr>" + "".join(lines) + "</table>"
-    )
+    lines = []
+    for number, row in enumerate(rows):
+        tag = "td" if number else "th"
+        lines.append("".join(f"<{tag}>{html.escape(cell)}</{tag}>" for cell in row))
+    return "<table>" + "".join(f"<tr>{line}</tr>" for line in lines) + "</table>"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -12,10 +12,12 @@ from numpy.typing import NDArray
 from worker.benchmarks.methods import CachedDetector
 from worker.benchmarks.paper.experiments import Trial
 from worker.benchmarks.paper.site import Site
+from worker.cloud.poses import transformed
 from worker.cloud.tiling import TilePairs, pair_tiles
 from worker.cloud.types import Floats, Points
 from worker.metrics import Confusion, confusion, pooled
 from worker.progress import Progress
+from worker.simulation.scenes import rigid
 
 #: What is swept, in the unit of its name; the first level of each is nothing at all.
 LEVELS: dict[str, tuple[float, ...]] = {
@@ -69,27 +71,25 @@ def disturbed(site: Site, trial: Trial, what: str, level: float) -> TilePairs:
     if level == 0:
         return trial.pairs
     if what == "jitter (mm)":
-        return _each(trial.pairs, lambda points: points + rng.normal(0.0, level / 1000, points.shape))
+        return _by_tile(trial.pairs, lambda points: points + rng.normal(0.0, level / 1000, points.shape))
     if what == "dropout (%)":
-        return _each(trial.pairs, lambda points: points[rng.random(len(points)) >= level / 100])
+        return _by_tile(trial.pairs, lambda points: points[rng.random(len(points)) >= level / 100])
     if what == "translation (cm)":
         heading = rng.uniform(0, 2 * np.pi)
         shift = level / 100 * np.array([np.cos(heading), np.sin(heading), 0.0])
         moved: Floats = trial.current + shift
     elif what == "yaw (degrees)":
-        moved = _turned(trial.current, np.radians(level))
+        moved = _turned(trial.current, level)
     else:
         raise ValueError(f"no disturbance {what}; there are {', '.join(LEVELS)}")
     return pair_tiles(site.tiles, moved.astype(np.float32), settings=site.settings.tiling)
 
 
-def _each(pairs: TilePairs, change: Callable[[Points], NDArray[Any]]) -> TilePairs:
-    current = tuple(change(points).astype(np.float32) for points in pairs.current)
-    return TilePairs(reference=pairs.reference, current=current, observed=pairs.observed)
+def _by_tile(pairs: TilePairs, change: Callable[[Points], NDArray[Any]]) -> TilePairs:
+    return replace(pairs, current=tuple(change(points).astype(np.float32) for points in pairs.current))
 
 
 def _turned(points: Points, yaw: float) -> Floats:
     middle = np.append((points.min(axis=0) + points.max(axis=0))[:2] / 2, 0.0)
-    turn = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
-    turned: Floats = (points - middle) @ turn.T + middle
+    turned: Floats = transformed(points - middle, rigid(yaw=yaw)) + middle
     return turned

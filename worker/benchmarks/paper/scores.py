@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from worker.benchmarks.methods import CachedDetector, Method, TileScore, change_scores, encode_reference
 from worker.benchmarks.paper.experiments import Trial
-from worker.cloud.tiling import TilePairs, Tiles
+from worker.cloud.tiling import Tiles
 from worker.cloud.types import Bools, Floats
 
 UNCHANGED_A_TRIAL = 15  #: of the many that are rightly left alone; the others are drawn all
@@ -53,15 +53,11 @@ def scored_by_detector(name: str, cached: CachedDetector, trials: Sequence[Trial
 
 def scored_by_baseline(baseline: Method, trials: Sequence[Trial]) -> MethodScores:
     """Score every trial by a baseline; its seconds are the median."""
-    seconds: list[float] = []
-
-    def timed(pairs: TilePairs) -> TileScore:
+    scores, seconds = [], []
+    for trial in trials:
         begun = time.perf_counter()
-        scores = baseline.score(pairs)
+        scores.append(baseline.score(trial.pairs))
         seconds.append(time.perf_counter() - begun)
-        return scores
-
-    scores = [timed(trial.pairs) for trial in trials]
     return _method_scores(baseline.name, scores, trials, float(np.median(seconds)))
 
 
@@ -83,8 +79,6 @@ class Embedding:
     places: Floats  #: (P, 2)
     explained: tuple[float, float]  #: share of the variance along each
     outcomes: NDArray[np.str_]  #: (P,) TP, FP, FN or TN
-    distances: Floats  #: (P,) between both descriptors
-    scores: Floats  #: (P,)
 
 
 def embed(
@@ -95,7 +89,7 @@ def embed(
     if known is None:
         return None
     rng = np.random.default_rng(SEED)
-    vectors, outcomes, distances, scores = [], [], [], []
+    vectors, outcomes = [], []
     for trial, score in zip(trials, method.scores, strict=True):
         outcome = outcomes_of(score, trial.truth, threshold)
         chosen = _chosen(outcome, trial.pairs.observed, rng)
@@ -105,17 +99,9 @@ def embed(
         current = Tiles(grid=pair.reference.grid, indices=pair.reference.indices, points=pair.current)
         reference, now = known[chosen], encode_reference(cached.detector, current)["descriptors"]
         vectors.append(np.hstack([np.abs(reference - now), reference * now]))
-        distances.append(np.linalg.norm(reference - now, axis=1))
         outcomes.append(outcome[chosen])
-        scores.append(score[chosen])
     places, explained = principal(np.concatenate(vectors))
-    return Embedding(
-        places=places,
-        explained=explained,
-        outcomes=np.concatenate(outcomes),
-        distances=np.concatenate(distances),
-        scores=np.concatenate(scores),
-    )
+    return Embedding(places=places, explained=explained, outcomes=np.concatenate(outcomes))
 
 
 def outcomes_of(scores: Floats, truth: NDArray[np.bool_], threshold: float) -> NDArray[np.str_]:

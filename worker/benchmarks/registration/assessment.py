@@ -11,7 +11,7 @@ from worker.benchmarks.documents import Document, pose_spread
 from worker.benchmarks.trajectory import WRONG, align
 from worker.cloud.poses import difference, inverse
 from worker.cloud.types import Matrix4
-from worker.pipeline.registration.results import RegistrationResult, ScanResult
+from worker.pipeline.registration.results import ScanResult
 
 Pair = tuple[float | None, float | None]  #: metres and radians
 
@@ -21,8 +21,7 @@ class PoseError:
     """One accepted scan against the truth, and the sigma that the map gives for it."""
 
     name: str
-    metres: float
-    radians: float
+    off: tuple[float, float]  #: metres and radians, all poses fitted to the true ones
     from_reference: Pair  #: the same with the frame held at the map's reference scan
     sigma: Pair  #: as the map states it against that scan; None where it states none
 
@@ -30,8 +29,7 @@ class PoseError:
         """Return it as JSON; centimetres and degrees."""
         return {
             "name": self.name,
-            "centimetres": 100 * self.metres,
-            "degrees": float(np.degrees(self.radians)),
+            **_both_units("", self.off),
             **_both_units("from_reference_", self.from_reference),
             **_both_units("sigma_", self.sigma),
         }
@@ -55,8 +53,8 @@ class Assessment:
             "of": self.scans,
             "foreign_accepted": len(self.foreign_accepted),
             "foreign": self.foreign,
-            "wrong": sum(error.metres > WRONG for error in self.errors),
-            **pose_spread([(error.metres, error.radians) for error in self.errors], "median", "worst"),
+            "wrong": sum(error.off[0] > WRONG for error in self.errors),
+            **pose_spread([error.off for error in self.errors], "median", "worst"),
             "translation_sigma": _calibration([(e.from_reference[0], e.sigma[0]) for e in self.errors]),
             "rotation_sigma": _calibration([(e.from_reference[1], e.sigma[1]) for e in self.errors]),
             "missing": list(self.missing),
@@ -74,53 +72,37 @@ def assess(
     """
     home = {scan: pose for scan, pose in enumerate(true) if pose is not None}
     out_of_place = [outcome for scan, outcome in enumerate(outcomes) if scan not in home]
-    accepted = {scan: placement for scan in home if (placement := outcomes[scan].registration) is not None}
-    frame: Matrix4 | None = None
-    errors: list[PoseError] = []
-    if accepted:
-        poses = [placement.map_from_scan for placement in accepted.values()]
-        frame = align(poses, [home[scan] for scan in accepted])
-        held = _held_at(reference, outcomes, true)
-        errors = [
-            _error(outcomes[scan].name, placement, home[scan], frame, None if scan == reference else held)
-            for scan, placement in accepted.items()
-        ]
+    poses = {scan: placed.map_from_scan for scan in home if (placed := outcomes[scan].registration)}
+    frame = align(list(poses.values()), [home[scan] for scan in poses]) if poses else None
+    held: Matrix4 | None = None  # true_from_map by the reference scan alone
+    if reference is not None and reference in poses:
+        held = home[reference] @ inverse(poses[reference])
     return Assessment(
         scans=len(home),
-        errors=tuple(errors),
-        missing=tuple(outcomes[scan].name for scan in home if scan not in accepted),
+        errors=tuple(
+            PoseError(
+                name=outcomes[scan].name,
+                off=difference(home[scan], frame @ pose),
+                from_reference=_known(held if scan != reference else None, pose, home[scan]),
+                sigma=_stated(outcomes[scan]),
+            )
+            for scan, pose in poses.items()
+            if frame is not None
+        ),
+        missing=tuple(outcomes[scan].name for scan in home if scan not in poses),
         foreign=len(out_of_place),
         foreign_accepted=tuple(outcome.name for outcome in out_of_place if outcome.registration),
         true_from_map=frame,
     )
 
 
-def _held_at(
-    reference: int | None, outcomes: Sequence[ScanResult], true: Sequence[Matrix4 | None]
-) -> Matrix4 | None:
-    """Return true_from_map by the reference scan alone; None where there is none, or it is of another building."""
-    if reference is None:
-        return None
-    placement, pose = outcomes[reference].registration, true[reference]
-    if placement is None or pose is None:
-        return None
-    true_from_map: Matrix4 = pose @ inverse(placement.map_from_scan)
-    return true_from_map
+def _known(true_from_map: Matrix4 | None, pose: Matrix4, true: Matrix4) -> Pair:
+    return (None, None) if true_from_map is None else difference(true, true_from_map @ pose)
 
 
-def _error(
-    name: str, placement: RegistrationResult, true: Matrix4, true_from_map: Matrix4, held: Matrix4 | None
-) -> PoseError:
-    metres, radians = difference(true, true_from_map @ placement.map_from_scan)
-    from_reference = (None, None) if held is None else difference(true, held @ placement.map_from_scan)
-    sigma = placement.uncertainty
-    return PoseError(
-        name=name,
-        metres=metres,
-        radians=radians,
-        from_reference=from_reference,
-        sigma=(None, None) if sigma is None else (sigma.translation, sigma.rotation),
-    )
+def _stated(outcome: ScanResult) -> Pair:
+    sigma = outcome.registration and outcome.registration.uncertainty
+    return (sigma.translation, sigma.rotation) if sigma else (None, None)
 
 
 def _calibration(rows: Sequence[tuple[float | None, float | None]]) -> dict[str, float] | None:

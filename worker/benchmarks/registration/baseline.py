@@ -26,10 +26,8 @@ PAPER_DISTANCES = (0.05,)  #: metres, of correspondences
 COARSE_TO_FINE = (0.6, 0.3, 0.1, 0.05)
 VOXEL, NORMAL_RADIUS, NORMAL_NEIGHBORS = 0.05, 0.10, 30  # Table 1
 MIN_FITNESS, MAX_RMSE = 0.55, 0.05  # Table 1
-GRAPH_DISTANCE, PRUNE = (
-    0.05,
-    0.25,
-)  # metres of Table 1, and Open3D's default share below which a loop counts as false
+GRAPH_DISTANCE = 0.05  # metres, Table 1
+PRUNE = 0.25  # Open3D's default share, below which a loop counts as false
 
 Pair = tuple[int, int]  #: indices of two files, the lower first
 Poses = Mapping[int, Matrix4]  #: map_from_scan by index of the file
@@ -51,11 +49,9 @@ class BaselineSettings:
 class BaselineEdge:
     """A pair that was accepted."""
 
-    pair: tuple[int, int]  #: i, j: indices of the files, i < j
+    pair: Pair
     i_from_j: Matrix4  #: (4, 4)
     information: Floats  #: (6, 6), as Open3D weighs edges
-    fitness: float
-    inlier_rmse: float  #: metres
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
@@ -159,13 +155,7 @@ def _edge(
     if result.fitness <= MIN_FITNESS or result.inlier_rmse >= MAX_RMSE:
         return None
     information = _registration.get_information_matrix_from_point_clouds(source, target, distances[-1], pose)
-    return BaselineEdge(
-        pair=pair,
-        i_from_j=np.asarray(pose),
-        information=np.asarray(information),
-        fitness=result.fitness,
-        inlier_rmse=result.inlier_rmse,
-    )
+    return BaselineEdge(pair=pair, i_from_j=np.asarray(pose), information=np.asarray(information))
 
 
 def _fused(files: Sequence[ScanFile], poses: dict[int, Matrix4]) -> int:
@@ -264,10 +254,9 @@ def _apart(differences: Sequence[tuple[float, float]]) -> Document:
 
 
 def _to_the_truth(poses: Poses, true: Sequence[Matrix4]) -> Document:
-    """Hold a map against the truth as the table of our own map does; centimetres and degrees."""
-    members = sorted(poses)
-    frame = align([poses[member] for member in members], [true[member] for member in members])
-    off = [difference(true[member], frame @ poses[member]) for member in members]
+    """Compare a map with the truth as the table of our own map does; centimetres and degrees."""
+    frame = align(list(poses.values()), [true[scan] for scan in poses])
+    off = [difference(true[scan], frame @ pose) for scan, pose in poses.items()]
     return {"wrong": sum(metres > WRONG for metres, _ in off), **pose_spread(off, "median", "worst")}
 
 

@@ -56,8 +56,8 @@ class RegistrationBenchmarkSettings:
     walk: WalkSettings = field(default_factory=WalkSettings)  #: its seed gives way to each of `seeds`
     seeds: tuple[int, ...] = (1,)
     kinds: tuple[ScenarioKind, ...] = KINDS
-    plain: bool = False  #: the Open3D baseline too, on the drifted scans of the first seed
-    plain_pairs: int | None = None  #: so many random pairs instead of all, and the seconds extrapolated
+    baseline: bool = False  #: the Open3D baseline too, on the drifted scans of the first seed
+    baseline_pairs: int | None = None  #: so many random pairs instead of all, and the seconds extrapolated
     survey: bool = True  #: time a scan of a second visit on the drifted map of the first seed
     real: Path | None = None  #: folder of real scans
     out: Path | None = None  #: folder for pictures
@@ -97,7 +97,7 @@ def evaluate(settings: RegistrationBenchmarkSettings, progress: Progress = no_pr
 
     Raises MapFailed where a scenario makes no map, OSError for the folders.
     """
-    if settings.plain and "drifted" not in settings.kinds:
+    if settings.baseline and "drifted" not in settings.kinds:
         raise ValueError("the baseline is run on the scenario `drifted`; name it among the scenarios")
     result: Document = {"machine": machine(load=os.getloadavg()[0]), "paper": PAPER, "scenarios": []}
     for seed in settings.seeds:
@@ -138,7 +138,7 @@ def _beside(
 ) -> Document:
     """Run the baseline on the same scans, and a survey on the map."""
     beside: Document = {}
-    if settings.plain:
+    if settings.baseline:
         beside["plain"] = [
             {"gates": list(distances), **_baseline(run, distances, settings, progress)}
             for distances in (baseline.COARSE_TO_FINE, baseline.PAPER_DISTANCES)
@@ -155,8 +155,8 @@ def _baseline(
     kept = frozenset((min(p.target, p.source), max(p.target, p.source)) for p in run.built.kept)
     chosen = baseline.BaselineSettings(
         distances=distances,
-        sample=settings.plain_pairs,
-        always=kept if settings.plain_pairs else frozenset(),
+        sample=settings.baseline_pairs,
+        always=kept if settings.baseline_pairs else frozenset(),
     )
     used = processor_seconds()
     theirs = baseline.build_baseline(run.scenario.files, chosen, progress)
@@ -166,9 +166,7 @@ def _baseline(
         for scan, outcome in enumerate(run.built.outcomes)
         if outcome.registration
     }
-    true: list[Matrix4] = [
-        pose for pose in run.scenario.true if pose is not None
-    ]  # of all: none is out of place
+    true = [pose for pose in run.scenario.true if pose is not None]  # all: none is out of place
     compared = baseline.compare(theirs, ours, kept, true)
     return {
         **compared,
@@ -197,27 +195,25 @@ def time_survey(
         folder=folder,
         name="survey",
     )
-    path = folder / "survey.pcd"
     map_from_true = inverse(true_from_map)
     surface, prior = reference.surface(), map_from_true @ simulated.prior
-    reading, registering, processor = [], [], []
+    seconds = []
     for _ in range(REPEATS + 1):
         begun, used = time.perf_counter(), time.process_time()
-        scan = read_scan(path)
+        scan = read_scan(folder / "survey.pcd")
         read = time.perf_counter()
         hypothesis = register(prepare(scan, settings), surface, prior=prior, settings=settings)
-        reading.append(read - begun)
-        registering.append(time.perf_counter() - read)
-        processor.append(time.process_time() - used)
+        seconds.append((read - begun, time.perf_counter() - read, time.process_time() - used))
+    reading, registering, processor = np.array(seconds[1:]).T
     metres, radians = difference(map_from_true @ simulated.world_from_sensor, hypothesis.target_from_source)
     return {
         "points": len(scan.points),
         "map_points": len(reference.points),
-        "read_seconds": float(np.median(reading[1:])),
-        "register_seconds": float(np.median(registering[1:])),
-        "register_least": min(registering[1:]),
-        "register_most": max(registering[1:]),
-        "processor_seconds": float(np.median(processor[1:])),
+        "read_seconds": float(np.median(reading)),
+        "register_seconds": float(np.median(registering)),
+        "register_least": float(registering.min()),
+        "register_most": float(registering.max()),
+        "processor_seconds": float(np.median(processor)),
         "centimetres": 100 * metres,
         "degrees": float(np.degrees(radians)),
     }

@@ -38,19 +38,15 @@ class RealPair:
 PAIRS = (
     RealPair("room_scan", "room_scan", "room_scan1.pcd", "room_scan2.pcd", "T_scan2_to_scan1.txt"),
     RealPair("corridor_pair", "corridor_pair", "cloud_0.ply", "cloud_1.ply", "T_cloud1_to_cloud0.txt"),
-    RealPair(
-        "ipad 808",
-        "ipad_rooms",
-        "pix4d_database_808_db.ply",
-        "pix4d_user_808_user.ply",
-        "T_user_to_db_808.txt",
-    ),
-    RealPair(
-        "ipad 560",
-        "ipad_rooms",
-        "pix4d_database_560_db.ply",
-        "pix4d_user_560_user.ply",
-        "T_user_to_db_560.txt",
+    *(
+        RealPair(
+            f"ipad {room}",
+            "ipad_rooms",
+            f"pix4d_database_{room}_db.ply",
+            f"pix4d_user_{room}_user.ply",
+            f"T_user_to_db_{room}.txt",
+        )
+        for room in (808, 560)
     ),
 )
 FRAMES = tuple(f"kinect_pairwise/capture000{number}.pcd" for number in range(1, 6))

@@ -37,33 +37,26 @@ def tables(result: Document) -> Group:
 
 def _scenario(row: Document, paper: Document) -> Table:
     report, seconds = row["report"], row["seconds"]
-    table = titled_table(f"{row['scenario']}, seed {row['seed']}", "", "measured", "the paper")
-    table.add_row(
-        "scans placed", f"{row['accepted']} of {row['of']}", f"{paper['accepted']} of {paper['scans']}"
-    )
-    if row["foreign"]:
-        table.add_row(
-            "scans of another building placed", f"{row['foreign_accepted']} of {row['foreign']}", ""
-        )
-    table.add_row("off the truth, median (worst)", _errors(row), "")
-    table.add_row("placed, but over 10 cm off", str(row["wrong"]), "")
-    table.add_row("within 2 sigma; median error / sigma", _calibration(row), "")
-    table.add_row(
-        "RMSE of accepted pairs", *(_of_pairs(totals, "rmse", 100, 2, " cm") for totals in (report, paper))
-    )
-    table.add_row(
-        "fitness of accepted pairs", *(_of_pairs(totals, "fitness", 1, 3) for totals in (report, paper))
-    )
+    placed = [f"{totals['accepted']} of {totals['of']}" for totals in (row, paper | {"of": paper["scans"]})]
     tried = f"{report['calls_saved']:.0%} ({report['pairs_tried']} of {report['pairs_possible']} tried)"
-    table.add_row("ICP calls saved", tried, f"over {paper['calls_saved']:.0%}")
-    graph = f"{report['pairs_accepted']}, {report['pairs_contradicted']}"
-    table.add_row("pairs accepted, wrong loops thrown out", graph, "")
+    foreign = ("scans of another building placed", f"{row['foreign_accepted']} of {row['foreign']}")
+    rows = (
+        ("scans placed", *placed),
+        *([foreign] if row["foreign"] else []),
+        ("off the truth, median (worst)", _errors(row)),
+        ("placed, but over 10 cm off", str(row["wrong"])),
+        ("within 2 sigma; median error / sigma", _calibration(row)),
+        ("RMSE of accepted pairs", *(_of_pairs(totals, "rmse", 100, 2, " cm") for totals in (report, paper))),
+        ("fitness of accepted pairs", *(_of_pairs(totals, "fitness", 1, 3) for totals in (report, paper))),
+        ("ICP calls saved", tried, f"over {paper['calls_saved']:.0%}"),
+        ("pairs accepted, wrong loops thrown out", f"{report['pairs_accepted']}, {report['pairs_contradicted']}"),
+        ("seconds", f"{seconds['total']:.1f} ({row['processor_seconds']:.1f} of processors)"),
+    )  # fmt: skip
     stages = ", ".join(f"{stage} {time:.1f}" for stage, time in seconds.items() if stage != "total")
-    processor = f"{seconds['total']:.1f} ({row['processor_seconds']:.1f} of processors)"
-    table.add_row("seconds", processor, "")
     missing = f"left out: {', '.join(row['missing'])}" if row["missing"] else ""
-    table.caption = "\n".join(line for line in (stages, missing) if line)
-    return table
+    caption = "\n".join(line for line in (stages, missing) if line)
+    title = f"{row['scenario']}, seed {row['seed']}"
+    return titled_table(title, ("", "measured", "the paper"), rows, caption=caption)
 
 
 def _of_pairs(totals: Document, what: str, factor: float, digits: int, unit: str = "") -> str:
@@ -94,19 +87,21 @@ def _calibration(row: Document) -> str:
 
 def _baseline(row: Document) -> Table:
     distances = ", ".join(f"{100 * distance:g}" for distance in row["gates"])
-    table = titled_table(f"the Open3D baseline on the drifted scans, correspondences within {distances} cm")
     seconds, truth = row["seconds"], row["to_the_truth"]
     run = f"{row['pairs_run']} of {row['pairs_possible']} pairs run, {row['processor_seconds']:.0f} s of processors"
     extrapolated = "; the time of the others extrapolated" if row["pairs_run"] < row["pairs_possible"] else ""
-    table.add_row("seconds", f"{seconds['total']:.0f}, {row['times_faster']:.1f} times ours")
-    table.add_row("", run + extrapolated)
-    table.add_row("scans placed", f"{row['accepted']}, {truth['wrong']} of them over 10 cm off")
-    table.add_row("off the truth, median (worst)", _errors(truth))
-    table.add_row("pairs accepted", f"{row['pairs_accepted']}, {row['pairs_wrong']} of them over 10 cm off")
-    table.add_row("ours", f"{row['our_pairs']}, {row['our_pairs_wrong']} of them over 10 cm off")
-    table.add_row("pairs of both, ours to theirs", _apart(row["common"]))
-    table.add_row("those where theirs is right", _apart(row["common_right"]))
-    return table
+    rows = (
+        ("seconds", f"{seconds['total']:.0f}, {row['times_faster']:.1f} times ours"),
+        ("", run + extrapolated),
+        ("scans placed", f"{row['accepted']}, {truth['wrong']} of them over 10 cm off"),
+        ("off the truth, median (worst)", _errors(truth)),
+        ("pairs accepted", f"{row['pairs_accepted']}, {row['pairs_wrong']} of them over 10 cm off"),
+        ("ours", f"{row['our_pairs']}, {row['our_pairs_wrong']} of them over 10 cm off"),
+        ("pairs of both, ours to theirs", _apart(row["common"])),
+        ("those where theirs is right", _apart(row["common_right"])),
+    )
+    title = f"the Open3D baseline on the drifted scans, correspondences within {distances} cm"
+    return titled_table(title, (), rows)
 
 
 def _apart(row: Document) -> str:
@@ -120,38 +115,42 @@ def _apart(row: Document) -> str:
 
 
 def _survey(row: Document) -> Table:
-    table = titled_table(f"one scan of {row['points']:,} points on a warm map of {row['map_points']:,}")
     times = f"{row['register_seconds']:.2f} ({row['register_least']:.2f} to {row['register_most']:.2f})"
-    table.add_row("seconds to register, median (least to most)", times)
-    table.add_row("seconds of processors, reading too", f"{row['processor_seconds']:.2f}")
-    table.add_row("seconds to read the file", f"{row['read_seconds']:.2f}")
-    table.add_row("off the truth", f"{row['centimetres']:.1f} cm, {row['degrees']:.2f} degrees")
-    return table
+    rows = (
+        ("seconds to register, median (least to most)", times),
+        ("seconds of processors, reading too", f"{row['processor_seconds']:.2f}"),
+        ("seconds to read the file", f"{row['read_seconds']:.2f}"),
+        ("off the truth", f"{row['centimetres']:.1f} cm, {row['degrees']:.2f} degrees"),
+    )
+    title = f"one scan of {row['points']:,} points on a warm map of {row['map_points']:,}"
+    return titled_table(title, (), rows)
 
 
 def _real(real: Document) -> Table:
-    table = titled_table(
-        "real scans, no priors", "scans", "joined", "to the given transform", "fitness", "RMSE", "seconds"
-    )
-    for row in real["pairs"]:
-        off = f"{row['centimetres']:.1f} cm, {row['degrees']:.2f} degrees" if row["joined"] else ""
-        table.add_row(row["name"], "yes" if row["joined"] else "no", off, *_quality(row))
     frames = real["frames"]
     worst = (
         f"{frames['centimetres_worst']:.1f} cm, {frames['degrees_worst']:.2f} degrees (worst, to pairs alone)"
     )
-    joined = f"{frames['accepted']} of {frames['frames']}"
-    table.add_row(frames["name"], joined, worst, *_quality(frames))
+    rows = [
+        (
+            row["name"],
+            "yes" if row["joined"] else "no",
+            f"{row['centimetres']:.1f} cm, {row['degrees']:.2f} degrees" if row["joined"] else "",
+            *_quality(row),
+        )
+        for row in real["pairs"]
+    ]
+    rows.append((frames["name"], f"{frames['accepted']} of {frames['frames']}", worst, *_quality(frames)))
     for row in real["foreign"]:
         verdict = "yes: wrong" if row["joined"] else "no"
-        table.add_row(" + ".join(row["names"]), verdict, "not one place", *_quality(row))
-    return table
+        rows.append((" + ".join(row["names"]), verdict, "not one place", *_quality(row)))
+    columns = ("scans", "joined", "to the given transform", "fitness", "RMSE", "seconds")
+    return titled_table("real scans, no priors", columns, rows)
 
 
 def _quality(row: Document) -> tuple[str, str, str]:
-    fitness = shown(row.get("fitness"), ".2f")
-    rmse = row.get("rmse_centimetres")
-    return fitness, "" if rmse is None else f"{rmse:.1f} cm", f"{row['seconds']:.1f}"
+    rmse = shown(row.get("rmse_centimetres"), ".1f", unit=" cm")
+    return shown(row.get("fitness"), ".2f"), rmse, f"{row['seconds']:.1f}"
 
 
 def draw_run(folder: Path, scenario: Scenario, seed: int, built: BuiltMap, assessment: Assessment) -> None:

@@ -8,6 +8,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
+from worker.benchmarks.documents import names_among
 from worker.benchmarks.trajectory import scan_files
 from worker.cloud.types import Matrix4
 from worker.pipeline.registration.results import ScanFile
@@ -85,12 +86,8 @@ def scenario(walk: Walk, kind: ScenarioKind, *, seed: int) -> Scenario:
 
 def kinds_named(words: str) -> tuple[ScenarioKind, ...]:
     """Read a list with commas, in the order given; `none` is none. Raises ValueError for another name."""
-    known = {str(kind): kind for kind in KINDS}
-    names = [word.strip() for word in words.split(",") if word.strip() != "none"]
-    unknown = [name for name in names if name not in known]
-    if unknown:
-        raise ValueError(f"no scenario {', '.join(unknown)}; there are {', '.join(KINDS)}, or none")
-    return tuple(known[name] for name in names)
+    names: tuple[ScenarioKind | Literal["none"], ...] = names_among(words, (*KINDS, "none"), "scenario")
+    return tuple(name for name in names if name != "none")
 
 
 def _out_of_place(

@@ -11,13 +11,7 @@ import numpy as np
 from worker.benchmarks.documents import Document, spread
 from worker.benchmarks.methods import baseline_methods, detector_methods
 from worker.benchmarks.revisit.measures import TileTable, measure, score_visits, threshold_of, tile_table
-from worker.benchmarks.revisit.plan import (
-    TEST_SEED,
-    VALIDATION_SEED,
-    RevisitSettings,
-    VisitPlan,
-    plan_visits,
-)
+from worker.benchmarks.revisit.plan import TEST_SEED, VALIDATION_SEED, RevisitSettings, plan_visits
 from worker.benchmarks.revisit.report import draw
 from worker.benchmarks.revisit.visits import Revisit, ScanErrors, load_visits, make_visits
 from worker.benchmarks.trajectory import WRONG
@@ -53,15 +47,12 @@ def evaluate(settings: RevisitBenchmarkSettings, progress: Progress = no_progres
     """
     card = open_card(settings.model_store, settings.model)
     made = settings.made.model_copy(update={"pipeline": PipelineSettings().for_model(card.preprocessing)})
-    methods = (
-        *detector_methods(settings.model_store, settings.model, settings.weights),
-        *baseline_methods(),
-    )
-    test_plans, test, made_now = _visits(settings.visits, TEST_SEED, made, settings.out, progress)
-    other_plans, other, made_more = _visits(
+    ours = detector_methods(settings.model_store, settings.model, settings.weights)
+    methods = (*ours, *baseline_methods())
+    test, table, made_now = _visits(settings.visits, TEST_SEED, made, settings.out, progress)
+    other, other_table, made_more = _visits(
         settings.validation, VALIDATION_SEED, made, settings.out, progress
     )
-    table, other_table = tile_table(test_plans, test), tile_table(other_plans, other)
     _check(table, "--visits")
     _check(other_table, "--validation")
     measured = []
@@ -109,10 +100,12 @@ def summary(table: TileTable, visits: Sequence[Revisit]) -> Document:
 
 def _visits(
     count: int, first_seed: int, made: RevisitSettings, out: Path, progress: Progress
-) -> tuple[tuple[VisitPlan, ...], tuple[Revisit, ...], int]:
+) -> tuple[tuple[Revisit, ...], TileTable, int]:
+    """Return the visits, their tiles, and how many of the visits had to be made."""
     plans = plan_visits(count, made, first_seed=first_seed)
     place, new = make_visits(plans, made, out / VISITS, progress)
-    return plans, load_visits(plans, place), new
+    visits = load_visits(plans, place)
+    return visits, tile_table(plans, visits), new
 
 
 def _check(table: TileTable, option: str) -> None:
@@ -134,7 +127,7 @@ def _visit(visit: Revisit) -> Document:
 
 
 def _scans(errors: Sequence[ScanErrors]) -> Document:
-    """Describe the scans of all visits; a map counts once a visit to it."""
+    """Summarize the scans of all visits; a map counts once a visit to it."""
     metres = np.concatenate([visit.metres for visit in errors])
     sigmas = np.concatenate([visit.sigmas for visit in errors])
     stated = sigmas > 0

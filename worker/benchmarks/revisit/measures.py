@@ -89,13 +89,8 @@ def binned(metres: Floats) -> dict[str, Bools]:
 class VisitScores:
     """What a method said of some visits."""
 
-    scores: tuple[TileScore, ...]  #: one array a visit
+    scores: TileScore  #: (N,) of all tiles, visit after visit
     seconds: float  #: for all of them
-
-    @property
-    def together(self) -> TileScore:
-        """(N,) of all tiles, visit after visit."""
-        return np.concatenate(self.scores)
 
 
 def score_visits(method: Method, visits: Sequence[Revisit], progress: Progress = no_progress) -> VisitScores:
@@ -104,7 +99,7 @@ def score_visits(method: Method, visits: Sequence[Revisit], progress: Progress =
     for done, revisit in enumerate(visits):
         progress(f"scoring: {method.name}", done / len(visits))
         scores.append(method.score(revisit.pairs))
-    return VisitScores(scores=tuple(scores), seconds=time.perf_counter() - begun)
+    return VisitScores(scores=np.concatenate(scores), seconds=time.perf_counter() - begun)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
@@ -119,9 +114,8 @@ class Measured:
     roc_area: float
     average_precision: float
     groups: Mapping[str, Mapping[str, Confusion]]  #: at the chosen threshold
-    alarms_on_slight: (
-        int  #: false alarms at the chosen threshold where something changed, but too little to count
-    )
+    #: false alarms at the chosen threshold where something changed, but too little to count
+    alarms_on_slight: int
     unchanged_visits: int
     unchanged_visits_with_alarm: int
     seconds: float  #: to score the test visits
@@ -149,14 +143,14 @@ class Measured:
 
 def threshold_of(scored: VisitScores, table: TileTable) -> float:
     """Choose the cut with the best F1 over the tiles that count. Raises ValueError where none of them changed."""
-    return best_f1(scored.together[table.counted], table.changed[table.counted], None).threshold
+    return best_f1(scored.scores[table.counted], table.changed[table.counted], None).threshold
 
 
 def measure(
     name: str, scored: VisitScores, table: TileTable, *, threshold: float, stated: float | None = None
 ) -> Measured:
-    """Hold the scores against the truth. Raises ValueError where no tile that counts has changed."""
-    scores, counted = scored.together, table.counted
+    """Compare the scores with the truth. Raises ValueError where no tile that counts has changed."""
+    scores, counted = scored.scores, table.counted
 
     def operating(threshold: float) -> Operating:
         return Operating(threshold=threshold, counts=table.count(scores, threshold))

@@ -8,6 +8,7 @@ from typing import Literal, get_args
 
 from pydantic import Field
 
+from worker.benchmarks.documents import names_among
 from worker.cloud.settings import StrictModel
 from worker.pipeline.settings import PipelineSettings
 from worker.simulation.scenes import BUILDINGS, BuildingKind, Scene
@@ -98,9 +99,4 @@ def plan_visits(count: int, settings: RevisitSettings, *, first_seed: int) -> tu
 
 def kinds_named(words: str) -> tuple[BuildingKind, ...]:
     """Read a list with commas, in the order given. Raises ValueError for another name."""
-    known = {str(kind): kind for kind in KINDS}
-    names = [word.strip() for word in words.split(",")]
-    unknown = [name for name in names if name not in known]
-    if unknown:
-        raise ValueError(f"no building {', '.join(unknown)}; there are {', '.join(KINDS)}")
-    return tuple(known[name] for name in names)
+    return names_among(words, KINDS, "building")

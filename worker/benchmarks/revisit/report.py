@@ -48,24 +48,23 @@ def _methods(result: Document) -> Table:
         f"{there['visits']} visits, {there['without_change']} of them without a change: "
         f"{there['observed']} of {there['tiles']} tiles observed, {there['changed']['counted']} of them changed"
     )
-    table = titled_table(
-        title, "method", "F1 (95%)", "precision", "recall", "false alarms", "quiet visits alarmed", "threshold",
+    columns = (
+        "method", "F1 (95%)", "precision", "recall", "false alarms", "quiet visits alarmed", "threshold",
         "test-optimal: F1", "threshold", "ROC area", "AP", "seconds",
     )  # fmt: skip
-    for row in result["methods"]:
-        table.add_row(row["name"], *_row(row))
     chosen = result["validation"]
-    table.caption = (
+    caption = (
         f"thresholds: best F1 on {chosen['visits']} visits to other buildings with {chosen['changed']['counted']} "
         "changed tiles; test-optimal: best F1 on the test visits themselves"
     )
-    return table
+    return titled_table(title, columns, (_row(row) for row in result["methods"]), caption=caption)
 
 
 def _row(row: Document) -> tuple[str, ...]:
     chosen, best = row["chosen"], row["best"]
     low, high = chosen["f1_interval"]
     return (
+        row["name"],
         f"{shown(chosen['f1'], '.2f')} ({low:.2f}-{high:.2f})",
         shown(chosen["precision"], ".2f"),
         shown(chosen["recall"], ".2f"),
@@ -82,10 +81,10 @@ def _row(row: Document) -> tuple[str, ...]:
 
 def _groups(result: Document) -> Table:
     methods = result["methods"]
-    table = titled_table("changes found; false alarms", "tiles", *(row["name"] for row in methods))
+    table = titled_table("changes found; false alarms", ("tiles", *(row["name"] for row in methods)))
     for by, title in TITLES.items():
         table.add_section()
-        table.add_row(f"[bold]{title}")
+        table.add_row(title, style="bold")
         for group in methods[0]["groups"][by]:
             cells = [_cell(row["groups"][by][group]) for row in methods]
             if any(cells):
@@ -140,10 +139,7 @@ def _curves(methods: Sequence[Measured], table: TileTable) -> Figure:
     truth = table.changed[table.counted]
     scored = [
         ScoredTiles(
-            name=method.name,
-            scores=method.scores[table.counted],
-            truth=truth,
-            chosen=method.chosen.counts,
+            name=method.name, scores=method.scores[table.counted], truth=truth, chosen=method.chosen.counts
         )
         for method in methods
     ]
@@ -185,15 +181,9 @@ def _draw_recall(axes: Axes, methods: Sequence[Measured], by: str, names: Sequen
 def verdicts_of(visit: Revisit, scores: TileScore, threshold: float) -> list[str]:
     """Name what a method said of each tile: (T,) keys of STYLES."""
     flagged = scores > threshold
-    return [
-        _verdict(*row)
-        for row in zip(flagged.tolist(), visit.exists.tolist(), visit.counted.tolist(), strict=True)
-    ]
-
-
-def _verdict(flagged: bool, changed: bool, counted: bool) -> str:
-    if not counted:
-        return "changed, nobody looked" if changed else "not observed"
-    if flagged:
-        return "hit" if changed else "false alarm"
-    return "missed" if changed else "rightly quiet"
+    verdicts: list[str] = np.where(
+        visit.exists,
+        np.where(~visit.counted, "changed, nobody looked", np.where(flagged, "hit", "missed")),
+        np.where(~visit.counted, "not observed", np.where(flagged, "false alarm", "rightly quiet")),
+    ).tolist()
+    return verdicts

@@ -20,12 +20,13 @@ from worker.benchmarks.revisit.plan import RevisitSettings, SitePlan, VisitPlan
 from worker.benchmarks.timing import StageClock
 from worker.benchmarks.trajectory import PlacedScan, map_frame, placed_scans, scan_files
 from worker.cloud import npz
-from worker.cloud.tiling import TileGrid, TilePairs, pair_tiles
-from worker.cloud.types import Bools, Floats, Indices, Matrix4
+from worker.cloud.tiling import TilePairs, pair_tiles
+from worker.cloud.types import Bools, Floats, Matrix4
 from worker.pipeline.flow import BuiltMap, NoScanAccepted, build_map, locate_survey
 from worker.pipeline.registration.results import ScanFile, ScanResult
 from worker.progress import Progress, no_progress
 from worker.simulation.scenes import Scene, rigid
+from worker.simulation.sensor import SimulatedScan
 from worker.simulation.truth import MIN_CELLS, true_changes
 from worker.simulation.visits import drifted_within, edited, visit
 
@@ -112,28 +113,35 @@ class MappedSite:
 def make_visits(
     plans: Sequence[VisitPlan], settings: RevisitSettings, folder: Path, progress: Progress = no_progress
 ) -> tuple[Path, int]:
-    """See to it that the folder has every visit; return where it lies, and how many had to be made.
+    """Make the visits that the folder lacks; return where it lies, and how many had to be made.
 
     Visits made with other settings lie beside them under another name. A map is built anew where a visit to it is
     missing. Raises MapFailed, and OSError for the folder.
     """
     place = folder / settings.fingerprint
+    place.mkdir(parents=True, exist_ok=True)
     made = 0
     for site, group in itertools.groupby(plans, key=lambda plan: plan.site):
-        missing = [plan for plan in group if not is_kept(plan.name, place)]
+        missing = [plan for plan in group if not path_of(plan.name, place).exists()]
         if not missing:
             continue
         with TemporaryDirectory(prefix="spicd-revisit-") as scratch:
             mapped = map_site(site, settings, Path(scratch), progress)
             for plan in missing:
-                save(walk_again(plan, mapped, settings, Path(scratch), progress), place)
+                revisit = walk_again(plan, mapped, settings, Path(scratch), progress)
+                npz.save(path_of(plan.name, place), revisit)
         made += len(missing)
     return place, made
 
 
 def load_visits(plans: Iterable[VisitPlan], place: Path) -> tuple[Revisit, ...]:
-    """Read the visits from where `make_visits` put them."""
-    return tuple(load(plan.name, place) for plan in plans)
+    """Read the visits from where `make_visits` put them. Raises OSError, and ValueError for other files."""
+    return tuple(npz.load(path_of(plan.name, place), Revisit) for plan in plans)
+
+
+def path_of(name: str, place: Path) -> Path:
+    """Return the file of plain arrays that a visit is kept in."""
+    return place / f"{name}.npz"
 
 
 def map_site(
@@ -147,16 +155,7 @@ def map_site(
     scene = plan.scene()
     rng = np.random.default_rng([plan.seed, 5])
     robot_from_world = rigid(*rng.uniform(-3, 3, 2), yaw=float(rng.uniform(0, 360)))
-    taken = visit(
-        scene,
-        settings.stops[plan.kind],
-        seed=10 * plan.seed,
-        prior_error=settings.drift,
-        drift=drifted_within,
-        duration_s=settings.standing_s,
-        folder=folder,
-        name="map-{:02d}",
-    )
+    taken = _walked(scene, settings.stops[plan.kind], 10 * plan.seed, settings, folder, "map")
     files = scan_files(taken, robot_from_world)
     titled = StageClock(progress, prefix=f"{plan.name}: ")
     built = build_map(files, settings=settings.pipeline, progress=titled)
@@ -186,16 +185,7 @@ def walk_again(
     """
     progress(f"{plan.name}: simulating the second visit", 0.0)
     after, poses = edited(site.before, plan.edits(settings), seed=plan.seed, count=plan.stops(settings))
-    taken = visit(
-        after,
-        poses,
-        seed=plan.seed,
-        prior_error=settings.drift,
-        drift=drifted_within,
-        duration_s=settings.standing_s,
-        folder=folder,
-        name=f"{plan.case}-{{:02d}}",
-    )
+    taken = _walked(after, poses, plan.seed, settings, folder, plan.case)
     titled = StageClock(progress, prefix=f"{plan.name}: ")
     pairs, outcomes = _located(scan_files(taken, site.map_from_world), site, settings, titled)
     scans = placed_scans(outcomes, taken, site.map_from_world)
@@ -208,13 +198,12 @@ def walk_again(
         first=[scan.true for scan in site.scans],
         second=[scan.true for scan in scans],
     )
-    index = tuple((indices - grid.lowest).T)
     return Revisit(
         name=plan.name,
         pairs=pairs,
-        cells=exists.cells[index],
-        in_sight=visible.cells[index],
-        outside=int((exists.changed & ~kept_tiles(grid, indices)).sum()),
+        cells=exists.cells_of(indices),
+        in_sight=visible.cells_of(indices),
+        outside=int(exists.changed.sum() - exists.of(indices).sum()),
         misalignment=residual_misalignments(site.scans, scans, grid, indices),
         sigma=stated_sigmas(scans, grid, indices),
         first=site.errors,
@@ -222,11 +211,25 @@ def walk_again(
     )
 
 
-def kept_tiles(grid: TileGrid, indices: Indices) -> Bools:
-    """Mark the tiles of the grid that the map has: (I, J, K)"""
-    marked = np.zeros(grid.shape, dtype=np.bool_)
-    marked[tuple((indices - grid.lowest).T)] = True
-    return marked
+def _walked(
+    scene: Scene,
+    poses: int | tuple[Matrix4, ...],
+    seed: int,
+    settings: RevisitSettings,
+    folder: Path,
+    name: str,
+) -> tuple[SimulatedScan, ...]:
+    """Simulate a visit into the folder, its priors drifted."""
+    return visit(
+        scene,
+        poses,
+        seed=seed,
+        prior_error=settings.drift,
+        drift=drifted_within,
+        duration_s=settings.standing_s,
+        folder=folder,
+        name=f"{name}-{{:02d}}",
+    )
 
 
 def _located(
@@ -239,23 +242,3 @@ def _located(
         nothing = np.empty((0, 3), np.float32)
         return pair_tiles(tiles, nothing, settings=settings.pipeline.tiling), nobody.outcomes
     return located.comparison.tile_pairs, located.outcomes
-
-
-def save(revisit: Revisit, folder: Path) -> None:
-    """Keep the visit in one file of plain arrays. Raises OSError."""
-    folder.mkdir(parents=True, exist_ok=True)
-    npz.save(_path(revisit.name, folder), revisit)
-
-
-def is_kept(name: str, folder: Path) -> bool:
-    """Tell whether there is a visit of this name."""
-    return _path(name, folder).exists()
-
-
-def load(name: str, folder: Path) -> Revisit:
-    """Read what `save` kept. Raises OSError, and ValueError for other files."""
-    return npz.load(_path(name, folder), Revisit)
-
-
-def _path(name: str, folder: Path) -> Path:
-    return folder / f"{name}.npz"

@@ -16,7 +16,7 @@ INNER = 0.12  #: metres, thickness of walls between rooms
 
 
 def small_office(seed: int) -> Scene:
-    """Four furnished rooms on both sides of a corridor of 1.5 m, 10 x 8 x 2.6 m inside, doors open."""
+    """Build four furnished rooms on both sides of a corridor of 1.5 m, 10 x 8 x 2.6 m inside, doors open."""
     rng = np.random.default_rng(seed)
     draft = Draft(f"office-{seed}", rng)
     height, south, north = 2.6, 3.3, 4.8
@@ -42,18 +42,14 @@ def small_office(seed: int) -> Scene:
         draft.keep_clear((door - 0.1, edge), (door + DOOR + 0.1, edge + 1.0))
         _fit_out(draft, room, number)
     fittings.hang_lamps(draft, corridor, "lamps-corridor")
-    for kind in ("cabinet", "bin", "plant"):
-        pieces = {
-            "cabinet": furniture.cabinet(0.8, 0.35, 1.0),
-            "bin": furniture.bin_(),
-            "plant": furniture.plant(),
-        }
-        draft.against_wall(corridor, kind, pieces[kind])
+    draft.against_wall(corridor, "cabinet", furniture.cabinet(0.8, 0.35, 1.0))
+    draft.against_wall(corridor, "bin", furniture.bin_())
+    draft.against_wall(corridor, "plant", furniture.plant())
     return draft.finish(rooms=(*rooms, corridor), route=_round(rooms, doors, (south + north) / 2))
 
 
 def random_room(seed: int) -> Scene:
-    """One room of 4-8 x 3.2-6.5 x 2.4-3.2 m with 6 to 14 pieces of furniture."""
+    """Build one room of 4-8 x 3.2-6.5 x 2.4-3.2 m with 6 to 14 pieces of furniture."""
     rng = np.random.default_rng(seed)
     draft = Draft(f"room-{seed}", rng)
     (x, y, height) = rng.uniform((4.0, 3.2, 2.4), (8.0, 6.5, 3.2)).tolist()
@@ -85,7 +81,7 @@ def _inner_wall(y: float, doors: list[float], height: float) -> Mesh:
 
 
 def _fit_out(draft: Draft, room: Room, number: int, *, pieces: int = 8) -> None:
-    """Lamps, a radiator, a pillar, pictures, then furniture, more of it along the walls than in the middle."""
+    """Put in lamps, a radiator, a pillar, pictures, then furniture, more of it along the walls than in the middle."""
     rng = draft.rng
     fittings.hang_lamps(draft, room, f"lamps-{number}")
     draft.against_wall(room, "radiator", fittings.radiator(), z=0.12, fixed=True)
@@ -104,7 +100,7 @@ def _fit_out(draft: Draft, room: Room, number: int, *, pieces: int = 8) -> None:
 
 
 def _round(rooms: tuple[Room, ...], doors: list[float], aisle: float) -> tuple[Place, ...]:
-    """Along the corridor, and through every room in a loop, in the order of the doors.
+    """Return the way along the corridor, and through every room in a loop, in the order of the doors.
 
     The loop turns the robot by all of 360 degrees, so that its half field of view misses no side of the room.
     """

@@ -24,7 +24,7 @@ class Caster:
     """Open3D's RaycastingScene over all triangles of a scene, and whose triangle each is."""
 
     def __init__(self, vertices: Floats, triangles: NDArray[np.int32], owners: NDArray[np.int32]) -> None:
-        """`vertices` (V, 3) metres, `triangles` (F, 3), `owners` (F,) object ids."""
+        """Take `vertices` (V, 3) metres, `triangles` (F, 3), `owners` (F,) object ids."""
         self._owners = owners
         self._scene = o3d.t.geometry.RaycastingScene()
         self._scene.add_triangles(
@@ -33,7 +33,7 @@ class Caster:
         )
 
     def cast(self, origins: Floats, rays: Floats) -> Hits:
-        """Rays (N, 3), unit length, from one origin (3,) or one each (N, 3), world frame; all in one call."""
+        """Cast rays (N, 3), unit length, from one origin (3,) or one each (N, 3), world frame; all in one call."""
         packed = np.empty((len(rays), 6), dtype=np.float32)
         packed[:, :3], packed[:, 3:] = origins, rays
         answer = self._scene.cast_rays(o3d.core.Tensor.from_numpy(packed))
@@ -49,7 +49,7 @@ class Caster:
         )
 
     def distances(self, points: Floats) -> Floats:
-        """(N,) metres from each point (N, 3) to the nearest surface."""
+        """Return the metres (N,) from each point (N, 3) to the nearest surface."""
         query = o3d.core.Tensor.from_numpy(np.ascontiguousarray(points, dtype=np.float32))
         distances: Floats = self._scene.compute_distance(query).numpy().astype(np.float64)
         return distances

@@ -9,6 +9,7 @@ from worker.simulation.scenes.mesh import Mesh, block, union
 from worker.simulation.scenes.scene import Room, Scene, SceneObject
 
 WALL_GAP = 0.03  #: metres between a wall and what stands against it; door frames stand out by 2 cm
+DOOR_HEIGHT = 2.05  #: metres
 TRIES = 40  #: random places tried before a piece is left out
 
 
@@ -26,7 +27,7 @@ class Draft:
         self._put(name, mesh, fixed=True)
 
     def keep_clear(self, low: tuple[float, float], high: tuple[float, float]) -> None:
-        """No furniture here, as in front of doors; x, y, metres."""
+        """Keep furniture away from here, as in front of doors; x, y, metres."""
         self._doorways.append(np.array([[*low, 0.0], [*high, 2.0]]))
 
     def against_wall(self, room: Room, kind: str, mesh: Mesh, *, z: float = 0.0, fixed: bool = False) -> bool:
@@ -64,7 +65,7 @@ class Draft:
         return False
 
     def finish(self, *, rooms: tuple[Room, ...], route: tuple[tuple[float, float], ...]) -> Scene:
-        """The scene as it stands."""
+        """Return the scene as it stands."""
         return Scene(name=self.name, objects=self._scene.objects, rooms=rooms, route=route)
 
     def _try(self, kind: str, mesh: Mesh, *, fixed: bool = False) -> bool:
@@ -91,9 +92,8 @@ def wall(
     thickness: float,
     height: float,
     doors: tuple[tuple[float, float], ...] = (),
-    door_height: float = 2.05,
 ) -> Mesh:
-    """A wall along x or y, its middle line from start to end, with openings.
+    """Build a wall along x or y, its middle line from start to end, with openings.
 
     `doors` are (from, to) in metres along the wall. Each opening has a frame that stands out by 2 cm.
     Raises ValueError for a slanting wall.
@@ -111,10 +111,10 @@ def wall(
     parts, reached = [], 0.0
     for first, last in sorted(doors):
         parts.append(part(reached, first, 0, height, thickness))
-        parts.append(part(first, last, door_height, height, thickness))
+        parts.append(part(first, last, DOOR_HEIGHT, height, thickness))
         for frame in ((first - 0.07, first + 0.01), (last - 0.01, last + 0.07)):
-            parts.append(part(*frame, 0, door_height + 0.06, thickness + 0.04))
-        parts.append(part(first, last, door_height - 0.01, door_height + 0.06, thickness + 0.04))
+            parts.append(part(*frame, 0, DOOR_HEIGHT + 0.06, thickness + 0.04))
+        parts.append(part(first, last, DOOR_HEIGHT - 0.01, DOOR_HEIGHT + 0.06, thickness + 0.04))
         reached = last
     parts.append(part(reached, end[along] - start[along], 0, height, thickness))
     return union(*parts)

@@ -9,7 +9,6 @@ import numpy as np
 
 from worker.cloud.types import Floats
 from worker.simulation.scenes.furniture import FREE_PIECES, WALL_PIECES
-from worker.simulation.scenes.mesh import Mesh
 from worker.simulation.scenes.scene import Change, ChangeKind, Room, Scene, SceneObject
 
 TRIES = 60  #: random places tried for one edit
@@ -19,7 +18,7 @@ NEAREST, FARTHEST = 0.3, 1.2  #: metres by which a piece is moved
 def random_edits(
     scene: Scene, *, seed: int, kinds: Sequence[ChangeKind] = ("add", "remove", "move")
 ) -> tuple[Scene, tuple[Change, ...]]:
-    """One edit for each entry of `kinds`, no object twice; pieces stay on the floor, in their room, and apart.
+    """Make one edit for each entry of `kinds`, no object twice; pieces stay on the floor, in their room, and apart.
 
     An edit that finds no place is left out: count the changes that come back.
     """
@@ -74,8 +73,7 @@ def _move(scene: Scene, item: SceneObject, rng: np.random.Generator) -> tuple[Sc
 
 
 def _stands(item: SceneObject) -> bool:
-    mesh: Mesh = item.mesh
-    return float(mesh.bounds[0, 2]) < 0.01
+    return float(item.mesh.bounds[0, 2]) < 0.01
 
 
 def _within(room: Room, bounds: Floats) -> bool:

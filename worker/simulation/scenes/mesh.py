@@ -23,19 +23,19 @@ class Mesh:
         return np.stack([self.vertices.min(axis=0), self.vertices.max(axis=0)])
 
     def placed(self, target_from_source: Matrix4) -> Mesh:
-        """The same mesh in the target frame."""
+        """Return the mesh in the target frame."""
         vertices = self.vertices @ target_from_source[:3, :3].T + target_from_source[:3, 3]
         return Mesh(vertices=vertices, triangles=self.triangles)
 
     def at(self, x: float = 0.0, y: float = 0.0, z: float = 0.0, *, yaw: float = 0.0) -> Mesh:
-        """The same mesh turned by `yaw` degrees about z, then shifted."""
+        """Return the mesh turned by `yaw` degrees about z, then shifted."""
         return self.placed(rigid(x, y, z, yaw=yaw))
 
 
 def rigid(
     x: float = 0.0, y: float = 0.0, z: float = 0.0, *, yaw: float = 0.0, pitch: float = 0.0, roll: float = 0.0
 ) -> Matrix4:
-    """(4, 4) target_from_source: roll about x, then pitch about y, then yaw about z (degrees), then the shift."""
+    """Return target_from_source (4, 4): roll about x, pitch about y, yaw about z (degrees), then the shift."""
     angles = np.radians([roll, pitch, yaw])
     (cr, cp, cy), (sr, sp, sy) = np.cos(angles), np.sin(angles)
     target_from_source = np.eye(4)
@@ -49,7 +49,7 @@ def rigid(
 
 
 def union(*meshes: Mesh) -> Mesh:
-    """All meshes as one; where solids overlap, the hidden faces stay (no ray from outside meets them)."""
+    """Return all meshes as one; where solids overlap, the hidden faces stay (no ray from outside meets them)."""
     starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
     triangles = [mesh.triangles + start for mesh, start in zip(meshes, starts, strict=False)]
     return Mesh(
@@ -59,7 +59,7 @@ def union(*meshes: Mesh) -> Mesh:
 
 
 def box(width: float, depth: float, height: float) -> Mesh:
-    """Extents along x, y, z; centred in x and y, standing on z = 0."""
+    """Build a box by its extents along x, y, z; centred in x and y, standing on z = 0."""
     corners = np.array([[x, y, z] for z in (0.0, 1.0) for y in (-0.5, 0.5) for x in (-0.5, 0.5)])
     quads = [(0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5)]
     triangles = [half for a, b, c, d in quads for half in ((a, b, c), (a, c, d))]
@@ -69,13 +69,13 @@ def box(width: float, depth: float, height: float) -> Mesh:
 
 
 def block(low: tuple[float, float, float], high: tuple[float, float, float]) -> Mesh:
-    """The axis-aligned box between two corners."""
+    """Build the axis-aligned box between two corners."""
     size = np.subtract(high, low)
     return box(*size).at((low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2])
 
 
 def turned(profile: list[tuple[float, float]], *, sides: int = 20) -> Mesh:
-    """The solid that a profile of (radius, z) sweeps about z; its first and last radius should be 0."""
+    """Build the solid that a profile of (radius, z) sweeps about z; its first and last radius should be 0."""
     angles = np.arange(sides) * (2 * np.pi / sides)
     rings = [np.c_[r * np.cos(angles), r * np.sin(angles), np.full(sides, z)] for r, z in profile]
     here = np.arange(sides)
@@ -89,12 +89,12 @@ def turned(profile: list[tuple[float, float]], *, sides: int = 20) -> Mesh:
 
 
 def cylinder(radius: float, height: float, *, sides: int = 20) -> Mesh:
-    """Axis along z, standing on z = 0."""
+    """Build a cylinder with its axis along z, standing on z = 0."""
     return turned([(0.0, 0.0), (radius, 0.0), (radius, height), (0.0, height)], sides=sides)
 
 
 def sphere(radius: float, *, sides: int = 16) -> Mesh:
-    """Standing on z = 0."""
+    """Build a ball that stands on z = 0."""
     angles = np.linspace(-np.pi / 2, np.pi / 2, sides // 2 + 1)
     rings = zip(radius * np.cos(angles), radius * (1 + np.sin(angles)), strict=True)
     return turned([(float(abs(r)), float(z)) for r, z in rings], sides=sides)

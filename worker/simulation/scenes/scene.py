@@ -57,7 +57,7 @@ class Scene:
     used_id: int = 0  #: highest object id that an edit has taken away again
 
     def __getitem__(self, name: str) -> SceneObject:
-        """Raises KeyError with the names that there are."""
+        """Return the object of a name. Raises KeyError with the names that there are."""
         for item in self.objects:
             if item.name == name:
                 return item
@@ -78,18 +78,18 @@ class Scene:
     def caster(self) -> Caster:
         """Built once: it costs more than a scan, and every scan uses it again."""
         starts = np.cumsum([0, *(len(item.mesh.vertices) for item in self.objects)])
-        triangles = [item.mesh.triangles + at for item, at in zip(self.objects, starts, strict=False)]
+        triangles = [item.mesh.triangles + start for item, start in zip(self.objects, starts, strict=False)]
         owners = [np.full(len(item.mesh.triangles), item.object_id, dtype=np.int32) for item in self.objects]
         vertices = np.concatenate([item.mesh.vertices for item in self.objects])
         return Caster(vertices, np.concatenate(triangles).astype(np.int32), np.concatenate(owners))
 
     def placed(self, target_from_world: Matrix4) -> Scene:
-        """The same solids in another frame; rooms and route, which know no turn, are left out."""
+        """Return the same solids in another frame; rooms and route, which know no turn, are left out."""
         objects = tuple(replace(item, mesh=item.mesh.placed(target_from_world)) for item in self.objects)
         return replace(self, objects=objects, rooms=(), route=())
 
     def is_free(self, bounds: Floats, *, ignoring: str | None = None) -> bool:
-        """No object's box overlaps this box (2, 3); touching is allowed."""
+        """Tell whether no object's box overlaps this box (2, 3); touching is allowed."""
         for item in self.objects:
             low, high = item.mesh.bounds
             if item.name != ignoring and _overlap(bounds, low, high):
@@ -97,7 +97,7 @@ class Scene:
         return True
 
     def with_added(self, name: str, mesh: Mesh) -> tuple[Scene, Change]:
-        """A new scene with one solid more. Raises ValueError where the name is taken."""
+        """Return a new scene with one solid more. Raises ValueError where the name is taken."""
         if any(item.name == name for item in self.objects):
             raise ValueError(f"scene {self.name} already has {name!r}")
         added = SceneObject(name=name, object_id=1 + self._highest_id, mesh=mesh)
@@ -105,25 +105,25 @@ class Scene:
         return scene, Change(kind="add", name=name, before=None, after=mesh.bounds)
 
     def without(self, name: str) -> tuple[Scene, Change]:
-        """A new scene with one solid less. Raises KeyError for an unknown name."""
+        """Return a new scene with one solid less. Raises KeyError for an unknown name."""
         gone = self[name]
         rest = tuple(item for item in self.objects if item is not gone)
         scene = replace(self, objects=rest, used_id=self._highest_id)
         return scene, Change(kind="remove", name=name, before=gone.mesh.bounds, after=None)
 
     def moved(self, name: str, target_from_source: Matrix4) -> tuple[Scene, Change]:
-        """A new scene with one solid moved rigidly in the world frame. Raises KeyError for an unknown name."""
+        """Return a new scene with one solid moved rigidly in the world frame. Raises KeyError for an unknown name."""
         old = self[name]
         new = replace(old, mesh=old.mesh.placed(target_from_source))
         scene = replace(self, objects=tuple(new if item is old else item for item in self.objects))
         return scene, Change(kind="move", name=name, before=old.mesh.bounds, after=new.mesh.bounds)
 
     def shifted(
-        self, name: str, *, dx: float = 0.0, dy: float = 0.0, dz: float = 0.0, yaw: float = 0.0
+        self, name: str, *, dx: float = 0.0, dy: float = 0.0, yaw: float = 0.0
     ) -> tuple[Scene, Change]:
-        """As `moved`: turned by `yaw` degrees about the vertical through the middle of its box, then shifted."""
+        """Move a solid: turn it by `yaw` degrees about the vertical through the middle of its box, then shift it."""
         x, y, _ = self[name].mesh.bounds.mean(axis=0)
-        return self.moved(name, rigid(x + dx, y + dy, dz, yaw=yaw) @ rigid(-x, -y))
+        return self.moved(name, rigid(x + dx, y + dy, yaw=yaw) @ rigid(-x, -y))
 
     @property
     def _highest_id(self) -> int:

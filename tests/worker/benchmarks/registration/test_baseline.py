@@ -31,8 +31,6 @@ def edge(i: int, j: int, i_from_j: Matrix4 | None = None) -> BaselineEdge:
         pair=(i, j),
         i_from_j=true if i_from_j is None else i_from_j,
         information=1000 * np.eye(6),
-        fitness=0.8,
-        inlier_rmse=0.02,
     )
 
 

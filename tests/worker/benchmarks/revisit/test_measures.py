@@ -40,7 +40,7 @@ def table(made_visit):
 
 
 def scored(*visits):
-    return VisitScores(scores=tuple(np.array(scores) for scores in visits), seconds=2.0)
+    return VisitScores(scores=np.concatenate([np.array(scores) for scores in visits]), seconds=2.0)
 
 
 SCORES = scored([0.9, 0.8, 0.2, np.nan, 0.7], [0.1, 0.3], [0.1, 0.6])
@@ -105,7 +105,7 @@ def test_a_document_is_json_and_says_none_where_a_figure_has_no_meaning(table):
 def test_every_visit_is_scored_by_itself(made_visit):
     visits = [made_visit(cells=[ADD, NONE]), made_visit(cells=[NONE])]
     counted = Method(name="n", score=lambda pairs: np.full(len(pairs.current), len(pairs.current), float))
-    assert score_visits(counted, visits).together.tolist() == [2, 2, 1]
+    assert score_visits(counted, visits).scores.tolist() == [2, 2, 1]
 
 
 @pytest.fixture

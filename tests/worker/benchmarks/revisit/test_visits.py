@@ -8,8 +8,8 @@ import numpy as np
 
 from worker.benchmarks.revisit import visits
 from worker.benchmarks.revisit.plan import RevisitSettings, plan_visits
-from worker.benchmarks.revisit.visits import kept_tiles, make_visits
-from worker.cloud.tiling import TileGrid
+from worker.benchmarks.revisit.visits import make_visits
+from worker.cloud import npz
 
 
 def test_poses_come_from_registration_and_are_near_the_truth(walked):
@@ -55,12 +55,6 @@ def test_visits_that_are_there_are_not_made_again(visits_folder: Path):
     assert made == 0
 
 
-def test_tiles_that_the_map_keeps_are_marked():
-    grid = TileGrid(origin=np.zeros(3), size=np.ones(3), shape=(2, 2, 1), lowest=(0, 0, 0))
-    kept = kept_tiles(grid, np.array([[0, 1, 0]], np.int32))
-    assert kept[..., 0].tolist() == [[False, True], [False, False]]
-
-
 def test_a_tile_is_changed_from_forty_cells_of_all_kinds_together(made_visit):
     visit = made_visit(cells=[[39, 0, 0], [20, 0, 20], [0, 0, 0]])
     assert visit.exists.tolist() == [False, True, False]
@@ -83,10 +77,9 @@ def test_a_change_out_of_sight_counts_neither_way_and_neither_does_an_unobserved
 
 def test_a_visit_comes_back_from_disk(made_visit, tmp_path: Path):
     visit = made_visit(cells=[[50, 0, 0], [0, 7, 0]], misalignment=[0.01, np.nan], outside=3)
-    assert not visits.is_kept(visit.name, tmp_path)
-    visits.save(visit, tmp_path)
-    assert visits.is_kept(visit.name, tmp_path)
-    again = visits.load(visit.name, tmp_path)
+    (plan,) = plan_visits(1, RevisitSettings(kinds=("room",)), first_seed=1)
+    npz.save(visits.path_of(visit.name, tmp_path), visit)
+    (again,) = visits.load_visits([plan], tmp_path)
     assert again.name == visit.name
     assert again.outside == 3
     assert (again.second.scans, again.second.accepted) == (2, 1)
