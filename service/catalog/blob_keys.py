@@ -58,13 +58,13 @@ map_manifest = _within(map_folder, "manifest.json")  #: the tile manifest (paper
 map_work = _within(map_folder, "work/")  #: what the building of a map remembers of itself while it lasts
 
 
-def map_embedding(job_id: str, model: str, sha256: str | None) -> str:
-    """Name the reference embedding of one model; `model` is `name/version`, the digest that of its weights.
+def map_embedding(job_id: str, model: str, fingerprint: str) -> str:
+    """Name the reference embedding of one model; `model` is `name/version`, `fingerprint` the one of its card.
 
-    Other weights under the same name find no embedding, rather than one that is not theirs. The key says
+    Other weights or settings under the same name find no embedding, rather than one that is not theirs. The key says
     `description`, as earlier builds wrote it.
     """
-    made_by = f"{model.replace('/', '-')}-{(sha256 or 'none')[:12]}"
+    made_by = f"{model.replace('/', '-')}-{fingerprint[:12]}"
     return f"{map_folder(job_id)}description-{safe_name(made_by)}.npz"
 
 

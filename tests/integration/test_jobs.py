@@ -48,7 +48,7 @@ def run_until_killed(job: JobRecord, name: str) -> None:
 def embedding_key(house: House, model: str) -> str:
     """Of what this model's weights said of the map."""
     card = open_card(house.material.model_store, model)
-    return blob_keys.map_embedding(house.catalog.maps.get(MAP).job_id, model, card.sha256)
+    return blob_keys.map_embedding(house.catalog.maps.get(MAP).job_id, model, card.fingerprint)
 
 
 def failed(house: House, job: JobRecord, code: str) -> str:

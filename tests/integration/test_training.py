@@ -128,7 +128,7 @@ def test_a_model_is_trained_further_calibrated_and_named_by_a_survey(house: Hous
     assert card.evaluation["validation"]["threshold"] == card.threshold
     assert not house.catalog.blobs.under(blob_keys.model_work(job.job_id))
     built_by = house.catalog.versions.ready(MAP, 1).job_id
-    assert house.catalog.blobs.exists(blob_keys.map_embedding(built_by, "lobby-net/1", card.sha256))
+    assert house.catalog.blobs.exists(blob_keys.map_embedding(built_by, "lobby-net/1", card.fingerprint))
 
     survey = house.survey_of(house.add("later.pcd", house.material.after), model="lobby-net/1")
     run(survey)

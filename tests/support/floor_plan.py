@@ -115,12 +115,13 @@ def survey_modules() -> set[str]:
         app_module = importlib.import_module("service.api.app")
         settings = importlib.import_module("service.settings").Settings()
         app = app_module.create_app(settings, queue=_NoQueue())
+        crossed: set[str] = set()
+        _watch(crossed)  # before the threads that answer requests begin
         with TestClient(app) as client:
             scan = _scan(client, _room_points(seed=0), "before.ply")
             _run(client.post("/maps", json={"id": "room", "scan_ids": [scan]}).json(), "map")
             scan = _scan(client, _room_points(seed=1), "after.ply")
-            crossed: set[str] = set()
-            _watch(crossed)
+            crossed.clear()
             try:
                 answer = client.post("/maps/room/surveys", json={"scan_ids": [scan]}).json()
                 _run(answer, "survey")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -67,6 +69,13 @@ class Card(StrictModel):
     def model(self) -> str:
         """The model's name, `name/version`."""
         return f"{self.name}/{self.version}"
+
+    @property
+    def fingerprint(self) -> str:
+        """What tells two models of one name apart: the sha256 of the weights, or else of the detector's settings."""
+        if self.sha256 is not None:
+            return self.sha256
+        return hashlib.sha256(json.dumps(self.detector_settings, sort_keys=True).encode()).hexdigest()
 
     def settings_as(self, kind: type[S]) -> S:
         """Read the detector's own settings. Raises ValueError, which names each unsound field."""

@@ -57,7 +57,7 @@ def encode_reference(context: Context, version: VersionRecord, detector: Detecto
         reference.tiles(min_points=detector.card.preprocessing.min_points),
         progress=lambda _, share: context.report("encoding", share),
     )
-    key = blob_keys.map_embedding(version.job_id, model, detector.card.sha256)
+    key = blob_keys.map_embedding(version.job_id, model, detector.card.fingerprint)
     put(context, key, lambda path: npz.save_arrays(path, embedding))
 
 

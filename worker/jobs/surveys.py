@@ -49,7 +49,7 @@ def score_survey(context: Context) -> None:
     survey, version, settings = _asked(context)
     detector = kept_detector(context, survey.model)
     embedding = None
-    key = blob_keys.map_embedding(version.job_id, survey.model, detector.card.sha256)
+    key = blob_keys.map_embedding(version.job_id, survey.model, detector.card.fingerprint)
     if context.catalog.blobs.exists(key):
         embedding = load(context, key, npz.load_arrays)
     map_key = functools.partial(blob_keys.map_scan, version.job_id)

@@ -11,7 +11,7 @@ import torch
 from worker.detectors.card import MODEL_STORE
 from worker.detectors.comparison import Comparison
 from worker.detectors.spicd_net.detector import SpicdNet
-from worker.detectors.store import open_detector
+from worker.detectors.store import open_card, open_detector
 from worker.errors import DetectorUnavailable
 
 
@@ -109,3 +109,12 @@ def test_a_card_of_release_0_1_opens_with_its_settings_in_their_place(model_stor
 def test_the_shipped_models_open():
     for name in ("spicd-net/1", "c2c/1"):
         assert open_detector(MODEL_STORE, name, device="cpu").card.model == name
+
+
+def test_models_of_one_name_are_told_apart_by_their_weights_or_without_such_by_their_settings() -> None:
+    weightless = open_card(MODEL_STORE, "c2c/1")
+    other = weightless.model_copy(update={"detector_settings": {"half_distance": 0.1}})
+    assert len(weightless.fingerprint) == 64
+    assert weightless.fingerprint != other.fingerprint
+    trained = open_card(MODEL_STORE, "spicd-net/1")
+    assert trained.fingerprint == trained.sha256
