@@ -15,8 +15,7 @@ from pathlib import Path
 from worker.cloud.formats.pcd import write_pcd
 from worker.detectors.card import MODEL_STORE
 from worker.detectors.store import open_detector
-from worker.pipeline import PipelineSettings, build_map, detect, locate_survey
-from worker.pipeline.registration.results import ScanFile
+from worker.pipeline import PipelineSettings, ScanFile, build_map, detect, locate_survey
 from worker.pipeline.results.export import TileResult, tile_results, write_coloured_cloud
 from worker.simulation.scenes import random_edits, random_room
 from worker.simulation.visits import visit
