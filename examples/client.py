@@ -1,7 +1,7 @@
 """Use the service from Python: build a map of one scan, compare a later scan with it, print what changed.
 
-    spicd up &
-    python examples/client.py monday.pcd tuesday.pcd
+spicd up &
+python examples/client.py monday.pcd tuesday.pcd
 """
 
 from __future__ import annotations

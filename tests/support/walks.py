@@ -14,7 +14,7 @@ from tests.support.rooms import as_scan
 from worker.cloud.formats.pcd import write_pcd
 from worker.cloud.poses import difference, inverse, transformed
 from worker.cloud.types import Matrix4, Points
-from worker.pipeline.mapping.settings import JointRegistrationSettings, MapSettings
+from worker.pipeline.mapping.settings import JointRegistrationSettings, MappingSettings
 from worker.pipeline.mapping.tasks import Folder, downsample
 from worker.pipeline.registration.preprocessing import prepare
 from worker.pipeline.registration.results import RegistrationResult, ScanFile, ScanResult
@@ -31,7 +31,7 @@ QUICK = RegistrationSettings(max_iterations=12, search_resolutions=(0.3,), searc
 def joint_settings(registration: RegistrationSettings = QUICK, **mapping: float) -> JointRegistrationSettings:
     """Return these settings together, with some of the map's changed."""
     return JointRegistrationSettings(
-        registration=registration, mapping=MapSettings().model_copy(update=mapping), max_points=MANY
+        registration=registration, mapping=MappingSettings().model_copy(update=mapping), max_points=MANY
     )
 
 

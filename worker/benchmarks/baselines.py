@@ -33,7 +33,7 @@ NORMAL_RADIUS, NORMAL_NEIGHBORS = 0.15, 30  #: metres; of the plane that M3C2-ap
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class CloudToCloud:
+class CloudToCloudBaseline:
     """C2C: nearest distances both ways (Girardeau-Montaut et al. 2005, the paper's [7]).
 
     `mean` is their mean over the tile's points in metres, `far` the share of points over 10 cm; of the two
@@ -163,10 +163,10 @@ def _library() -> Any:
     return py4dgeo
 
 
-Baseline = CloudToCloud | M3c2Approximation | M3c2
+Baseline = CloudToCloudBaseline | M3c2Approximation | M3c2
 
 
 def installed_baselines() -> tuple[Baseline, ...]:
     """Return those that this machine can run: the real M3C2 needs a library that is an extra of the install."""
-    always = (CloudToCloud(), CloudToCloud(statistic="far"), M3c2Approximation())
+    always = (CloudToCloudBaseline(), CloudToCloudBaseline(statistic="far"), M3c2Approximation())
     return (*always, M3c2()) if m3c2_is_installed() else always

@@ -17,7 +17,7 @@ import torch
 from rich.console import Group
 from rich.table import Table
 
-from worker.benchmarks.baselines import CloudToCloud
+from worker.benchmarks.baselines import CloudToCloudBaseline
 from worker.benchmarks.documents import Document, pose_spread, shown, spread, titled_table
 from worker.benchmarks.methods import TileScore, change_scores, encode_reference, open_model, tile_scores
 from worker.benchmarks.timing import StageClock, machine
@@ -180,7 +180,7 @@ def ways(pairs: TilePairs, detector: Detector) -> dict[str, Callable[[], TileSco
     """Return the yardstick, and the detector without and with the reference embedding that a map keeps."""
     embedding = encode_reference(detector, pairs.reference)
     return {
-        YARDSTICK: lambda: CloudToCloud().score(pairs),
+        YARDSTICK: lambda: CloudToCloudBaseline().score(pairs),
         "uncached": lambda: change_scores(detector, pairs),
         "cached": lambda: change_scores(detector, pairs, embedding),
     }

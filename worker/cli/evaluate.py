@@ -66,10 +66,10 @@ def registration(
         evaluate,
     )
     from worker.benchmarks.registration.report import tables  # noqa: PLC0415
-    from worker.benchmarks.registration.scenarios import WalkSettings, kinds_named  # noqa: PLC0415
+    from worker.benchmarks.registration.scenarios import ScenarioSettings, kinds_named  # noqa: PLC0415
 
     settings = RegistrationBenchmarkSettings(
-        walk=WalkSettings(building=building, scans=scans, foreign=foreign, duration_s=standing),
+        walk=ScenarioSettings(building=building, scans=scans, foreign=foreign, duration_s=standing),
         seeds=_numbers(seeds),
         kinds=kinds_named(scenarios),
         baseline=baseline or baseline_pairs is not None,

@@ -33,14 +33,14 @@ def register(
 
     from worker.cloud.formats.scan import read_scan  # noqa: PLC0415
     from worker.cloud.poses import difference  # noqa: PLC0415
-    from worker.pipeline.mapping.settings import JointRegistrationSettings, MapSettings  # noqa: PLC0415
+    from worker.pipeline.mapping.settings import JointRegistrationSettings, MappingSettings  # noqa: PLC0415
     from worker.pipeline.mapping.survey_registration import register_survey_scans  # noqa: PLC0415
     from worker.pipeline.registration.preprocessing import prepare  # noqa: PLC0415
     from worker.pipeline.registration.results import ScanFile, ScanRejected  # noqa: PLC0415
     from worker.pipeline.registration.settings import RegistrationSettings  # noqa: PLC0415
 
     settings = JointRegistrationSettings(
-        registration=RegistrationSettings(), mapping=MapSettings(), max_points=50_000_000
+        registration=RegistrationSettings(), mapping=MappingSettings(), max_points=50_000_000
     )
     target = prepare(read_scan(reference), settings.registration).surface
     file = ScanFile(name=current.name, path=current, pose=None if start is None else np.loadtxt(start))

@@ -7,7 +7,7 @@ from pydantic import Field
 from worker.cloud.settings import StrictModel
 from worker.cloud.tiling import TilingSettings
 from worker.detectors.card import Preprocessing
-from worker.pipeline.mapping.settings import JointRegistrationSettings, MapSettings
+from worker.pipeline.mapping.settings import JointRegistrationSettings, MappingSettings
 from worker.pipeline.registration.settings import RegistrationSettings
 
 
@@ -15,7 +15,7 @@ class PipelineSettings(StrictModel):
     """One settings class a stage."""
 
     registration: RegistrationSettings = Field(default_factory=RegistrationSettings)
-    mapping: MapSettings = Field(default_factory=MapSettings)
+    mapping: MappingSettings = Field(default_factory=MappingSettings)
     tiling: TilingSettings = Field(default_factory=TilingSettings)
     max_scan_points: int = Field(50_000_000, gt=0)
 

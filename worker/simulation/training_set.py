@@ -21,7 +21,7 @@ from worker.simulation.scenes import BUILDINGS, BuildingKind, Scene, rigid
 from worker.simulation.sensor import SimulatedScan
 from worker.simulation.truth import true_changes
 from worker.simulation.visits import edited, visit
-from worker.training.anomalies import OPERATIONS, Change
+from worker.training.anomalies import OPERATIONS, ChangeSize
 from worker.training.dataset import Observation, TileSet, joined
 
 MARGIN = 1e-4  #: metres that a synthetic change keeps from the tile's border, which belongs to the next tile
@@ -238,7 +238,7 @@ def _injected(
     if not inside.any():
         return points
     centre, half = grid.centers(index)[0], (grid.size / 2 - MARGIN).astype(np.float32)
-    change = Change(magnitude=rng.uniform(*settings.magnitude), density=rng.uniform(*settings.density))
+    change = ChangeSize(magnitude=rng.uniform(*settings.magnitude), density=rng.uniform(*settings.density))
     operation = OPERATIONS[str(rng.choice(list(OPERATIONS)))]
     after = operation((points[inside] - centre).astype(np.float32), change, half, rng).points
     return np.concatenate([points[~inside], (after + centre).astype(np.float32)])

@@ -18,7 +18,7 @@ Half = NDArray[np.float32]  #: (3,) metres, half the tile's size: the tile is -h
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Change:
+class ChangeSize:
     """How large a change is."""
 
     magnitude: float  #: metres of displacement
@@ -34,10 +34,10 @@ class Changed:
     vanished: Points  #: (v, 3) those that are there no more
 
 
-Operation = Callable[[Points, Change, Half, np.random.Generator], Changed]
+Operation = Callable[[Points, ChangeSize, Half, np.random.Generator], Changed]
 
 
-def add_object(points: Points, change: Change, half: Half, rng: np.random.Generator) -> Changed:
+def add_object(points: Points, change: ChangeSize, half: Half, rng: np.random.Generator) -> Changed:
     """Add to (n, 3) the k points around a random one again, shifted and jittered, kept in the tile."""
     chosen = _cluster(points, change.density, rng)
     spread = rng.normal(scale=nuisance_sigma(change.magnitude), size=(len(chosen), 3))
@@ -46,7 +46,7 @@ def add_object(points: Points, change: Change, half: Half, rng: np.random.Genera
     return Changed(points=np.concatenate([points, added]), appeared=added, vanished=points[:0])
 
 
-def remove_object(points: Points, change: Change, half: Half, rng: np.random.Generator) -> Changed:  # noqa: ARG001
+def remove_object(points: Points, change: ChangeSize, half: Half, rng: np.random.Generator) -> Changed:  # noqa: ARG001
     """Remove from (n, 3) the k points around a random one, but leave 64 points."""
     chosen = _cluster(points, change.density, rng)
     chosen = chosen[: max(len(points) - MIN_RETAINED, 0)]
@@ -54,7 +54,7 @@ def remove_object(points: Points, change: Change, half: Half, rng: np.random.Gen
     return Changed(points=kept, appeared=points[:0], vanished=points[chosen])
 
 
-def move_object(points: Points, change: Change, half: Half, rng: np.random.Generator) -> Changed:
+def move_object(points: Points, change: ChangeSize, half: Half, rng: np.random.Generator) -> Changed:
     """Shift the k points of (n, 3) around a random one as one, kept in the tile."""
     chosen = _cluster(points, change.density, rng)
     moved = points.copy()

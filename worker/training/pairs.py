@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from worker.cloud.patches import patch
 from worker.cloud.types import Points
 from worker.detectors.trainable import CHANGED, DIFFERENT, UNCHANGED, Pair
-from worker.training.anomalies import OPERATIONS, Change, Half, Operation, shown
+from worker.training.anomalies import OPERATIONS, ChangeSize, Half, Operation, shown
 from worker.training.augmentation import Augmentation, Nuisance, augmented, second_observation, turned_alike
 from worker.training.dataset import Observation, TileSet
 
@@ -238,7 +238,9 @@ def changed(
     """
     operation = operation or OPERATIONS[str(rng.choice(list(OPERATIONS)))]
     for _ in range(12):
-        change = Change(magnitude=rng.uniform(*settings.magnitude), density=rng.uniform(*settings.density))
+        change = ChangeSize(
+            magnitude=rng.uniform(*settings.magnitude), density=rng.uniform(*settings.density)
+        )
         result = operation(points, change, half, rng)
         if settings.min_shown == 0 or shown(points, result, settings.shown_distance) >= settings.min_shown:
             break

@@ -8,7 +8,7 @@ import pytest
 from worker.benchmarks.baselines import (
     FAR,
     Baseline,
-    CloudToCloud,
+    CloudToCloudBaseline,
     M3c2,
     M3c2Approximation,
     m3c2_is_installed,
@@ -47,7 +47,7 @@ def pairs() -> TilePairs:
     return pair_tiles(tiles, after, settings=TilingSettings())
 
 
-METHODS = [CloudToCloud(), CloudToCloud(statistic="far"), M3c2Approximation(), M3c2()]
+METHODS = [CloudToCloudBaseline(), CloudToCloudBaseline(statistic="far"), M3c2Approximation(), M3c2()]
 
 
 def scores_of(method: Baseline, pairs: TilePairs) -> np.ndarray:
@@ -77,7 +77,9 @@ def test_an_added_box_scores_above_an_equal_tile(method: Baseline, pairs: TilePa
 
 
 @pytest.mark.parametrize(
-    "method", [CloudToCloud(), CloudToCloud(statistic="far"), M3c2()], ids=lambda method: method.name
+    "method",
+    [CloudToCloudBaseline(), CloudToCloudBaseline(statistic="far"), M3c2()],
+    ids=lambda method: method.name,
 )
 def test_a_removed_part_scores_above_an_equal_tile(method: Baseline, pairs: TilePairs) -> None:
     found = scores_of(method, pairs)
@@ -96,7 +98,7 @@ def test_the_share_of_far_points_is_that_of_the_hole_less_its_rim(pairs: TilePai
     apart = np.linalg.norm(third[hole][:, None] - left[None], axis=2).min(axis=1)
     expected = (apart > FAR).sum() / len(third)
     assert expected > 0.05
-    assert CloudToCloud(statistic="far").score(pairs)[REMOVED] == pytest.approx(expected)
+    assert CloudToCloudBaseline(statistic="far").score(pairs)[REMOVED] == pytest.approx(expected)
 
 
 def test_the_mean_of_c2c_takes_the_worse_of_both_directions(pairs: TilePairs) -> None:
@@ -104,7 +106,7 @@ def test_the_mean_of_c2c_takes_the_worse_of_both_directions(pairs: TilePairs) ->
     current = pairs.current[ADDED]
     before = np.concatenate(pairs.reference.points)
     apart = np.linalg.norm(current[:, None] - before[None], axis=2).min(axis=1)
-    assert CloudToCloud().score(pairs)[ADDED] == pytest.approx(apart.mean(), rel=1e-5)
+    assert CloudToCloudBaseline().score(pairs)[ADDED] == pytest.approx(apart.mean(), rel=1e-5)
 
 
 def test_m3c2_counts_core_points_with_nothing_around_as_changed(pairs: TilePairs) -> None:

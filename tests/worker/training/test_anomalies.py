@@ -7,8 +7,8 @@ import pytest
 
 from tests.worker.training.conftest import HALF
 from worker.training.anomalies import (
-    Change,
     Changed,
+    ChangeSize,
     add_object,
     move_object,
     nuisance_sigma,
@@ -16,7 +16,7 @@ from worker.training.anomalies import (
     shown,
 )
 
-CHANGE = Change(magnitude=0.3, density=0.075)
+CHANGE = ChangeSize(magnitude=0.3, density=0.075)
 
 
 @pytest.fixture
@@ -46,7 +46,7 @@ def test_removing_takes_the_neighbours_of_one_point(tile):
 
 def test_removing_leaves_64_points_and_nothing_below_that():
     few = rng().uniform(-0.1, 0.1, (70, 3)).astype(np.float32)
-    half_gone = Change(magnitude=0.3, density=0.5)
+    half_gone = ChangeSize(magnitude=0.3, density=0.5)
     assert len(remove_object(few, half_gone, HALF, rng()).points) == 64
     assert len(remove_object(few[:50], half_gone, HALF, rng()).points) == 50
 
@@ -78,7 +78,7 @@ def test_an_addition_has_the_magnitude_less_what_its_vertical_part_loses(tile):
 def test_nothing_leaves_the_tile(operation):
     edge = (rng().uniform(-1, 1, (400, 3)) * HALF).astype(np.float32)
     for seed in range(20):
-        changed = operation(edge, Change(magnitude=0.5, density=0.3), HALF, rng(seed))
+        changed = operation(edge, ChangeSize(magnitude=0.5, density=0.3), HALF, rng(seed))
         assert (np.abs(changed.points) <= HALF).all()
 
 
@@ -96,6 +96,6 @@ def test_a_doubled_piece_of_floor_shows_nothing_and_a_lifted_one_shows_all():
 
 
 def test_a_removed_cluster_shows_but_for_its_rim(tile):
-    changed = remove_object(tile, Change(magnitude=0.3, density=0.3), HALF, rng())
+    changed = remove_object(tile, ChangeSize(magnitude=0.3, density=0.3), HALF, rng())
     distance = np.linalg.norm(changed.vanished[:, None] - changed.points, axis=2).min(axis=1)
     assert 0 < shown(tile, changed, 0.03) == (distance > 0.03).sum() < len(changed.vanished)

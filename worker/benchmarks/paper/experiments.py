@@ -26,7 +26,7 @@ from worker.pipeline.registration.results import ScanRejected
 from worker.pipeline.registration.scan_to_map import register
 from worker.progress import Progress
 from worker.simulation.scenes import ChangeKind
-from worker.training.anomalies import OPERATIONS, Change
+from worker.training.anomalies import OPERATIONS, ChangeSize
 
 MARGIN = 1e-4  #: metres that a change keeps from the tile's border, which belongs to the next tile
 INJECTION_SEED = 42  #: the paper's
@@ -124,7 +124,7 @@ def _change(
     within = {scan: grid.locate(cloud) == cell for scan, cloud in before.items()}
     within = {scan: mask for scan, mask in within.items() if mask.any()}
     cloud = np.concatenate([before[scan][mask] for scan, mask in within.items()])
-    change = Change(magnitude=experiment.magnitude, density=experiment.density)
+    change = ChangeSize(magnitude=experiment.magnitude, density=experiment.density)
     half = (grid.size / 2 - MARGIN).astype(np.float32)
     operation = OPERATIONS[str(experiment.operation)]
     after = operation((cloud - centre).astype(np.float32), change, half, rng)

@@ -19,7 +19,7 @@ from worker.benchmarks.registration.scenarios import (
     KINDS,
     Scenario,
     ScenarioKind,
-    WalkSettings,
+    ScenarioSettings,
     scenario,
     take_walk,
 )
@@ -53,7 +53,7 @@ PAPER = {
 class RegistrationBenchmarkSettings:
     """What is run."""
 
-    walk: WalkSettings = field(default_factory=WalkSettings)  #: its seed gives way to each of `seeds`
+    walk: ScenarioSettings = field(default_factory=ScenarioSettings)  #: its seed gives way to each of `seeds`
     seeds: tuple[int, ...] = (1,)
     kinds: tuple[ScenarioKind, ...] = KINDS
     baseline: bool = False  #: the Open3D baseline too, on the drifted scans of the first seed
@@ -64,7 +64,7 @@ class RegistrationBenchmarkSettings:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
-class Run:
+class ScenarioRun:
     """One scenario, built and held against the truth."""
 
     scenario: Scenario
@@ -116,14 +116,14 @@ def evaluate(settings: RegistrationBenchmarkSettings, progress: Progress = no_pr
     return result
 
 
-def run_scenario(given: Scenario, seed: int, progress: Progress) -> Run:
+def run_scenario(given: Scenario, seed: int, progress: Progress) -> ScenarioRun:
     """Build the map once, against the clock. Raises MapFailed."""
     used = processor_seconds()
     clock = StageClock(progress, prefix=f"{given.kind}, seed {seed}: ")
     built = build_map(given.files, settings=PipelineSettings(), progress=clock)
     seconds = clock.seconds()
     reference = None if built.report is None else built.report.reference
-    return Run(
+    return ScenarioRun(
         scenario=given,
         seed=seed,
         built=built,
@@ -134,7 +134,11 @@ def run_scenario(given: Scenario, seed: int, progress: Progress) -> Run:
 
 
 def _beside(
-    run: Run, walk: WalkSettings, folder: Path, settings: RegistrationBenchmarkSettings, progress: Progress
+    run: ScenarioRun,
+    walk: ScenarioSettings,
+    folder: Path,
+    settings: RegistrationBenchmarkSettings,
+    progress: Progress,
 ) -> Document:
     """Run the baseline on the same scans, and a survey on the map."""
     beside: Document = {}
@@ -150,7 +154,10 @@ def _beside(
 
 
 def _baseline(
-    run: Run, distances: tuple[float, ...], settings: RegistrationBenchmarkSettings, progress: Progress
+    run: ScenarioRun,
+    distances: tuple[float, ...],
+    settings: RegistrationBenchmarkSettings,
+    progress: Progress,
 ) -> Document:
     kept = frozenset((min(p.target, p.source), max(p.target, p.source)) for p in run.built.kept)
     chosen = baseline.BaselineSettings(
@@ -176,7 +183,7 @@ def _baseline(
 
 
 def time_survey(
-    reference: ReferenceMap, true_from_map: Matrix4, walk: WalkSettings, folder: Path
+    reference: ReferenceMap, true_from_map: Matrix4, walk: ScenarioSettings, folder: Path
 ) -> Document:
     """Register a scan from the middle of a second visit to a loaded map, its prior drifted, over and over; JSON-ready.
 

@@ -22,7 +22,7 @@ KINDS: tuple[ScenarioKind, ...] = get_args(ScenarioKind)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class WalkSettings:
+class ScenarioSettings:
     """What is simulated."""
 
     building: Literal["loop", "room"] = "loop"
@@ -53,7 +53,7 @@ class Scenario:
     true: tuple[Matrix4 | None, ...]  #: world_from_sensor of each file; None for one of another building
 
 
-def take_walk(settings: WalkSettings, folder: Path, progress: Progress = no_progress) -> Walk:
+def take_walk(settings: ScenarioSettings, folder: Path, progress: Progress = no_progress) -> Walk:
     """Simulate a visit, and a few stops in another building, into PCD files."""
     progress("simulating", 0.0)
     scans = visit(
@@ -91,7 +91,7 @@ def kinds_named(words: str) -> tuple[ScenarioKind, ...]:
 
 
 def _out_of_place(
-    settings: WalkSettings, walk: tuple[SimulatedScan, ...], folder: Path
+    settings: ScenarioSettings, walk: tuple[SimulatedScan, ...], folder: Path
 ) -> tuple[SimulatedScan, ...]:
     """Take neighbouring stops in another building: a corridor of the same width, an office or a room, by the seed.
 

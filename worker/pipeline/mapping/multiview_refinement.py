@@ -16,7 +16,7 @@ from worker.cloud.poses import adjoint, inverse, skew
 from worker.cloud.types import Floats, Matrix4, Points
 from worker.pipeline.mapping.pair_selection import Extent, likely_pairs
 from worker.pipeline.mapping.pose_graph_optimization import Factor, covariances, retract, solve
-from worker.pipeline.mapping.settings import MapSettings
+from worker.pipeline.mapping.settings import MappingSettings
 from worker.pipeline.mapping.tasks import LinearizedPair, LinearizeTask, Workspace, linearize
 from worker.pipeline.registration.results import Uncertainty
 
@@ -129,7 +129,7 @@ def _pairs(
     poses: Mapping[int, Matrix4],
     points: Mapping[int, Points],
     ties: Sequence[tuple[int, int]],
-    settings: MapSettings,
+    settings: MappingSettings,
 ) -> list[tuple[int, int]]:
     extents = {scan: Extent.of(points[scan], pose) for scan, pose in poses.items()}
     near = likely_pairs(extents, settings, partners=_NEIGHBOURS)

@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 from worker.cloud.types import Matrix4, Points
 from worker.pipeline.mapping.pair_selection import Extent, likely_pairs
 from worker.pipeline.mapping.pose_graph import most_reliable_tree, reliability
-from worker.pipeline.mapping.settings import MapSettings
+from worker.pipeline.mapping.settings import MappingSettings
 from worker.pipeline.mapping.tasks import FreeSpaceTask, Violation, Workspace, check_free_space
 from worker.pipeline.registration.scan_to_scan import PairResult
 
@@ -43,7 +43,7 @@ def most_voted(
     scans: Sequence[int],
     edges: Sequence[PairResult],
     violations: Sequence[Violation],
-    settings: MapSettings,
+    settings: MappingSettings,
 ) -> PairResult | None:
     """Return the edge that most violations vote for; None where no edge lies between them."""
     paths = most_reliable_tree(scans, edges, settings).paths

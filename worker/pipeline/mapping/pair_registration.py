@@ -12,7 +12,7 @@ import numpy as np
 from worker.cloud.poses import inverse
 from worker.cloud.types import Floats, Matrix4
 from worker.pipeline.mapping.pair_selection import Extent, best_pairs, overlap_rank
-from worker.pipeline.mapping.settings import MapSettings
+from worker.pipeline.mapping.settings import MappingSettings
 from worker.pipeline.mapping.tasks import (
     RegisterTask,
     SearchResult,
@@ -59,7 +59,7 @@ class PairPlan:
     rank: Floats  #: (S, S) 0..1; by the priors' boxes, or by how much of a scan was found in the other
     starts: dict[Pair, tuple[Matrix4, ...]]  #: (lower, higher): where a searched pair was found
 
-    def first(self, settings: MapSettings) -> list[Pair]:
+    def first(self, settings: MappingSettings) -> list[Pair]:
         """Return the pairs to begin with: a few that each scan proposes."""
         searched = self._mask(self.starts)
         by_prior = best_pairs(self.indices, np.where(searched, 0.0, self.rank), settings.partners)
@@ -67,7 +67,7 @@ class PairPlan:
         return sorted({*by_prior, *by_search})
 
     def across(
-        self, components: Sequence[Sequence[int]], tried: Collection[Pair], settings: MapSettings
+        self, components: Sequence[Sequence[int]], tried: Collection[Pair], settings: MappingSettings
     ) -> list[Pair]:
         """Return the best pairs between scans of different components that were not tried yet."""
         inside = ((a, b) for component in components for a in component for b in component)

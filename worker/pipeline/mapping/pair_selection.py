@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from worker.cloud.poses import transformed
 from worker.cloud.types import Floats, Matrix4
-from worker.pipeline.mapping.settings import MapSettings
+from worker.pipeline.mapping.settings import MappingSettings
 
 _SHARE = (5, 95)  # percentiles along each axis: a few far returns do not make a box
 
@@ -37,14 +37,14 @@ class Extent:
 
 
 def likely_pairs(
-    extents: Mapping[int, Extent], settings: MapSettings, *, partners: int | None = None
+    extents: Mapping[int, Extent], settings: MappingSettings, *, partners: int | None = None
 ) -> list[tuple[int, int]]:
     """Return pairs (lower index, higher index), sorted; each scan proposes `partners` at most, else the settings'."""
     rank = overlap_rank(extents, settings)
     return best_pairs(sorted(extents), rank, settings.partners if partners is None else partners)
 
 
-def overlap_rank(extents: Mapping[int, Extent], settings: MapSettings) -> Floats:
+def overlap_rank(extents: Mapping[int, Extent], settings: MappingSettings) -> Floats:
     """Rank (S, S) how likely two scans see the same, 0..1, in the order of their indices; 0 where they are culled."""
     if not extents:
         return np.zeros((0, 0))

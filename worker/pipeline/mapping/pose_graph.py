@@ -23,7 +23,7 @@ from scipy.sparse.csgraph import (
 from worker.cloud.poses import difference, fit_poses, inverse
 from worker.cloud.types import Floats, Matrix4
 from worker.pipeline.mapping.pose_graph_optimization import Poses, optimize, residual
-from worker.pipeline.mapping.settings import MapSettings
+from worker.pipeline.mapping.settings import MappingSettings
 from worker.pipeline.registration.scan_to_scan import PairResult
 
 ENOUGH_PRIORS = 3  #: from which the error of one is outweighed
@@ -60,7 +60,7 @@ def reference_of(scans: Sequence[int], edges: Sequence[PairResult]) -> int:
     return max(scans, key=lambda scan: (len(fitness[scan]), np.mean(fitness[scan] or [0.0]), -scan))
 
 
-def chain(scans: Sequence[int], edges: Sequence[PairResult], settings: MapSettings) -> Chains:
+def chain(scans: Sequence[int], edges: Sequence[PairResult], settings: MappingSettings) -> Chains:
     """Chain the registrations along shortest paths from the reference; an edge is short that can be relied on."""
     reference = reference_of(scans, edges)
     graph = _matrix(scans, edges, _HOP + _costs(edges, settings))
@@ -68,7 +68,9 @@ def chain(scans: Sequence[int], edges: Sequence[PairResult], settings: MapSettin
     return _follow(scans, edges, reference, before)
 
 
-def most_reliable_tree(scans: Sequence[int], edges: Sequence[PairResult], settings: MapSettings) -> Chains:
+def most_reliable_tree(
+    scans: Sequence[int], edges: Sequence[PairResult], settings: MappingSettings
+) -> Chains:
     """Chain them along the tree of the edges that can be relied on most: a long way round a doubtful edge.
 
     Paths are long, and errors grow along them: good for telling which of the other edges may be true.
@@ -79,7 +81,7 @@ def most_reliable_tree(scans: Sequence[int], edges: Sequence[PairResult], settin
     return _follow(scans, edges, reference, before)
 
 
-def _costs(edges: Sequence[PairResult], settings: MapSettings) -> Floats:
+def _costs(edges: Sequence[PairResult], settings: MappingSettings) -> Floats:
     costs: Floats = -np.log(np.clip(reliability(edges, settings), 1e-6, 1.0))
     return costs
 
@@ -103,13 +105,13 @@ def _follow(
     return Chains(reference=reference, poses=poses, paths=paths)
 
 
-def reliability(edges: Sequence[PairResult], settings: MapSettings) -> Floats:
+def reliability(edges: Sequence[PairResult], settings: MappingSettings) -> Floats:
     """Return (E,) in 0..1: the confidence of each, times the share of triangles that close over it."""
     closing, open_ = triangle_counts(edges, settings)
     return np.array([edge.confidence for edge in edges]) * (closing + 1) / (closing + open_ + 2)
 
 
-def triangle_counts(edges: Sequence[PairResult], settings: MapSettings) -> tuple[Floats, Floats]:
+def triangle_counts(edges: Sequence[PairResult], settings: MappingSettings) -> tuple[Floats, Floats]:
     """Count (E,) the triangles over each edge that close within the limits of a loop, and that do not."""
     number_of = {frozenset(edge.pair): number for number, edge in enumerate(edges)}
     near = defaultdict(set)
@@ -161,7 +163,7 @@ class Solution:
     rejected: tuple[PairResult, ...]  #: accepted ones that loops do not close over
 
 
-def solve_graph(scans: Sequence[int], pairs: Sequence[PairResult], settings: MapSettings) -> Solution:
+def solve_graph(scans: Sequence[int], pairs: Sequence[PairResult], settings: MappingSettings) -> Solution:
     """Chain the accepted registrations, optimise them robustly, reject what is far from the rest, and repeat.
 
     Ends when what is left is connected and agrees; a rejection takes at least one edge, so it does end.
@@ -190,7 +192,7 @@ def solve_graph(scans: Sequence[int], pairs: Sequence[PairResult], settings: Map
         edges = [edge for edge in edges if id(edge) not in wrong]
 
 
-def _plausible(poses: Poses, edges: Sequence[PairResult], settings: MapSettings) -> list[PairResult]:
+def _plausible(poses: Poses, edges: Sequence[PairResult], settings: MappingSettings) -> list[PairResult]:
     """Return the edges that may be true by these poses."""
     return [edge for edge in edges if residual(poses, edge, settings) <= _PLAUSIBLE]
 

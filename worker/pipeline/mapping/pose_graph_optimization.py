@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from worker.cloud.poses import adjoint, difference, exponential, inverse
 from worker.cloud.types import Floats, Matrix4
-from worker.pipeline.mapping.settings import MapSettings
+from worker.pipeline.mapping.settings import MappingSettings
 from worker.pipeline.registration.scan_to_scan import PairResult
 
 Poses = Mapping[int, Matrix4]  #: map_from_scan by index of the scan
@@ -65,14 +65,14 @@ def pose_graph_factors(poses: Poses, edges: Sequence[PairResult], weights: Float
     return [_factor(poses, edge, weight) for edge, weight in zip(edges, weights, strict=True)]
 
 
-def residual(poses: Poses, edge: PairResult, settings: MapSettings) -> float:
+def residual(poses: Poses, edge: PairResult, settings: MappingSettings) -> float:
     """Measure how far a registration is from the poses: 1 where it is off by as much as a loop may be."""
     metres, radians = difference(edge.target_from_source, inverse(poses[edge.target]) @ poses[edge.source])
     return float(np.hypot(metres / settings.loop_distance, radians / settings.loop_angle))
 
 
 def optimize(
-    poses: Poses, edges: Sequence[PairResult], *, fixed: int, settings: MapSettings
+    poses: Poses, edges: Sequence[PairResult], *, fixed: int, settings: MappingSettings
 ) -> tuple[dict[int, Matrix4], Floats]:
     """Find poses on which as many registrations as possible agree, and the weight (E,) of each, 0..1.
 
@@ -95,7 +95,7 @@ def optimize(
     return current, weights
 
 
-def _squares(poses: Poses, edges: Sequence[PairResult], settings: MapSettings) -> Floats:
+def _squares(poses: Poses, edges: Sequence[PairResult], settings: MappingSettings) -> Floats:
     return np.array([residual(poses, edge, settings) ** 2 for edge in edges])
 
 

@@ -10,7 +10,7 @@ from worker.cloud.settings import StrictModel
 from worker.pipeline.registration.settings import RegistrationSettings
 
 
-class MapSettings(StrictModel):
+class MappingSettings(StrictModel):
     """Of overlap culling, the pose graph and the multi-view refinement (paper, Section 3.3.2, and what we add)."""
 
     min_box_overlap: float = Field(
@@ -43,5 +43,5 @@ class JointRegistrationSettings:
     """What the registration of many scans needs: the settings of two stages, and the reader's limit."""
 
     registration: RegistrationSettings
-    mapping: MapSettings
+    mapping: MappingSettings
     max_points: int  #: of one scan

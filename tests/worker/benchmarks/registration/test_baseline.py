@@ -16,7 +16,7 @@ from worker.benchmarks.registration.baseline import (
     compare,
     optimised,
 )
-from worker.benchmarks.registration.scenarios import WalkSettings, scenario, take_walk
+from worker.benchmarks.registration.scenarios import ScenarioSettings, scenario, take_walk
 from worker.benchmarks.trajectory import align, distances
 from worker.cloud.poses import difference, inverse
 from worker.cloud.types import Matrix4
@@ -65,7 +65,7 @@ def test_a_wrong_loop_is_outvoted() -> None:
 
 
 def test_four_scans_of_a_room_come_out_right_from_drifted_priors(tmp_path: Path) -> None:
-    walk = WalkSettings(building="room", scans=4, foreign=1, seed=3, duration_s=2.0)
+    walk = ScenarioSettings(building="room", scans=4, foreign=1, seed=3, duration_s=2.0)
     given = scenario(take_walk(walk, tmp_path), "drifted", seed=3)
     true = [pose for pose in given.true if pose is not None]
     found = build_baseline(given.files, BaselineSettings())
@@ -80,7 +80,7 @@ def test_four_scans_of_a_room_come_out_right_from_drifted_priors(tmp_path: Path)
 
 
 def test_files_without_priors_are_refused(tmp_path: Path) -> None:
-    walk = WalkSettings(building="room", scans=2, foreign=1, duration_s=0.1)
+    walk = ScenarioSettings(building="room", scans=2, foreign=1, duration_s=0.1)
     given = scenario(take_walk(walk, tmp_path), "lost", seed=1)
     with pytest.raises(ValueError, match="priors"):
         build_baseline(given.files, BaselineSettings())

@@ -7,8 +7,8 @@ import pytest
 
 from worker.benchmarks.registration.scenarios import (
     KINDS,
+    ScenarioSettings,
     Walk,
-    WalkSettings,
     kinds_named,
     scenario,
     take_walk,
@@ -18,7 +18,7 @@ from worker.cloud.poses import difference, transformed
 from worker.simulation.scenes import random_room
 from worker.simulation.visits import DRIFT
 
-SETTINGS = WalkSettings(building="room", scans=6, foreign=3, seed=2, duration_s=0.2)
+SETTINGS = ScenarioSettings(building="room", scans=6, foreign=3, seed=2, duration_s=0.2)
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.support.tilings import ORIGIN, SIZE, grid_of
-from worker.benchmarks.baselines import CloudToCloud as Baseline
+from worker.benchmarks.baselines import CloudToCloudBaseline as Baseline
 from worker.cloud.tiling import TilePairs, TilingSettings, cut, pair_tiles
 from worker.detectors.card import MODEL_STORE, Card
 from worker.detectors.comparison import Comparison, Side

@@ -26,7 +26,7 @@ from worker.cloud.poses import exponential, inverse
 from worker.cloud.types import Matrix4
 from worker.errors import Cancelled, MapFailed, ScanError, ScanTooLarge
 from worker.pipeline.mapping.map_registration import MapRegistration, register_map_scans
-from worker.pipeline.mapping.settings import JointRegistrationSettings, MapSettings
+from worker.pipeline.mapping.settings import JointRegistrationSettings, MappingSettings
 from worker.pipeline.registration.results import ScanFile
 from worker.pipeline.registration.results import read_registered as read_again
 from worker.progress import Progress, no_progress
@@ -347,7 +347,7 @@ def test_where_no_file_is_a_scan_the_first_is_named(tmp_path: Path) -> None:
 
 
 def test_a_scan_of_more_points_than_the_limit_is_refused(drifted: tuple[ScanFile, ...]) -> None:
-    few = JointRegistrationSettings(registration=QUICK, mapping=MapSettings(), max_points=1000)
+    few = JointRegistrationSettings(registration=QUICK, mapping=MappingSettings(), max_points=1000)
     with pytest.raises(ScanTooLarge, match=r"^drifted-0\.pcd: "):
         register(drifted[:1], few)
 

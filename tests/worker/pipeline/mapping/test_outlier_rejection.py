@@ -13,12 +13,12 @@ from tests.support.walks import QUICK, joint_settings, prepared_folder, spread, 
 from worker.cloud.poses import exponential
 from worker.pipeline.mapping import map_registration as stage
 from worker.pipeline.mapping.outlier_rejection import find_violations, most_voted
-from worker.pipeline.mapping.settings import MapSettings
+from worker.pipeline.mapping.settings import MappingSettings
 from worker.pipeline.mapping.tasks import Violation, Workspace
 from worker.pipeline.registration.scan_to_scan import PairResult
 from worker.processes import Processes
 
-SETTINGS = MapSettings()
+SETTINGS = MappingSettings()
 
 
 def two_lines() -> tuple[list[int], list[PairResult], PairResult]:

@@ -14,7 +14,7 @@ from worker.errors import Cancelled
 from worker.pipeline.mapping import pair_registration
 from worker.pipeline.mapping.map_registration import MapRegistration, register_map_scans
 from worker.pipeline.mapping.pair_registration import NullPairCache, PairCache, PairPlan
-from worker.pipeline.mapping.settings import MapSettings
+from worker.pipeline.mapping.settings import MappingSettings
 from worker.pipeline.mapping.tasks import RegisterTask, SearchTask, register_pairs, search
 from worker.pipeline.registration.results import ScanFile
 from worker.pipeline.registration.scan_to_scan import PairResult
@@ -154,7 +154,7 @@ def test_the_null_cache_keeps_nothing() -> None:
     assert list(cache.load()) == []
 
 
-SELECTION = MapSettings(partners=1, searched_partners=2, partners_across=1)
+SELECTION = MappingSettings(partners=1, searched_partners=2, partners_across=1)
 
 
 def plan(pairs: dict[tuple[int, int], float], *, searched: tuple[tuple[int, int], ...] = ()) -> PairPlan:

@@ -5,9 +5,9 @@ import pytest
 
 from tests.support.graphs import shifted
 from worker.pipeline.mapping.pair_selection import Extent, best_pairs, likely_pairs
-from worker.pipeline.mapping.settings import MapSettings
+from worker.pipeline.mapping.settings import MappingSettings
 
-SETTINGS = MapSettings()
+SETTINGS = MappingSettings()
 
 
 def box(x: float = 0.0, y: float = 0.0, z: float = 0.0, *, size: tuple[float, float, float]) -> Extent:

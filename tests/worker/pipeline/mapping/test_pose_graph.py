@@ -22,10 +22,10 @@ from worker.pipeline.mapping.pose_graph import (
     solve_graph,
     triangle_counts,
 )
-from worker.pipeline.mapping.settings import MapSettings
+from worker.pipeline.mapping.settings import MappingSettings
 from worker.pipeline.registration.scan_to_scan import PairResult
 
-SETTINGS = MapSettings()
+SETTINGS = MappingSettings()
 MOTION = exponential(np.array([0.02, -0.01, 1.9, 4.0, -7.0, 0.3]))
 TRUTH = line(8)
 doubtful = partial(edge, two_way_inlier_ratio=0.84, free_space_violation=0.003)

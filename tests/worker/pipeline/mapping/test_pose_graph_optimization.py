@@ -16,9 +16,9 @@ from worker.pipeline.mapping.pose_graph_optimization import (
     retract,
     solve,
 )
-from worker.pipeline.mapping.settings import MapSettings
+from worker.pipeline.mapping.settings import MappingSettings
 
-SETTINGS = MapSettings()
+SETTINGS = MappingSettings()
 SMALL = exponential(np.array([0.002, -0.003, 0.004, 0.01, -0.02, 0.015]))
 
 
