@@ -33,8 +33,8 @@ def record_figures(model_store: Path, model: str, files: Mapping[str, Path]) -> 
     return folder / "card.json"
 
 
-def out_of_place(card: Card) -> list[str]:
-    """Return the benchmarks whose figures on this card were measured with other weights than it vouches for."""
+def outdated_sections(card: Card) -> list[str]:
+    """Name the benchmarks on this card that were measured with other weights than its own."""
     measured = {name: card.evaluation[name] for name in SECTIONS if name in card.evaluation}
     return [name for name, section in measured.items() if section.get("sha256") != card.sha256]
 

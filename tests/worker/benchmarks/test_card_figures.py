@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from worker.benchmarks.card_figures import out_of_place, paper_figures, revisit_figures
+from worker.benchmarks.card_figures import outdated_sections, paper_figures, revisit_figures
 from worker.cli import main
 from worker.detectors.card import MODEL_STORE, Card, Preprocessing
 from worker.detectors.store import open_card, read_card, write_card
@@ -113,7 +113,7 @@ def test_both_benchmarks_come_on_the_card_and_the_rest_of_it_stays(store: Path) 
     assert set(after.evaluation) == {"validation", "paper", "revisit"}
     assert after.evaluation["validation"] == {"f1": 0.5}
     assert after.model_copy(update={"evaluation": before.evaluation}) == before
-    assert out_of_place(after) == []
+    assert outdated_sections(after) == []
 
 
 def test_the_paper_section_has_both_thresholds_the_kinds_and_the_baselines() -> None:
@@ -165,9 +165,9 @@ def test_what_is_no_measurement_of_this_model_is_refused_and_the_card_stays(
 def test_figures_left_over_from_other_weights_are_found(store: Path) -> None:
     record(store, paper=paper_told(), revisit=revisit_told())
     card = open_card(store, "spicd-net/7")
-    assert out_of_place(card.model_copy(update={"sha256": OTHERS})) == ["paper", "revisit"]
+    assert outdated_sections(card.model_copy(update={"sha256": OTHERS})) == ["paper", "revisit"]
 
 
 @pytest.mark.parametrize("path", CARDS, ids=lambda path: "/".join(path.parts[-3:-1]))
 def test_the_shipped_cards_have_no_figures_of_other_weights(path: Path) -> None:
-    assert out_of_place(read_card(path.parent)) == []
+    assert outdated_sections(read_card(path.parent)) == []
