@@ -17,7 +17,7 @@ from tests.support.release_0_1 import current_of_0_1, reference_of_0_1, scan_of_
 from worker.cloud import npz
 from worker.detectors.card import MODEL_STORE
 from worker.detectors.detector import Detection
-from worker.errors import TrainingFailed
+from worker.errors import MapFailed, TrainingFailed
 from worker.pipeline import archive
 from worker.pipeline.mapping.fusion import CurrentMap
 
@@ -122,6 +122,18 @@ def test_a_survey_of_a_map_that_release_0_1_built_says_what_it_said_then(house: 
     survey = house.survey(surveyed(house, "spicd-net/1", map_id=MAP))
     assert survey.status == "ready"
     assert house.tiles(survey.survey_id) == before
+
+
+def test_a_map_in_files_that_nobody_knows_is_refused_with_what_to_do(house: House) -> None:
+    key = blob_keys.map_reference(house.catalog.versions.ready(MAP, 1).job_id)
+    unknown = house.folder / "unknown.npz"
+    npz.save_arrays(unknown, {"octree": np.zeros(3)})
+    house.catalog.blobs.put_file(key, unknown)
+    with pytest.raises(MapFailed, match="build the map anew from its scans"):
+        surveyed(house, "spicd-net/1", map_id=MAP)
+    problem = house.catalog.jobs.page(limit=1).items[0].problem
+    assert problem is not None
+    assert problem.code == "map_failed"
 
 
 def test_a_survey_that_release_0_1_had_registered_is_scored_and_exported(house: House) -> None:

@@ -14,6 +14,7 @@ from service.catalog import blob_keys
 from service.catalog.records import ScanOutcome, VersionRecord
 from worker.cloud import npz
 from worker.cloud.types import Indices
+from worker.errors import MapFailed
 from worker.jobs.pair_cache import StoredPairCache
 from worker.jobs.scans import kept_scans, save_scans, scan_files, scan_outcomes
 from worker.jobs.step import Context, put
@@ -41,12 +42,18 @@ class Made:
 
 
 def kept_reference(context: Context, version: VersionRecord) -> ReferenceMap:
-    """Return the map of a version, also one that release 0.1 built."""
+    """Return the map of a version, also one that release 0.1 built. Raises MapFailed for a file of another kind."""
     blobs, tiles_of_0_1 = context.catalog.blobs, blob_keys.map_tiles(version.job_id)
     with ExitStack() as stack:
         path = stack.enter_context(blobs.local(blob_keys.map_reference(version.job_id)))
         grid = stack.enter_context(blobs.local(tiles_of_0_1)) if blobs.exists(tiles_of_0_1) else None
-        return archive.load_reference(path, tiles_of_0_1=grid)
+        try:
+            return archive.load_reference(path, tiles_of_0_1=grid)
+        except ValueError as unknown:
+            raise MapFailed(
+                f"version {version.version} of map {version.map_id} is kept in files that this release cannot read; "
+                "build the map anew from its scans"
+            ) from unknown
 
 
 def make_version(context: Context, version: VersionRecord, settings: PipelineSettings) -> Made:

@@ -1,7 +1,7 @@
 """The encoder as it is used: weights folded once, one cloud at a time, in pieces that stay in the cache.
 
 It takes a patch's distinct points, since a max-pool cannot see repeats; only the centroid knows of them. The
-result is the descriptor of the padded patch within float32 rounding (a test holds 1e-4 on the scores).
+result is the descriptor of the padded patch within float32 rounding (a test holds it).
 """
 
 from __future__ import annotations
