@@ -18,6 +18,7 @@ from worker.simulation.scenes import (
     rigid,
     small_office,
 )
+from worker.simulation.scenes.edits import Place
 from worker.simulation.scenes.mesh import box, cylinder, sphere
 from worker.simulation.sensor import PERFECT, scan
 
@@ -159,7 +160,9 @@ def test_edits_take_turns():
 
 def test_random_solids_keep_to_their_sizes_and_places():
     scene = small_office(1)
-    for place, low, high in (("floor", 0.0, 0.0), ("furniture", 0.1, 2.6), ("air", 0.3, 2.6)):
+    bands: dict[Place, tuple[float, float]]
+    bands = {"floor": (0.0, 0.0), "furniture": (0.1, 2.6), "air": (0.3, 2.6)}
+    for place, (low, high) in bands.items():
         after, changes = random_solids(scene, seed=5, count=12, places=(place,))
         assert len(changes) >= 8
         assert {change.kind for change in changes} == {"add"}
