@@ -60,7 +60,14 @@ class Toy:
         share = np.clip(self.gain * np.abs(now - kept["counts"]) / kept["counts"], 0, 1)
         progress("scoring", 1.0)
         detection = Detection.of_scores(np.where(comparison.observed, share, np.nan))
-        voxels = VoxelScores(keys=np.array([3, 5]), appeared=np.ones(2, "f4"), disappeared=np.zeros(2, "f4"))
+        voxels = VoxelScores(
+            keys=np.array([3, 5]),
+            appeared=np.ones(2, "f4"),
+            disappeared=np.zeros(2, "f4"),
+            judged=np.ones(2, bool),
+            moving=np.zeros(2, bool),
+            seen_through=np.ones(2, np.int16),
+        )
         return Detection(probabilities=detection.probabilities, voxels=voxels)
 
 

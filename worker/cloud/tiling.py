@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,11 +16,16 @@ from worker.errors import MapFailed
 _MOST_TILES = 10_000_000  # of a grid's box; a wider one means stray points, not a building
 
 
+#: `dense`: tiles of the map with enough points to compare patches; `touched`: all that either visit has a point in
+TileChoice = Literal["dense", "touched"]
+
+
 class TilingSettings(StrictModel):
     """Section 3.4 and Table 3 of the paper; tile size and points come from the model's card."""
 
     tile_size: tuple[float, float, float] = Field((1.5, 1.5, 1.0), description="metres")
-    min_points: int = Field(512, gt=0, description="tiles of the map with fewer points are left out")
+    tiles: TileChoice = Field("dense", description="those with enough points of the map, or all touched")
+    min_points: int = Field(512, gt=0, description="dense tiles of the map with fewer points are left out")
     min_observed_share: float = Field(
         0.5,
         ge=0,
@@ -154,9 +159,27 @@ def cut(points: Points, grid: TileGrid, *, min_points: int) -> Tiles:
     kept = np.array([cell for cell, _ in dense], np.int64)
     return Tiles(
         grid=grid,
-        indices=(np.stack(np.unravel_index(kept, grid.shape), axis=1) + grid.lowest).astype(np.int32),
+        indices=_indices_of(kept, grid),
         points=tuple(part for _, part in dense),
     )
+
+
+def _indices_of(cells: NDArray[np.int64], grid: TileGrid) -> Indices:
+    return (np.stack(np.unravel_index(cells, grid.shape), axis=1) + grid.lowest).astype(np.int32)
+
+
+def touched_tiles(reference: Points, current: Points, grid: TileGrid) -> Tiles:
+    """Sort the map's points (N, 3) into all tiles in which it or the survey (M, 3) has a point, in the grid's order.
+
+    The grid grows to hold both; tiles that only the survey touched are empty. Raises MapFailed as `grown` does.
+    """
+    grid = grown(grid, np.concatenate([reference, current]))
+    mapped = cut(reference, grid, min_points=1)
+    cells = np.unique(np.concatenate([grid.cells(mapped.indices), grid.locate(current)]))
+    rows = {int(cell): row for row, cell in enumerate(grid.cells(mapped.indices))}
+    nothing = np.empty((0, 3), np.float32)
+    points = tuple(mapped.points[rows[int(cell)]] if int(cell) in rows else nothing for cell in cells)
+    return Tiles(grid=grid, indices=_indices_of(cells, grid), points=points)
 
 
 def pair_tiles(reference: Tiles, current: Points, *, settings: TilingSettings) -> TilePairs:
@@ -166,5 +189,6 @@ def pair_tiles(reference: Tiles, current: Points, *, settings: TilingSettings) -
     ordered = current[np.argsort(rows, kind="stable")].astype(np.float32, copy=False)
     points = tuple(np.split(ordered, np.cumsum(counts)[:-1])[1:])
     expected = np.array([len(part) for part in reference.points]) * settings.min_observed_share
-    observed = (counts[1:] >= settings.min_points) & (counts[1:] >= expected)
+    fewest = settings.min_points if settings.tiles == "dense" else 1
+    observed = (counts[1:] >= fewest) & (counts[1:] >= expected)
     return TilePairs(reference=reference, current=points, observed=observed)

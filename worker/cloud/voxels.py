@@ -6,7 +6,7 @@ one frame are sampled by the same cells.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,9 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from worker.cloud.types import Colors, Points
+from worker.cloud.voxel_keys import BITS, packed
 from worker.errors import MapFailed
-
-_BITS = 21  # of a signed cell index; 2^20 cells of 5 cm reach 52 km from the origin
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -50,12 +49,12 @@ class Voxels:
     @staticmethod
     def keys_of(points: NDArray[Any], *, size: float) -> NDArray[np.int64]:
         """Return (N,) the packed index of the cell that each point (N, 3) lies in; raises MapFailed as `of` does."""
-        cells = np.floor(points / size).astype(np.int64) + (1 << (_BITS - 1))
-        if len(cells) and (cells.min() < 0 or cells.max() >> _BITS):
+        cells = np.floor(points / size).astype(np.int64)
+        limit = 1 << (BITS - 1)
+        if len(cells) and (cells.min() < -limit or cells.max() >= limit):
             farthest = float(np.abs(points).max()) / 1000
             raise MapFailed(f"a point lies {farthest:.0f} km from the map's origin; check the pose priors")
-        keys: NDArray[np.int64] = (cells[:, 0] << (2 * _BITS)) | (cells[:, 1] << _BITS) | cells[:, 2]
-        return keys
+        return packed(cells)
 
     def merged(self, other: Voxels) -> Voxels:
         """Add both; colours are kept only where both have them."""
@@ -107,6 +106,23 @@ def _summed(
         counts=np.add.reduceat(counts[order], starts),
         sums=np.add.reduceat(values[order], starts, axis=0),
     )
+
+
+def fused(parts: Iterable[Voxels]) -> Voxels | None:
+    """Merge all parts, a few of which are held at once; None where there is none.
+
+    Sums of like size are merged, as in a merge sort: each voxel is sorted log(parts) times, not once a part.
+    """
+    stack: list[Voxels] = []
+    for part in parts:
+        stack.append(part)
+        while len(stack) > 1 and len(stack[-2].keys) < 2 * len(stack[-1].keys):
+            last = stack.pop()
+            stack[-1] = stack[-1].merged(last)
+    while len(stack) > 1:
+        last = stack.pop()
+        stack[-1] = stack[-1].merged(last)
+    return stack[0] if stack else None
 
 
 def merged_in_order(parts: Sequence[Voxels]) -> Voxels:

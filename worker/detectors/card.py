@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, Field, ValidationError, model_validator
 
 from worker.cloud.settings import StrictModel
+from worker.cloud.tiling import TileChoice
 
 #: The models that come with the code, wherever a command is typed.
 MODEL_STORE = Path(__file__).resolve().parents[2] / "model_store"
@@ -25,7 +26,10 @@ class Preprocessing(StrictModel):
 
     voxel_size: float = Field(gt=0, description="metres; both maps are fused at this size")
     tile_size: tuple[float, float, float] = Field(description="metres")
-    min_points: int = Field(gt=0, description="tiles with fewer points are not scored")
+    min_points: int = Field(gt=0, description="dense tiles with fewer points are not scored")
+    tiles: TileChoice = Field(
+        "dense", description="the tiles that are scored; detectors by voxels take all touched"
+    )
 
 
 class Card(StrictModel):

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from worker.cloud.seen import Seen
 from worker.cloud.tiling import TileGrid, TilePairs, Tiles
 from worker.cloud.types import Bools, Floats, Indices, Matrix4, Normals, Points
 
@@ -30,15 +30,6 @@ class SeenScan(Protocol):
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
-class Evidence:
-    """What the rays of one side met in voxels; a voxel that is not listed is unknown to it."""
-
-    keys: NDArray[np.int64]  #: (V,) voxels of the map frame, ascending
-    hits: NDArray[np.int32]  #: (V,) returns from within the voxel: it was occupied
-    passes: NDArray[np.int32]  #: (V,) rays that went on behind it: it was seen through
-
-
-@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
 class Side:
     """One of the two clouds that are compared."""
 
@@ -47,7 +38,7 @@ class Side:
     scans: Sequence[
         Callable[[], SeenScan]
     ] = ()  #: each call loads one, so that a map of 500 never lies in memory
-    evidence: Evidence | None = None  #: None: nobody followed the rays
+    seen: Seen | None = None  #: None: nobody kept what the scans saw
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)

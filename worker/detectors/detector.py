@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from worker.cloud.tiling import Tiles
-from worker.cloud.types import Arrays
+from worker.cloud.types import Arrays, Bools
 from worker.detectors.card import Card
 from worker.detectors.comparison import Comparison, Side
 from worker.progress import Progress, no_progress
@@ -19,18 +19,27 @@ Probabilities = NDArray[np.float32]
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
 class VoxelScores:
-    """Probabilities of V voxels of the map frame; of the others nothing is said."""
+    """What is said of each of the V voxels that either visit hit, map frame."""
 
     keys: NDArray[np.int64]  #: (V,) ascending
-    appeared: Probabilities  #: (V,) there is something that was not there
-    disappeared: Probabilities  #: (V,) something is no longer there
+    appeared: Probabilities  #: (V,) the survey hit something that was not there; 0 where it hit nothing
+    disappeared: Probabilities  #: (V,) what the map has is no longer there; 0 where it has nothing
+    judged: Bools  #: (V,) whether the other visit could tell; where it could not, both probabilities are 0
+    moving: Bools  #: (V,) whether the very visit that hit it saw through it as well: people, doors
+    seen_through: NDArray[np.int16]  #: (V,) scans of the other visit that saw through it
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
 class Detection:
     """Class probabilities of every tile: no change, changed, different place (paper, Section 3.1)."""
 
-    probabilities: Probabilities  #: (T, 3), rows sum to 1; NaN where the tile was not observed
+    #: (T, 3), rows sum to 1; NaN where the tile was not observed, and so cannot be compared
+    probabilities: Probabilities
+    observed_share: Probabilities | None = (
+        None  #: (T,) of what the map knows of the tile, what could be judged
+    )
+    appeared: NDArray[np.int32] | None = None  #: (T,) voxels
+    disappeared: NDArray[np.int32] | None = None  #: (T,) voxels
     voxels: VoxelScores | None = None  #: None: the detector scores tiles alone
 
     @classmethod

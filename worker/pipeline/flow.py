@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
-from worker.cloud.tiling import TileGrid, Tiles, grid_over, grown, pair_tiles
+from worker.cloud.seen import Seen
+from worker.cloud.tiling import TileGrid, Tiles, grid_over, grown, pair_tiles, touched_tiles
 from worker.cloud.types import Arrays
 from worker.cloud.voxels import Voxels
 from worker.detectors.comparison import Comparison, SeenScan, Side
@@ -123,12 +124,19 @@ def compare(
     settings: PipelineSettings,
     reference_scans: Scans = (),
     current_scans: Scans = (),
+    reference_seen: Seen | None = None,
+    current_seen: Seen | None = None,
 ) -> Comparison:
     """Set the map and a survey side by side for a detector, cut along the map's tiles (about 50 ms)."""
-    tiles = reference.tiles(min_points=settings.tiling.min_points)
+    if settings.tiling.tiles == "touched":
+        tiles = touched_tiles(reference.points, current.points, reference.grid)
+    else:
+        tiles = reference.tiles(min_points=settings.tiling.min_points)
     return Comparison(
-        reference=Side(points=reference.points, normals=reference.normals, scans=reference_scans),
-        current=Side(points=current.points, scans=current_scans),
+        reference=Side(
+            points=reference.points, normals=reference.normals, scans=reference_scans, seen=reference_seen
+        ),
+        current=Side(points=current.points, scans=current_scans, seen=current_seen),
         tile_pairs=pair_tiles(tiles, current.points, settings=settings.tiling),
     )
 

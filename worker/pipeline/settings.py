@@ -22,7 +22,7 @@ class PipelineSettings(StrictModel):
     def for_model(self, needs: Preprocessing) -> PipelineSettings:
         """Return the same settings with what is tied to a model's weights put in its place."""
         voxels = {"voxel_size": needs.voxel_size}
-        tiles = {"tile_size": needs.tile_size, "min_points": needs.min_points}
+        tiles = {"tile_size": needs.tile_size, "min_points": needs.min_points, "tiles": needs.tiles}
         return self.with_values(
             registration=self.registration.with_values(**voxels), tiling=self.tiling.with_values(**tiles)
         )

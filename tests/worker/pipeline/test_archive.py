@@ -71,7 +71,18 @@ def test_pairs_come_back_equal_with_empty_tiles_in_any_place(
 
 
 @pytest.mark.parametrize(
-    "voxels", [None, VoxelScores(keys=np.arange(2), appeared=POINTS[0, :2], disappeared=POINTS[1, :2])]
+    "voxels",
+    [
+        None,
+        VoxelScores(
+            keys=np.arange(2),
+            appeared=POINTS[0, :2],
+            disappeared=POINTS[1, :2],
+            judged=np.ones(2, bool),
+            moving=np.zeros(2, bool),
+            seen_through=np.ones(2, np.int16),
+        ),
+    ],
 )
 def test_scores_come_back_equal_with_nan_and_with_voxels_where_there_are_any(
     tmp_path: Path, voxels: VoxelScores | None

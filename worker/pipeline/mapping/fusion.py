@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from worker.cloud.tiling import TileGrid, Tiles, cut
 from worker.cloud.types import Bools, Colors, Normals, Points
-from worker.cloud.voxels import Voxels
+from worker.cloud.voxels import Voxels, fused
 from worker.errors import MapFailed
 from worker.pipeline.registration.results import RegisteredScan
 from worker.pipeline.registration.settings import RegistrationSettings
@@ -47,35 +47,26 @@ def fuse(scans: Iterable[RegisteredScan], *, voxel_size: float) -> Voxels:
 
     Raises MapFailed where there is no scan.
     """
-    # Sums of like size are merged, as in a merge sort: each voxel is sorted log(scans) times, not once a scan.
-    stack: list[Voxels] = []
-    for scan in scans:
-        stack.append(scan.voxels(voxel_size))
-        while len(stack) > 1 and len(stack[-2].keys) < 2 * len(stack[-1].keys):
-            last = stack.pop()
-            stack[-1] = stack[-1].merged(last)
-    if not stack:
+    voxels = fused(scan.voxels(voxel_size) for scan in scans)
+    if voxels is None:
         raise MapFailed("no scan is left to fuse; see the reasons listed with the scans")
-    while len(stack) > 1:
-        last = stack.pop()
-        stack[-1] = stack[-1].merged(last)
-    return stack[0]
+    return voxels
 
 
-def reference_map(fused: Voxels, *, grid: TileGrid, settings: RegistrationSettings) -> ReferenceMap:
+def reference_map(voxels: Voxels, *, grid: TileGrid, settings: RegistrationSettings) -> ReferenceMap:
     """Return the fused cloud with the normals that surveys will need, computed once."""
-    surface = surface_of(fused, settings)
+    surface = surface_of(voxels, settings)
     return ReferenceMap(
-        points=fused.points,
+        points=voxels.points,
         normals=surface.normals.astype("float32"),
         oriented=surface.oriented,
-        colors=fused.colors,
-        voxel_size=fused.size,
+        colors=voxels.colors,
+        voxel_size=voxels.size,
         grid=grid,
     )
 
 
 def current_map(scans: Iterable[RegisteredScan], *, voxel_size: float) -> CurrentMap:
     """Fuse the survey's scans like the map was (paper, Section 3.9.1)."""
-    fused = fuse(scans, voxel_size=voxel_size)
-    return CurrentMap(points=fused.points, colors=fused.colors)
+    voxels = fuse(scans, voxel_size=voxel_size)
+    return CurrentMap(points=voxels.points, colors=voxels.colors)

@@ -1,0 +1,200 @@
+"""Sights: how far each scan of a visit saw in every direction, and so what stands at a place, or does not.
+
+A scan's range image is kept in the map frame, about its sensor's place: of each direction the nearest and the farthest
+return. A point at depth d is held against it:
+
+| verdict | the returns in the point's direction |
+| --- | --- |
+| through | all lie beyond it: the scan saw through the place |
+| surely | those of the eight neighbouring directions lie beyond it as well (grazing floors fool a single one) |
+| hidden | all lie before it: something stands in the way |
+| confirmed | neither: something stands there |
+| none | there are none: the scan did not look there |
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worker.cloud.types import Floats
+from worker.threads import query_threads
+
+CELLS = 96  #: along a face of the cube: 1.2 degrees in its middle, 0.6 at its edge
+TOLERANCE = (
+    0.08,
+    0.01,
+)  #: metres, and times the depth, that a return may lie off and still be the same surface
+FARTHEST_RESIDUAL = 0.6  #: metres; a residual is no larger
+_MILLIMETRE = 0.001  # ranges are kept in these, as uint16: up to 65 m
+_FARTHEST = np.iinfo(np.uint16).max  # in these
+
+Counts = NDArray[np.int16]
+
+
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class Verdicts:
+    """How many scans of a visit said what of each of N places."""
+
+    through: Counts  #: (N,)
+    surely: Counts  #: (N,) of those that saw through
+    confirmed: Counts  #: (N,)
+    hidden: Counts  #: (N,)
+    residual: NDArray[np.float32]  #: (N,) metres to the nearest return of any scan, along its ray, clipped
+
+    @classmethod
+    def none(cls, count: int) -> Self:
+        """Say nothing of `count` places."""
+        through, surely, confirmed, hidden = np.zeros((4, count), np.int16)
+        residual = np.full(count, FARTHEST_RESIDUAL, np.float32)
+        return cls(through=through, surely=surely, confirmed=confirmed, hidden=hidden, residual=residual)
+
+    @property
+    def judged(self) -> NDArray[np.bool_]:
+        """(N,) whether any scan could tell that something stands there, or nothing."""
+        return (self.through > 0) | (self.confirmed > 0)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class Sights:
+    """The range images of S scans, map frame; 0 where a scan had no return."""
+
+    origins: Floats  #: (S, 3) metres
+    nearest: NDArray[np.uint16]  #: (S, 6 CELLS^2) millimetres
+    farthest: NDArray[np.uint16]  #: (S, 6 CELLS^2) millimetres
+
+    @classmethod
+    def of(cls, scans: Iterable[tuple[NDArray[Any], Floats]]) -> Self | None:
+        """Take each scan's points (N, 3) and the place (3,) that all were seen from, metres, map frame.
+
+        Returns None where there is no scan.
+        """
+        return cls.joined([cls._of_one(points, origin) for points, origin in scans])
+
+    @classmethod
+    def joined(cls, parts: Iterable[Self | None]) -> Self | None:
+        """Put the images of several visits together, or None where none has any."""
+        there = [part for part in parts if part is not None]
+        if not there:
+            return None
+        return cls(
+            origins=np.concatenate([part.origins for part in there]),
+            nearest=np.concatenate([part.nearest for part in there]),
+            farthest=np.concatenate([part.farthest for part in there]),
+        )
+
+    @classmethod
+    def _of_one(cls, points: NDArray[Any], origin: Floats) -> Self:
+        rays = (points - origin).astype(np.float32)
+        cells = _cells_of(rays)
+        ranges = np.minimum(np.sqrt(np.einsum("ij,ij->i", rays, rays)) / _MILLIMETRE, _FARTHEST)
+        nearest = np.full(6 * CELLS**2, np.inf, np.float32)
+        farthest = np.zeros(6 * CELLS**2, np.float32)
+        np.minimum.at(nearest, cells, ranges)
+        np.maximum.at(farthest, cells, ranges)
+        nearest[farthest == 0] = 0
+        return cls(
+            origins=np.asarray(origin, np.float64)[None],
+            nearest=np.rint(nearest).astype(np.uint16)[None],
+            farthest=np.rint(farthest).astype(np.uint16)[None],
+        )
+
+    def __len__(self) -> int:
+        return len(self.origins)
+
+    def subset(self, chosen: NDArray[np.intp]) -> Sights:
+        """Return the images of these scans (s,) alone."""
+        return Sights(
+            origins=self.origins[chosen], nearest=self.nearest[chosen], farthest=self.farthest[chosen]
+        )
+
+    def verdicts(self, points: NDArray[Any]) -> Verdicts:
+        """Hold points (N, 3), metres, map frame, against every scan; each costs only the points within its reach.
+
+        Points in the order of their x, as voxels are, are the cheapest.
+        """
+        answer = Verdicts.none(len(points))
+        order = np.argsort(points[:, 0], kind="stable")
+        ordered = np.ascontiguousarray(points[order], np.float32)
+        with ThreadPoolExecutor(max(1, query_threads())) as pool:
+            for rows, told in pool.map(functools.partial(self._verdicts_of_one, ordered), range(len(self))):
+                there = order[rows]
+                answer.through[there] += told.through
+                answer.surely[there] += told.surely
+                answer.confirmed[there] += told.confirmed
+                answer.hidden[there] += told.hidden
+                answer.residual[there] = np.minimum(answer.residual[there], told.residual)
+        return answer
+
+    def _verdicts_of_one(self, ordered: NDArray[np.float32], scan: int) -> tuple[NDArray[np.int64], Verdicts]:
+        """Return the rows of the points that one scan reached, and what it says of them."""
+        origin, reach = self.origins[scan].astype(np.float32), self.farthest[scan].max() * _MILLIMETRE
+        first, last = np.searchsorted(ordered[:, 0], [origin[0] - reach, origin[0] + reach])
+        rays = ordered[first:last] - origin
+        rows = np.flatnonzero(np.abs(rays[:, 1]) <= reach)
+        if len(rows) < len(rays):
+            rays = rays[rows]
+        cells = _cells_of(rays)
+        depth = np.sqrt(np.einsum("ij,ij->i", rays, rays))
+        nearest, farthest, around = (image[cells] for image in self._images(scan))
+        tolerance = TOLERANCE[0] + TOLERANCE[1] * depth
+        known = farthest > 0
+        through = known & (nearest > depth + tolerance)
+        hidden = known & (farthest < depth - tolerance)
+        gap = np.where(known, np.maximum(np.maximum(nearest - depth, depth - farthest), 0), FARTHEST_RESIDUAL)
+        return first + rows, Verdicts(
+            through=through.astype(np.int16),
+            surely=(through & (around > depth + tolerance)).astype(np.int16),
+            confirmed=(known & ~through & ~hidden).astype(np.int16),
+            hidden=hidden.astype(np.int16),
+            residual=np.minimum(gap, FARTHEST_RESIDUAL).astype(np.float32),
+        )
+
+    def _images(self, scan: int) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+        """Return nearest, farthest, and the nearest with the eight neighbours, of one scan, in metres."""
+        nearest = self.nearest[scan].astype(np.float32) * np.float32(_MILLIMETRE)
+        farthest = self.farthest[scan].astype(np.float32) * np.float32(_MILLIMETRE)
+        known = np.where(nearest > 0, nearest, np.float32(np.inf))
+        around = known.copy()
+        for neighbour in _neighbours():
+            np.minimum(around, known[neighbour], out=around)
+        return nearest, farthest, around
+
+
+def _cells_of(rays: NDArray[np.float32]) -> NDArray[np.int32]:
+    """Return (N,) the cell of a cube around the origin that each ray (N, 3) goes through, of any length."""
+    x, y, z = rays.T
+    ax, ay, az = np.abs(x), np.abs(y), np.abs(z)
+    along_x = (ax >= ay) & (ax >= az)
+    along_y = ~along_x & (ay >= az)
+    along = np.where(along_x, x, np.where(along_y, y, z))
+    first, second = np.where(along_x, y, x), np.where(along_x | along_y, z, y)
+    face = 2 * np.where(along_x, 0, np.where(along_y, 1, 2)).astype(np.int32) + (along > 0)
+    half = np.float32(CELLS / 2) / np.maximum(np.abs(along), np.float32(1e-9))
+    u = np.minimum((first * half + np.float32(CELLS / 2)).astype(np.int32), CELLS - 1)
+    v = np.minimum((second * half + np.float32(CELLS / 2)).astype(np.int32), CELLS - 1)
+    cells: NDArray[np.int32] = (face * CELLS + u) * CELLS + v
+    return cells
+
+
+@functools.cache
+def _neighbours() -> NDArray[np.int32]:
+    """Return (8, 6 CELLS^2) of each cell those around it, across the edges of the cube as well."""
+    faces, u, v = np.unravel_index(np.arange(6 * CELLS**2), (6, CELLS, CELLS))
+    axis, sign = faces // 2, np.where(faces % 2, 1.0, -1.0)
+    rings = []
+    for du, dv in ((-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1)):
+        a, b = (2 * (u + 0.5 + du) / CELLS - 1, 2 * (v + 0.5 + dv) / CELLS - 1)
+        rays = np.empty((len(faces), 3), np.float32)
+        rows = np.arange(len(faces))
+        rays[rows, axis] = sign
+        rays[rows, np.where(axis == 0, 1, 0)] = a
+        rays[rows, np.where(axis == 2, 1, 2)] = b
+        rings.append(_cells_of(rays))
+    return np.stack(rings)
