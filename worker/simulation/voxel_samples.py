@@ -21,10 +21,11 @@ from worker.processes import default_processes, open_processes
 from worker.progress import Progress, no_progress
 from worker.simulation.scenes import BUILDINGS, BuildingKind, Scene, random_solids, rigid
 from worker.simulation.sensor import SensorModel, SimulatedScan
-from worker.simulation.visits import edited, stops, visit
+from worker.simulation.visits import NEXT_DRAW, edited, stops, visit
 from worker.training.voxels.samples import MISSING, THERE, UNKNOWN, VoxelSample, save_samples
 
 FAR = 0.075  #: metres off every surface of the other visit: what stands there is missing from it
+_DRAWS = 20  # of edits
 CLOSE = 0.03  #: metres; so near to one it is not; what lies between the two is not learned from
 
 
@@ -103,9 +104,9 @@ def building_samples(kind: BuildingKind, number: int, settings: VoxelSampleSetti
     map_from_world = rigid(yaw=float(rng.uniform(0, 360)))
     samples = []
     for again in range(settings.visits):
-        before, after = _edited_pair(base, kind, seed * 10 + again, settings)
-        first = _Visit.made(before, after, kind, seed * 20 + 2 * again, map_from_world, settings, rng)
-        second = _Visit.made(after, before, kind, seed * 20 + 2 * again + 1, map_from_world, settings, rng)
+        walks = _edited_pair(base, kind, seed * 10 + again, settings)
+        first = _Visit.made(walks[0], walks[1].scene, map_from_world, settings, rng)
+        second = _Visit.made(walks[1], walks[0].scene, map_from_world, settings, rng)
         for view in range(settings.views):
             blind = view == settings.views - 1
             chosen = _view(view, first, second, rng)
@@ -113,22 +114,32 @@ def building_samples(kind: BuildingKind, number: int, settings: VoxelSampleSetti
     return samples
 
 
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class _Walk:
+    """A building as a visit finds it, and where the robot stops."""
+
+    scene: Scene
+    poses: tuple[Matrix4, ...]  #: world_from_sensor
+    seed: int
+
+
 def _edited_pair(
     base: Scene, kind: BuildingKind, seed: int, settings: VoxelSampleSettings
-) -> tuple[Scene, Scene]:
-    """Return the building as both visits find it; edits that leave the robot no way are drawn again."""
-    for draw in range(20):
-        drawn = seed + draw * 1_000_000_007
-        count, most = settings.stops[kind], settings.solids[kind]
-        before, _ = random_solids(base, seed=drawn, count=most, name="gone")
+) -> tuple[_Walk, _Walk]:
+    """Return both visits to a building; edits that leave the robot no way are drawn again."""
+    count, most = settings.stops[kind], settings.solids[kind]
+    for draw in range(_DRAWS):
+        drawn = 2 * (seed + draw * NEXT_DRAW)
         try:
+            before, _ = random_solids(base, seed=drawn, count=most, name="gone")
             after, _ = edited(base, settings.edits[kind], seed=drawn, count=count)
             after, _ = random_solids(after, seed=drawn + 1, count=most, name="new")
-            stops(before, count, seed=drawn)
-            stops(after, count, seed=drawn)
+            return (
+                _Walk(scene=before, poses=stops(before, count, seed=drawn), seed=drawn),
+                _Walk(scene=after, poses=stops(after, count, seed=drawn + 1), seed=drawn + 1),
+            )
         except ValueError:
-            continue
-        return before, after
+            most = most * 3 // 4  # fewer things leave more of a way
     raise ValueError(f"{base.name}: no edits leave a way for the robot")
 
 
@@ -150,15 +161,13 @@ class _Visit:
     @classmethod
     def made(
         cls,
-        scene: Scene,
+        walk: _Walk,
         other: Scene,
-        kind: BuildingKind,
-        seed: int,
         map_from_world: Matrix4,
         settings: VoxelSampleSettings,
         rng: np.random.Generator,
     ) -> _Visit:
-        """Simulate a visit to `scene`; what it has and `other` has not is labelled as missing."""
+        """Simulate a visit; what its scene has and `other` has not is labelled as missing."""
         sensor = replace(
             SensorModel(),
             range_sigma=float(rng.uniform(0.005, 0.025)),
@@ -170,9 +179,9 @@ class _Visit:
         error = (settings.pose_error[0] * rng.uniform(0.2, 1), settings.pose_error[1] * rng.uniform(0.2, 1))
         people = int(rng.integers(1, 4)) if rng.random() < settings.people else 0
         taken = visit(
-            scene,
-            settings.stops[kind],
-            seed=seed,
+            walk.scene,
+            walk.poses,
+            seed=walk.seed,
             sensor=sensor,
             prior_error=error,
             people=people,
@@ -180,7 +189,9 @@ class _Visit:
         )
         offset = rigid(*shift)
         return cls(
-            scans=tuple(_placed(scan, scene, other, offset @ map_from_world @ scan.prior) for scan in taken)
+            scans=tuple(
+                _placed(scan, walk.scene, other, offset @ map_from_world @ scan.prior) for scan in taken
+            )
         )
 
 
