@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,6 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from worker.cloud.types import Floats, Matrix4, Points
+from worker.simulation.company import Carrier, Walker, nearest
+from worker.simulation.scenes.caster import Hits
 from worker.simulation.scenes.scene import Scene
 
 TURN = 360.0  #: degrees
@@ -47,7 +50,8 @@ class SimulatedScan:
     """What a standing sensor returned, and the truth about it."""
 
     points: Points  #: (N, 3) float32, metres, sensor frame: x ahead, y left, z up
-    object_ids: NDArray[np.int32]  #: (N,) object that the middle of the beam met
+    #: (N,) object that the middle of the beam met; below zero for people and the robot itself (company.py)
+    object_ids: NDArray[np.int32]
     world_from_sensor: Matrix4  #: (4, 4) the true pose
     #: (4, 4) world_from_sensor as the robot believes it; the true pose unless a visit drifts it
     prior: Matrix4
@@ -81,13 +85,18 @@ def scan(
     duration_s: float = 5.0,
     sensor: SensorModel,
     rng: np.random.Generator,
+    walkers: Sequence[Walker] = (),
+    carrier: Carrier | None = None,
 ) -> SimulatedScan:
-    """Stand for `duration_s` seconds at a pose and measure. One cast of all rays; the same rng state, the same scan."""
+    """Stand for `duration_s` seconds at a pose and measure. One cast of all rays; the same rng state, the same scan.
+
+    People who walk by and parts of the robot hide what is behind them; noise and losses are drawn as without them.
+    """
     reported = directions(sensor, duration_s, rng)  # (N, 3) sensor frame
     fired = _perturbed(reported, sensor.angle_sigma_deg, rng)
     edge = _perturbed(fired, sensor.beam_deg, rng)
-    both = np.concatenate([fired, edge]) @ world_from_sensor[:3, :3].T  # (2N, 3) world frame
-    hit = scene.caster.cast(world_from_sensor[:3, 3], both)
+    both = np.concatenate([fired, edge])  # (2N, 3)
+    hit = _first_hits(scene, world_from_sensor, both, duration_s, walkers, carrier)
     count = len(reported)
     first, other = np.split(np.minimum(hit.ranges, NOWHERE), 2)
     mixed = _mixed(first, other, hit.cosines[:count], sensor, rng)
@@ -123,6 +132,24 @@ def directions(sensor: SensorModel, duration_s: float, rng: np.random.Generator)
     around = np.cos(azimuth)[:, None] * side + np.sin(azimuth)[:, None] * up
     rays: Floats = np.cos(off_axis)[:, None] * axis + np.sin(off_axis)[:, None] * around
     return rays
+
+
+def _first_hits(
+    scene: Scene,
+    world_from_sensor: Matrix4,
+    rays: Floats,
+    duration_s: float,
+    walkers: Sequence[Walker],
+    carrier: Carrier | None,
+) -> Hits:
+    """Cast rays (2N, 3), sensor frame, the second half fired at the same times as the first."""
+    origin = world_from_sensor[:3, 3]
+    turned = rays @ world_from_sensor[:3, :3].T
+    hits = scene.caster.cast(origin, turned)
+    seconds = np.tile(np.linspace(0.0, duration_s, len(rays) // 2, endpoint=False), 2)
+    for walker in walkers:
+        hits = nearest(hits, walker.cast(origin, turned, seconds))
+    return hits if carrier is None else nearest(hits, carrier.cast(rays))
 
 
 def _perturbed(rays: Floats, sigma_deg: float, rng: np.random.Generator) -> Floats:

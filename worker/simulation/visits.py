@@ -10,6 +10,7 @@ import numpy as np
 
 from worker.cloud.formats.pcd import write_pcd
 from worker.cloud.types import Floats, Matrix4, Points
+from worker.simulation.company import Carrier, Walker, walkers
 from worker.simulation.scenes import Scene, edit_kinds, random_edits, rigid
 from worker.simulation.sensor import SensorModel, SimulatedScan, scan
 
@@ -81,25 +82,46 @@ def visit(
     duration_s: float = 5.0,
     folder: Path | None = None,
     name: str = "scan-{:02d}",
+    people: int = 0,
+    carrier: Carrier | None = None,
 ) -> tuple[SimulatedScan, ...]:
     """Simulate one scan a stop; `poses` are the stops (world_from_sensor) or how many to make along the route.
 
     Each scan's prior is off, independently of the others, by `prior_error` (metres, degrees of yaw): with
     `drifted` that is sigma, with `drifted_within` the most there can be. Each scan's noise depends on the seed
     and its place in the visit only. With a folder each scan is written there as PCD, its points in the sensor frame;
-    `name` takes the scan's number, from 1. Raises ValueError as `stops` does, OSError for the folder.
+    `name` takes the scan's number, from 1. Past each stop walk `people`, other ones each time; `carrier` is what the
+    sensor sees of its robot. Raises ValueError as `stops` does and for people without a route, OSError for the folder.
     """
     sensor = sensor or SensorModel()
     where = stops(scene, poses, seed=seed) if isinstance(poses, int) else poses
     scans = []
     for number, world_from_sensor in enumerate(where):
         rng = np.random.default_rng([seed, 2, number])
-        seen = scan(scene, world_from_sensor, duration_s=duration_s, sensor=sensor, rng=rng)
+        passing = _passing(scene, world_from_sensor, people, seed, number)
+        seen = scan(
+            scene,
+            world_from_sensor,
+            duration_s=duration_s,
+            sensor=sensor,
+            rng=rng,
+            walkers=passing,
+            carrier=carrier,
+        )
         path = None if folder is None else folder / f"{name.format(number + 1)}.pcd"
         if path is not None:
             write_pcd(path, seen.points)
         scans.append(replace(seen, prior=drift(world_from_sensor, prior_error, rng), path=path))
     return tuple(scans)
+
+
+def _passing(
+    scene: Scene, world_from_sensor: Matrix4, people: int, seed: int, number: int
+) -> tuple[Walker, ...]:
+    """Draw who walks by; from random numbers of their own, so that the scan's noise stays as it is without them."""
+    if not people:
+        return ()
+    return walkers(scene, world_from_sensor, people, np.random.default_rng([seed, 6, number]))
 
 
 def edited(scene: Scene, edits: int, *, seed: int, count: int) -> tuple[Scene, tuple[Matrix4, ...]]:

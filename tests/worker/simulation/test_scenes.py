@@ -14,9 +14,11 @@ from worker.simulation.scenes import (
     edit_kinds,
     random_edits,
     random_room,
+    random_solids,
     rigid,
     small_office,
 )
+from worker.simulation.scenes.edits import Place
 from worker.simulation.scenes.mesh import box, cylinder, sphere
 from worker.simulation.sensor import PERFECT, scan
 
@@ -154,3 +156,40 @@ def test_a_scene_in_another_frame_keeps_names_and_ids_of_its_things(bare_room):
 
 def test_edits_take_turns():
     assert edit_kinds(4) == ("add", "remove", "move", "add")
+
+
+def test_random_solids_keep_to_their_sizes_and_places():
+    scene = small_office(1)
+    bands: dict[Place, tuple[float, float]]
+    bands = {"floor": (0.0, 0.0), "furniture": (0.1, 2.6), "air": (0.3, 2.6)}
+    for place, (low, high) in bands.items():
+        after, changes = random_solids(scene, seed=5, count=12, places=(place,))
+        assert len(changes) >= 8
+        assert {change.kind for change in changes} == {"add"}
+        added = [after[change.name].mesh for change in changes]
+        assert all(low <= mesh.bounds[0, 2] <= high for mesh in added)
+        assert all(mesh.bounds[1, 2] <= 2.6 - 0.15 + 1e-9 for mesh in added)
+        # of a turned box the box along the axes is longer, by at most the square root of two
+        assert all(np.ptp(mesh.bounds, axis=0).max() <= 1.2 * np.sqrt(2) for mesh in added)
+        if place != "furniture":
+            assert overlapping(after) == []
+
+
+def test_a_solid_on_furniture_rests_on_it():
+    room = random_room(3)
+    after, changes = random_solids(room, seed=1, count=10, places=("furniture",), size=(0.12, 0.2))
+    assert changes
+    for change in changes:
+        low, high = after[change.name].mesh.bounds
+        x, y = np.meshgrid(*np.linspace(low[:2], high[:2], 12).T)
+        origins = np.stack([x.ravel(), y.ravel(), np.full(x.size, low[2] + 1e-3)], axis=1)
+        below = room.caster.cast(origins, np.tile([0.0, 0.0, -1.0], (len(origins), 1)))
+        assert below.ranges.min() < 0.02
+
+
+def test_random_solids_are_a_function_of_their_seed():
+    room = random_room(3)
+    (first, _), (again, _), (other, _) = (random_solids(room, seed=seed, count=4) for seed in (1, 1, 2))
+    assert [item.name for item in first.objects] == [item.name for item in again.objects]
+    assert np.array_equal(first.objects[-1].mesh.vertices, again.objects[-1].mesh.vertices)
+    assert not np.array_equal(first.objects[-1].mesh.vertices, other.objects[-1].mesh.vertices)

@@ -5,7 +5,7 @@ from typing import Literal
 
 from worker.simulation.scenes.buildings import random_room, small_office
 from worker.simulation.scenes.corridors import corridor, corridor_with_loop
-from worker.simulation.scenes.edits import edit_kinds, random_edits
+from worker.simulation.scenes.edits import edit_kinds, random_edits, random_solids
 from worker.simulation.scenes.mesh import Mesh, rigid
 from worker.simulation.scenes.scene import Change, ChangeKind, Room, Scene, SceneObject
 
@@ -33,6 +33,7 @@ __all__ = [
     "edit_kinds",
     "random_edits",
     "random_room",
+    "random_solids",
     "rigid",
     "small_office",
 ]

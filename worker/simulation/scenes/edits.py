@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import get_args
+from typing import Literal, get_args
 
 import numpy as np
 
 from worker.cloud.types import Floats
 from worker.simulation.scenes.furniture import FREE_PIECES, WALL_PIECES
+from worker.simulation.scenes.mesh import Mesh, box, cylinder
 from worker.simulation.scenes.scene import Change, ChangeKind, Room, Scene, SceneObject
 
 TRIES = 60  #: random places tried for one edit
 NEAREST, FARTHEST = 0.3, 1.2  #: metres by which a piece is moved
+Place = Literal["floor", "furniture", "air"]  #: where a solid comes to stand; `air` is at mid-height
+PLACES: tuple[Place, ...] = get_args(Place)
+SOLID_SIZE = (0.12, 1.20)  #: metres, the extents of a random solid
+HEADROOM = 0.15  #: metres under the ceiling that stay free: lamps hang there
+AIR = 0.3  #: metres over the floor from which on a solid stands at mid-height
 
 
 def random_edits(
@@ -78,3 +84,94 @@ def _stands(item: SceneObject) -> bool:
 
 def _within(room: Room, bounds: Floats) -> bool:
     return bool(np.all(bounds[0, :2] >= room.low) and np.all(bounds[1, :2] <= room.high))
+
+
+def random_solids(
+    scene: Scene,
+    *,
+    seed: int,
+    count: int,
+    size: tuple[float, float] = SOLID_SIZE,
+    places: Sequence[Place] = PLACES,
+    name: str = "solid",
+) -> tuple[Scene, tuple[Change, ...]]:
+    """Add `count` boxes, cylinders and pieces of furniture, each in a place drawn from `places`; `add` changes.
+
+    The extents of boxes and cylinders are drawn between the two of `size` (metres), small ones as often as large;
+    pieces of furniture are scaled so that their longest extent is. On the floor and at mid-height a solid keeps clear
+    of everything; on furniture it rests on the highest spot under it. A solid that finds no place is left out.
+    To have them removed instead, take the scene that comes back as the first visit's.
+    Raises ValueError where an object has the name that one would get, as in `solid-1-box`.
+    """
+    rng = np.random.default_rng([seed, 4])
+    before, changes = scene, []
+    for number in range(1, count + 1):
+        kind, mesh = _solid(rng, size)
+        place = str(rng.choice(places))
+        for _ in range(TRIES):
+            turned = mesh.at(yaw=float(rng.uniform(0, 360)))
+            standing = _stood(before, turned, place, rng)
+            if standing is not None and _apart(scene, before, standing, place):
+                scene, change = scene.with_added(f"{name}-{number}-{kind}", standing)
+                changes.append(change)
+                break
+    return scene, tuple(changes)
+
+
+def _solid(rng: np.random.Generator, size: tuple[float, float]) -> tuple[str, Mesh]:
+    """Draw a shape, standing on z = 0, and what to call it."""
+
+    def extent() -> float:
+        return float(np.exp(rng.uniform(*np.log(size))))
+
+    shape = rng.choice(["box", "cylinder", "piece"], p=[0.4, 0.3, 0.3])
+    if shape == "box":
+        return "box", box(extent(), extent(), extent())
+    if shape == "cylinder":
+        return "cylinder", cylinder(extent() / 2, extent())
+    pieces = {**WALL_PIECES, **FREE_PIECES}
+    kind = str(rng.choice(list(pieces)))
+    mesh = pieces[kind]()
+    low, high = mesh.bounds
+    return kind, Mesh(vertices=mesh.vertices * (extent() / (high - low).max()), triangles=mesh.triangles)
+
+
+def _stood(scene: Scene, mesh: Mesh, place: str, rng: np.random.Generator) -> Mesh | None:
+    """Put a mesh somewhere in such a place of the scene; None where it does not fit into the room there."""
+    room = scene.rooms[int(rng.integers(len(scene.rooms)))]
+    low, high = np.array(room.low), np.array(room.high)
+    if place == "furniture":
+        below = scene.movable[int(rng.integers(len(scene.movable)))].mesh.bounds if scene.movable else None
+        if below is None:
+            return None
+        low, high = below[0, :2], below[1, :2]
+        room = next((room for room in scene.rooms if _within(room, below)), room)
+    x, y = rng.uniform(low, high)
+    tall = float(mesh.bounds[1, 2])
+    most = room.height - HEADROOM - tall
+    if place == "air":
+        z = float(rng.uniform(AIR, most)) if most > AIR else None
+    else:
+        z = 0.0 if place == "floor" else _top(scene, mesh.at(x, y), room.height - HEADROOM)
+    if z is None or z > most or (place == "furniture" and z < 0.1):
+        return None
+    standing = mesh.at(float(x), float(y), z)
+    return standing if _within(room, standing.bounds) else None
+
+
+def _top(scene: Scene, mesh: Mesh, ceiling: float) -> float | None:
+    """Return the height of the highest surface under the mesh's footprint; None where that reaches the ceiling."""
+    low, high = mesh.bounds
+    x, y = (axis.ravel() for axis in np.meshgrid(*np.linspace(low[:2], high[:2], 6).T))
+    origins = np.stack([x, y, np.full(len(x), ceiling)], axis=1)
+    ranges = scene.caster.cast(origins, np.tile([0.0, 0.0, -1.0], (len(x), 1))).ranges
+    return float(ceiling - ranges.min()) if np.isfinite(ranges).all() and ranges.min() > 1e-3 else None
+
+
+def _apart(scene: Scene, before: Scene, mesh: Mesh, place: str) -> bool:
+    """Tell whether it keeps clear of all boxes; on furniture, whose box may reach over it, of what was added."""
+    if place != "furniture":
+        return scene.is_free(mesh.bounds)
+    old = {item.name for item in before.objects}
+    added = tuple(item for item in scene.objects if item.name not in old)
+    return Scene(name=scene.name, objects=added).is_free(mesh.bounds)
