@@ -80,6 +80,12 @@ class TileProperties(Document):
     threshold: float | None = Field(description="changed above this score", examples=[0.5])
     n_reference: int = Field(description="points of the map in the tile", examples=[1904])
     n_current: int = Field(description="points of the survey in the tile", examples=[2210])
+    observed_share: float | None = Field(
+        description="of the tile, that the survey could judge; null of models that tell tiles alone, like the next two",
+        examples=[0.87],
+    )
+    appeared: int | None = Field(description="voxels with something new", examples=[212])
+    disappeared: int | None = Field(description="voxels with something gone", examples=[0])
     map_id: str = Field(examples=["lobby"])
     map_version: int = Field(description="that the survey was compared with", examples=[1])
     survey_id: str = Field(examples=["survey-91c4"])
