@@ -243,6 +243,10 @@ class MapRecord(Built):
 
     name: str | None
     anchor: Anchor | None = Field(description="where the map lies on the Earth; null: nobody said")
+    objects: dict[str, int] = Field(
+        description="changed things, by status; empty while no survey tells any",
+        examples=[{"new": 2, "still_there": 5, "gone_again": 1, "unknown": 0, "accepted": 3}],
+    )
 
 
 class VersionRecord(Built):
@@ -331,3 +335,8 @@ class ChangeRecord(Record):
     model: str
     threshold: float | None
     captured_at: Utc
+    first_seen: Utc | None = (
+        None  #: when a survey first saw this change of the tile; None where there is none
+    )
+    last_seen: Utc | None = None  #: when one last saw it, before it was gone
+    max_score: float | None = None  #: over the surveys that saw it

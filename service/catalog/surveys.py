@@ -10,7 +10,7 @@ from typing import get_args
 from sqlalchemy import delete, select
 from sqlalchemy.orm import Session, selectinload
 
-from service.catalog import blob_keys, tables
+from service.catalog import blob_keys, history, tables
 from service.catalog.blobs import Blobs
 from service.catalog.database import Database
 from service.catalog.jobs import new_job
@@ -129,7 +129,7 @@ class Surveys:
         by_state = Counter(tile.state for tile in tiles)
         by_kind = Counter(thing.kind for thing in things)
         with self._database.write() as session:
-            row = _row(session, survey_id)
+            row = _locked(session, survey_id)
             _replace_tiles(session, survey_id, tiles)
             _replace_objects(session, survey_id, things)
             row.threshold = threshold
@@ -137,6 +137,8 @@ class Surveys:
             row.objects = {kind: by_kind[kind] for kind in get_args(ObjectKind)} if told else None
             row.moving = moving
             row.updated = now()
+            if row.status == "ready":  # a step that was thought lost runs beside its second run, and is late
+                history.rewrite(session, row.map_id)
 
     def delete(self, survey_id: str) -> None:
         """Delete a survey with its job and files; the scans stay.
@@ -144,9 +146,11 @@ class Surveys:
         Raises NotFound, and Conflict while a version is built of it.
         """
         with self._database.write() as session:
-            row = _row(session, survey_id, lock=True)
+            row = _locked(session, survey_id)
             _check_unused(session, row)
             session.delete(row)
+            if row.status == "ready":
+                history.rewrite(session, row.map_id)
         self._blobs.delete_prefix(blob_keys.survey_folder(survey_id))
 
 
@@ -160,6 +164,12 @@ def _check_unused(session: Session, row: Survey) -> None:
             f"version {built.version} of map {row.map_id!r} is being built of survey {row.survey_id!r}; wait for job "
             f"{built.job_id}, or dismiss it"
         )
+
+
+def _locked(session: Session, survey_id: str) -> Survey:
+    """Return the row of a survey while nobody else works on its map. Raises NotFound."""
+    map_row(session, _row(session, survey_id).map_id, lock=True)
+    return _row(session, survey_id, lock=True)
 
 
 def _row(session: Session, survey_id: str, *, lock: bool = False) -> Survey:

@@ -296,6 +296,7 @@ class MapObject(Base):
     map_id: Mapped[str] = mapped_column(ForeignKey("maps.id", ondelete="CASCADE"))
     kind: Mapped[str]
     status: Mapped[str]
+    last_known: Mapped[str]
     transient: Mapped[bool]
     first_seen: Mapped[datetime]
     last_seen: Mapped[datetime]

@@ -108,7 +108,11 @@ def test_the_tiles_are_features_in_the_frame_of_the_map(client: TestClient, cata
         "survey_id": survey_id,
         "model": "spicd-net/1",
         "captured_at": "2026-03-01T12:00:00Z",
+        "first_seen": "2026-03-01T12:00:00Z",
+        "last_seen": "2026-03-01T12:00:00Z",
+        "max_score": 0.93,
     }
+    assert unobserved["properties"]["first_seen"] is None
     assert unobserved["properties"]["state"] == "unobserved"
     assert unobserved["properties"]["score"] is None
 

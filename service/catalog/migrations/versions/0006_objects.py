@@ -54,7 +54,7 @@ def upgrade() -> None:
     _make(
         "map_objects",
         ("id",),
-        *_needed(sa.String(), "id map_id kind status survey_id"),
+        *_needed(sa.String(), "id map_id kind status last_known survey_id"),
         *_needed(sa.Boolean(), "transient"),
         *_needed(UtcDateTime(), "first_seen last_seen last_looked created"),
         sa.Column("accepted_in_version", sa.Integer()),
