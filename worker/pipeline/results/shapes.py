@@ -26,9 +26,9 @@ ROUND = 0.1  #: of overlap that no turn loses, where a shape is round
 PER_METRE = (0.1, 1.0)  #: of overlap that a metre of way weighs, level and up: things are seldom carried far
 RIVAL = 0.05  #: of overlap and way together: a second pair as good as that leaves it open which is right
 BELONGS = 0.6  #: of a further region, that the motion lays upon the thing: then it is a part of it
-FRAGMENT = 0.1  #: of the larger of two shapes; a smaller one fits anywhere, and proves nothing
+FRAGMENT = 0.08  #: of the larger of two shapes; a smaller one fits anywhere, and proves nothing
 _NEAR = (1.5, 1.0)  # times the larger size, or metres, between two places that may overlap
-_COARSE, _FINE, _KEPT = 64, 300, 4  # points a shape, and poses that are refined
+_COARSE, _FINE, _KEPT = 64, 250, 4  # points a shape, and poses that are refined
 _COARSE_REACHES, _FINE_REACHES = (0.5, 0.3, 0.2), (0.15, 0.1)  # metres to a partner, step by step
 _LAST_REACHES = (0.1,) * 10  # sides that slide on each other take many steps
 _SAME_YAW, _SAME_SHIFT = np.radians(20), 0.15  # poses that come to rest at the same
@@ -155,10 +155,8 @@ def moved_things(
 def _alike(before: Shape, now: Shape, settings: ShapeSettings) -> bool:
     """Tell whether two shapes are near enough and of like size to be worth laying upon each other."""
     way = np.subtract(now.center, before.center)
-    if (
-        np.hypot(way[0], way[1]) > settings.max_distance
-        or abs(now.bottom - before.bottom) > settings.max_rise
-    ):
+    fewer, more = sorted((len(before.points), len(now.points)))
+    if np.hypot(way[0], way[1]) > settings.max_distance or fewer < FRAGMENT * more:
         return False
     if _near(before, now):
         return True
