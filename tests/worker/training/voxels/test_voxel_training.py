@@ -77,7 +77,11 @@ def test_a_training_learns_and_goes_on_where_it_stopped(
     states = [torch.load(path, weights_only=True) for path in (whole, part)]
     for name, value in states[0]["network"].items():
         assert torch.equal(value, states[1]["network"][name]), name
-    assert states[0]["measured"]["average_precision"] > 0.3
+    labels = np.concatenate(
+        [sample.labels for sample in samples if sample.building == 0 and sample.free_space]
+    )
+    chance = (labels == MISSING).sum() / (labels != UNKNOWN).sum()
+    assert states[0]["measured"]["average_precision"] > 1.5 * chance
     assert len((tmp_path / "part" / "epochs-seeing.csv").read_text().splitlines()) == 3
     with pytest.raises(ValueError, match="made with other settings"):
         train_network(SEEING, samples, QUICK.with_values(epochs=1), tmp_path / "whole")
