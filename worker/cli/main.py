@@ -11,6 +11,7 @@ from worker.cli.demo import demo
 from worker.cli.detect import detect
 from worker.cli.register import register
 from worker.cli.train import train, with_training_options
+from worker.cli.train_voxels import train_voxels
 from worker.demo.service import DemoFailed
 from worker.errors import PipelineError
 from worker.threads import wait_passively
@@ -37,7 +38,7 @@ def _commands() -> typer.Typer:
         pretty_exceptions_enable=False,
         help="Compares LiDAR scans of a space on this machine, trains the detector, and shows the whole service.",
     )
-    for command in (detect, register, with_training_options(train), demo, evaluate.bench):
+    for command in (detect, register, with_training_options(train), train_voxels, demo, evaluate.bench):
         commands.command()(command)
     measuring = typer.Typer(no_args_is_help=True, help="How good it is, measured where the truth is known.")
     for command in (evaluate.registration, evaluate.paper, evaluate.revisit, evaluate.record):

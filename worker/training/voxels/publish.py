@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import nn
 
 from worker.cloud.types import Bools, Floats
 from worker.cloud.voxel_keys import packed, unpacked
@@ -27,6 +28,7 @@ CPU = torch.device("cpu")
 TILE = (30, 30, 20)  #: voxels, of the tiles that the tile score is fitted on: the paper's 1.5 x 1.5 x 1.0 m
 MIN_CHANGED = 40  #: voxels that make a changed tile, as in the benchmark
 _ROUNDS = 50  # of Newton's method; it settles within ten
+_APART = 400  # tiles between two samples: no building is as long
 _BINS = 15  # of the expected calibration error (Guo et al., ICML 2017)
 
 #: What a card says of where the figures on held-out samples come from.
@@ -154,7 +156,8 @@ def _scored(network: VoxelNetwork, samples: Sequence[VoxelSample]) -> _Scored:
         p = np.clip(p.astype(np.float64), 1e-6, 1 - 1e-6)
         logits.append(np.log(p / (1 - p)))
         missing.append(sample.labels[known] == MISSING)
-        tile = np.floor_divide(unpacked(sample.keys[known]), TILE) + [number * 10_000, 0, 0]
+        tile = np.floor_divide(unpacked(sample.keys[known]), TILE)
+        tile[:, 0] += number * _APART
         tiles.append(packed(tile))
     return _Scored(
         logits=np.concatenate(logits), missing=np.concatenate(missing), tiles=np.concatenate(tiles)
@@ -164,6 +167,8 @@ def _scored(network: VoxelNetwork, samples: Sequence[VoxelSample]) -> _Scored:
 def _rescale(network: VoxelNetwork, slope: float, offset: float) -> None:
     """Fold the calibration into the last layer."""
     last = network.head[-1]
+    if not isinstance(last, nn.Linear):
+        raise TypeError(f"the head ends in a {type(last).__name__}")
     with torch.no_grad():
         last.weight.mul_(slope)
         last.bias.mul_(slope).add_(offset)

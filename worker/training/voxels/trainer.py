@@ -124,6 +124,7 @@ def train_network(
     validation = [sample for sample in fitting if sample.building % settings.held_out == 0]
     if not training or not validation:
         raise ValueError(f"{len(training)} samples to train {name} on and {len(validation)} to validate on")
+    out.mkdir(parents=True, exist_ok=True)
     run = _Run(name, settings, out)
     run.resume()
     crops = _Crops(training, settings)
@@ -141,7 +142,6 @@ def train_networks(
     progress: Progress = no_progress,
 ) -> dict[str, Path]:
     """Train both networks of a model; returns the checkpoint of each. Raises as `train_network` does."""
-    out.mkdir(parents=True, exist_ok=True)
     return {
         name: train_network(name, samples, asked, out, progress)
         for name, asked in ((SEEING, settings), (BLIND, blind))
