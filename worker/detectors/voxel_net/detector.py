@@ -1,0 +1,105 @@
+"""The detector: evidence around candidates, the network both ways, tiles made of voxels."""
+
+from __future__ import annotations
+
+from typing import Self
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from pydantic import Field
+from torch import Tensor
+
+from worker.cloud.settings import StrictModel
+from worker.cloud.tiling import Tiles
+from worker.cloud.types import Arrays
+from worker.detectors.card import Card
+from worker.detectors.comparison import Comparison, Side
+from worker.detectors.detector import Detection
+from worker.detectors.voxel_net.network import WIDTHS, VoxelNetwork, probabilities
+from worker.detectors.voxels.evidence import Evidence, EvidenceSettings
+from worker.detectors.voxels.scores import Scorer, TileScoreSettings, detected
+from worker.progress import Progress, no_progress
+
+Weights = dict[str, Tensor]
+
+#: The two networks of a model, by the prefix of their weights' names.
+SEEING, BLIND = "seeing", "blind"  #: with free space, and for clouds without a sensor's place
+
+
+class VoxelNetSettings(StrictModel):
+    """`detector_settings` of a card of this detector."""
+
+    widths: tuple[int, ...] = Field(WIDTHS, min_length=1, description="channels at 2, 4, 8, ... voxels")
+    head: int = Field(32, gt=0, description="channels of the head")
+    evidence: EvidenceSettings = EvidenceSettings.model_validate({})
+    tiles: TileScoreSettings = TileScoreSettings.model_validate({})
+
+    def build(self) -> VoxelNetwork:
+        """Return a network before training."""
+        return VoxelNetwork(self.widths, self.head)
+
+
+class VoxelNet(Scorer):
+    """Detector (worker.detectors.detector) that weighs the evidence by a network; it has one for blind clouds."""
+
+    settings_class = VoxelNetSettings
+
+    def __init__(self, card: Card, networks: dict[str, VoxelNetwork], device: torch.device) -> None:
+        self.card = card
+        self._settings = card.settings_as(VoxelNetSettings)
+        self._networks = {name: network.to(device).eval() for name, network in networks.items()}
+        self._device = device
+
+    @classmethod
+    def load(cls, card: Card, weights: Weights, device: torch.device) -> Self:
+        """Open a model. Raises RuntimeError for weights of another network, ValueError for unsound settings."""
+        settings = card.settings_as(VoxelNetSettings)
+        networks = {name: settings.build() for name in (SEEING, BLIND)}
+        for name, network in networks.items():
+            network.load_state_dict(_under(name, weights))
+        return cls(card, networks, device)
+
+    def weights(self) -> Weights:
+        """Return what `load` takes."""
+        return joined({name: network.state_dict() for name, network in self._networks.items()})
+
+    def encode_reference(
+        self,
+        reference: Side,  # noqa: ARG002
+        tiles: Tiles,  # noqa: ARG002
+        *,
+        progress: Progress = no_progress,
+    ) -> Arrays:
+        """Return nothing: what the map's scans saw is kept with the map."""
+        progress("encoding", 1.0)
+        return {}
+
+    def detect(
+        self,
+        comparison: Comparison,
+        *,
+        embedding: Arrays | None = None,  # noqa: ARG002
+        progress: Progress = no_progress,
+    ) -> Detection:
+        """Score every voxel and tile. Raises ValueError where a side's `seen` is not there."""
+        progress("scoring", 0.0)
+        detection = detected(comparison, self, self._settings.evidence, self._settings.tiles)
+        progress("scoring", 1.0)
+        return detection
+
+    def score(self, evidence: Evidence, *, free_space: bool) -> NDArray[np.float32]:
+        """Return (N,) the network's probabilities."""
+        network = self._networks[SEEING if free_space else BLIND]
+        return probabilities(network, evidence.keys, evidence.channels, self._device)
+
+
+def joined(states: dict[str, Weights]) -> Weights:
+    """Return the weights of several networks under one roof, each name with its network's before it."""
+    return {f"{name}.{key}": value for name, state in states.items() for key, value in state.items()}
+
+
+def _under(name: str, weights: Weights) -> Weights:
+    return {
+        key.removeprefix(f"{name}."): value for key, value in weights.items() if key.startswith(f"{name}.")
+    }

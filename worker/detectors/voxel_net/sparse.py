@@ -1,0 +1,144 @@
+"""Sparse convolutions in plain torch: a table of neighbours, a gather and one matrix product.
+
+The idea is that of submanifold sparse convolutional networks (Graham, Engelcke and van der Maaten, CVPR 2018): only
+occupied cells have features, and only they get some.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from worker.cloud.voxel_keys import Keys, blocks, offsets, rows_of
+
+NEIGHBOURS = 27
+CHILDREN = 8
+
+
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class Level:
+    """The cells of one size, and how they hang together with those of half the size."""
+
+    neighbours: Tensor  #: (N, 27) int64, row of each neighbour; N where there is none
+    children: Tensor  #: (N, 8) int64, row of each child among the finer cells (M); M where there is none
+    parent: Tensor  #: (M,) int64, row of each finer cell's parent
+    child: Tensor  #: (M,) int64, which child of its parent a finer cell is
+
+    def to(self, device: torch.device) -> Level:
+        """Return the same on a device."""
+        return Level(
+            neighbours=self.neighbours.to(device),
+            children=self.children.to(device),
+            parent=self.parent.to(device),
+            child=self.child.to(device),
+        )
+
+
+def pyramid(keys: Keys, levels: int) -> list[Level]:
+    """Return the cells of twice, four times, ... the size of the voxels (N,), ascending keys."""
+    finer, made = keys, []
+    for _ in range(levels):
+        parents = blocks(finer, 1)
+        cells, parent = np.unique(parents, return_inverse=True)
+        child = _child_of(finer)
+        children = np.full((len(cells), CHILDREN), len(finer), np.int64)
+        children[parent, child] = np.arange(len(finer))
+        made.append(
+            Level(
+                neighbours=torch.from_numpy(_neighbours(cells)),
+                children=torch.from_numpy(children),
+                parent=torch.from_numpy(parent.astype(np.int64)),
+                child=torch.from_numpy(child),
+            )
+        )
+        finer = cells
+    return made
+
+
+def _child_of(keys: Keys) -> NDArray[np.int64]:
+    """Return (N,) which of the eight children of its parent a cell is: the lowest bit of x, y and z."""
+    return ((keys >> 42) & 1) * 4 + ((keys >> 21) & 1) * 2 + (keys & 1)
+
+
+def _neighbours(cells: Keys) -> NDArray[np.int64]:
+    """Return (N, 27) the rows of the cells around each, itself in the middle; N where there is none."""
+    count, steps = len(cells), offsets(1)
+    table = np.full((count, NEIGHBOURS), count, np.int64)
+    table[:, NEIGHBOURS // 2] = np.arange(count)
+    for column in range(NEIGHBOURS // 2):
+        row = rows_of(cells + steps[column], cells)
+        there = np.flatnonzero(row >= 0)
+        table[there, column] = row[there]
+        table[row[there], NEIGHBOURS - 1 - column] = there
+    return table
+
+
+class _Gathered(torch.autograd.Function):
+    """Multiply each cell's neighbourhood by one matrix; the gradient is a gather through the mirrored table."""
+
+    @staticmethod
+    def forward(ctx: Any, features: Tensor, weight: Tensor, table: Tensor, mirrored: Tensor) -> Tensor:
+        ctx.save_for_backward(features, weight, table, mirrored)
+        return _columns(features, table) @ weight
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, Tensor | None, None, None]:
+        (grad,) = grads
+        features, weight, table, mirrored = ctx.saved_tensors
+        offsets_, inner = table.shape[1], features.shape[1]
+        to_weight = _columns(features, table).T @ grad
+        turned = weight.view(offsets_, inner, -1).flip(0).transpose(1, 2).reshape(-1, inner)
+        return _columns(grad.contiguous(), mirrored) @ turned, to_weight, None, None
+
+
+def _columns(features: Tensor, table: Tensor) -> Tensor:
+    """Return (N, K C) the features (M, C) that a table (N, K) names; zeros for row M."""
+    padded = torch.cat([features, features.new_zeros(1, features.shape[1])])
+    return padded.index_select(0, table.reshape(-1)).view(len(table), -1)
+
+
+class Convolution(nn.Module):
+    """A submanifold convolution over 3 x 3 x 3 cells."""
+
+    def __init__(self, inner: int, outer: int) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.empty(NEIGHBOURS * inner, outer))
+        nn.init.normal_(self.weight, std=(2 / (9 * inner)) ** 0.5)  # about nine of the 27 are occupied
+
+    def forward(self, features: Tensor, level: Level) -> Tensor:
+        """Map (N, inner) to (N, outer)."""
+        product: Tensor = _Gathered.apply(features, self.weight, level.neighbours, level.neighbours)
+        return product
+
+
+class Merge(nn.Module):
+    """Gather up to eight children into their cell, each by weights of its own."""
+
+    def __init__(self, inner: int, outer: int) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.empty(CHILDREN * inner, outer))
+        nn.init.normal_(self.weight, std=(2 / (4 * inner)) ** 0.5)
+
+    def forward(self, features: Tensor, level: Level) -> Tensor:
+        """Map the finer cells' (M, inner) to (N, outer)."""
+        return _columns(features, level.children) @ self.weight
+
+
+class Split(nn.Module):
+    """Hand each cell's features to its children, each by weights of its own."""
+
+    def __init__(self, inner: int, outer: int) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.empty(inner, CHILDREN * outer))
+        nn.init.normal_(self.weight, std=(2 / inner) ** 0.5)
+        self._outer = outer
+
+    def forward(self, features: Tensor, level: Level) -> Tensor:
+        """Map (N, inner) to the finer cells' (M, outer)."""
+        all_children = (features @ self.weight).view(-1, self._outer)
+        return all_children.index_select(0, level.parent * CHILDREN + level.child)

@@ -1,0 +1,1 @@
+"""The rule without training: hit by one visit, seen through by the other."""

@@ -1,0 +1,167 @@
+"""From voxels to tiles: a detection made of each direction's probabilities."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from worker.cloud.seen import Seen
+from worker.cloud.settings import StrictModel
+from worker.cloud.tiling import TileGrid
+from worker.cloud.types import Bools, Floats, Indices
+from worker.cloud.voxel_keys import Keys, rows_of
+from worker.detectors.comparison import Comparison
+from worker.detectors.detector import Detection, VoxelScores
+from worker.detectors.voxels.evidence import (
+    Evidence,
+    EvidenceSettings,
+    Missing,
+    free_space,
+    gathered,
+    missing,
+    moving,
+)
+
+_SPOTS = (4, 4, 3)  # places along x, y, z of a tile that free space is asked at
+_SPOT_WEIGHT = 10.0  # voxels of surface that one of them counts as
+
+
+class TileScoreSettings(StrictModel):
+    """How the changed voxels of a tile make its score: sigmoid(slope * log(1 + expected changed voxels) + offset)."""
+
+    slope: float = Field(2.0, gt=0)
+    offset: float = -6.0
+
+
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class Answer:
+    """One direction's answer."""
+
+    missing: Missing
+    keys: Keys  #: (N,) ascending
+    probabilities: NDArray[np.float32]  #: (N,) that what own hit there is missing from other
+    moving: Bools  #: (N,)
+
+
+class Scorer:
+    """Answers one direction by evidence; a rule or a network."""
+
+    def score(self, evidence: Evidence, *, free_space: bool) -> NDArray[np.float32]:
+        """Return (N,) the probability of each voxel that what own hit there is missing from other."""
+        raise NotImplementedError
+
+
+def answered(own: Seen, other: Seen, scorer: Scorer, settings: EvidenceSettings) -> Answer:
+    """Ask of what own hit, what is missing from other.
+
+    The gate: a voxel that own did not hit, that the other visit could not judge, or that belongs to something that
+    moved during the visit has no probability.
+    """
+    lacks = missing(own, other, settings)
+    if not len(lacks.candidates):
+        nothing = np.empty(0, np.int64)
+        return Answer(missing=lacks, keys=nothing, probabilities=np.empty(0, "f4"), moving=np.empty(0, bool))
+    evidence = gathered(own, other, lacks.candidates, settings)
+    probabilities = scorer.score(evidence, free_space=free_space(own, other))
+    rows = rows_of(evidence.keys, own.keys)
+    passing = moving(evidence)
+    counted = (rows >= 0) & lacks.judged[rows] & ~passing
+    return Answer(
+        missing=lacks,
+        keys=evidence.keys,
+        probabilities=np.where(counted, probabilities, 0).astype(np.float32),
+        moving=passing,
+    )
+
+
+def detected(
+    comparison: Comparison, scorer: Scorer, evidence: EvidenceSettings, tiles: TileScoreSettings
+) -> Detection:
+    """Score voxels both ways, and tiles by them. Raises ValueError where a side's `seen` is not there."""
+    reference, current = comparison.reference.seen, comparison.current.seen
+    if reference is None or current is None:
+        raise ValueError("a detector by voxels needs what both visits saw")
+    gone = answered(reference, current, scorer, evidence)
+    new = answered(current, reference, scorer, evidence)
+    voxels = _voxel_scores(reference, current, gone, new)
+    counts, sums = _per_tile(comparison, reference, current, gone, new)
+    share = observed_share(comparison.grid, comparison.tiles, reference, current, gone.missing.judged)
+    score = tile_score(sums, tiles)
+    probabilities = np.stack([1 - score, score, np.zeros_like(score)], axis=1).astype(np.float32)
+    probabilities[(share == 0) & (sums == 0)] = np.nan
+    return Detection(
+        probabilities=probabilities,
+        observed_share=share.astype(np.float32),
+        appeared=counts[1],
+        disappeared=counts[0],
+        voxels=voxels,
+    )
+
+
+def tile_score(sums: Floats, settings: TileScoreSettings) -> Floats:
+    """Return the probability of change (T,) of tiles with so many changed voxels to be expected (T,)."""
+    return np.asarray(1 / (1 + np.exp(-(settings.slope * np.log1p(sums) + settings.offset))))
+
+
+def observed_share(
+    grid: TileGrid, tiles: Indices, reference: Seen, current: Seen, judged: Bools
+) -> NDArray[np.float64]:
+    """Return (T,) the share of what the map knows of a tile, its surfaces and free space, that the survey could judge.
+
+    `judged` (V,) is of the map's voxels. A tile of which the map knows nothing has 0.
+    """
+    row = grid.locate_among(reference.points, tiles) + 1
+    known = np.bincount(row, minlength=len(tiles) + 1)[1:].astype(np.float64)
+    seen = np.bincount(row, weights=judged, minlength=len(tiles) + 1)[1:]
+    if free_space(reference, current) and len(tiles):
+        steps = [(np.arange(count) + 0.5) / count for count in _SPOTS]
+        within = np.stack(np.meshgrid(*steps, indexing="ij"), axis=-1).reshape(-1, 3) * grid.size
+        spots = (grid.lower(tiles)[:, None, :] + within).reshape(-1, 3).astype(np.float32)
+        free = reference.verdicts(spots).through > 0
+        again = np.zeros(len(spots), bool)
+        again[free] = current.verdicts(spots[free]).judged
+        known += _SPOT_WEIGHT * free.reshape(len(tiles), -1).sum(axis=1)
+        seen += _SPOT_WEIGHT * again.reshape(len(tiles), -1).sum(axis=1)
+    return np.asarray(seen / np.maximum(known, 1))
+
+
+def _voxel_scores(reference: Seen, current: Seen, gone: Answer, new: Answer) -> VoxelScores:
+    keys = np.union1d(reference.keys, current.keys)
+    judged, through = np.zeros(len(keys), bool), np.zeros(len(keys), np.int16)
+    scores, passing = [], np.zeros(len(keys), bool)
+    for seen, answer in ((reference, gone), (current, new)):
+        rows = np.searchsorted(keys, seen.keys)
+        judged[rows] |= answer.missing.judged
+        through[rows] = np.maximum(through[rows], answer.missing.seen_through)
+        rows = np.searchsorted(keys, answer.keys)
+        score = np.zeros(len(keys), np.float32)
+        score[rows] = answer.probabilities
+        passing[rows] |= answer.moving
+        scores.append(score)
+    return VoxelScores(
+        keys=keys,
+        appeared=scores[1],
+        disappeared=scores[0],
+        judged=judged,
+        moving=passing,
+        seen_through=through,
+    )
+
+
+def _per_tile(
+    comparison: Comparison, reference: Seen, current: Seen, gone: Answer, new: Answer
+) -> tuple[list[NDArray[np.int32]], Floats]:
+    """Return the voxels that disappeared and appeared in each tile, (T,) each, and how many to expect in all (T,)."""
+    count = len(comparison.tiles)
+    changed, expected = [], np.zeros(count)
+    for seen, answer in ((reference, gone), (current, new)):
+        some = answer.probabilities > 0
+        points = seen.points[rows_of(answer.keys[some], seen.keys)]
+        tile = comparison.grid.locate_among(points, comparison.tiles) + 1
+        p = answer.probabilities[some]
+        changed.append(np.bincount(tile[p > 0.5], minlength=count + 1)[1:].astype(np.int32))
+        expected += np.bincount(tile, weights=p, minlength=count + 1)[1:]
+    return changed, expected
