@@ -128,6 +128,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
     ),
     "worker.simulation": (
         "worker.training",
+        "worker.detectors",
         "worker.cloud",
         "worker.processes",
         "worker.errors",

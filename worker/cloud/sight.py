@@ -9,7 +9,7 @@ return. A point at depth d is held against it:
 | surely | those of the eight neighbouring directions lie beyond it as well (grazing floors fool a single one) |
 | hidden | all lie before it: something stands in the way |
 | confirmed | neither: something stands there |
-| none | there are none: the scan did not look there |
+| none | there are none, or the point is beyond the scan's farthest return: the scan did not look there |
 """
 
 from __future__ import annotations

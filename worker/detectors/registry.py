@@ -23,6 +23,8 @@ DETECTORS: dict[str, Entry] = {
         detector="worker.detectors.spicd_net.detector:SpicdNet",
         network="worker.detectors.spicd_net.training:SpicdNetTraining",
     ),
+    "voxel-net": Entry(detector="worker.detectors.voxel_net.detector:VoxelNet"),
+    "voxel-rule": Entry(detector="worker.detectors.voxel_rule.detector:VoxelRule"),
 }
 
 

@@ -12,18 +12,27 @@ from service.catalog.records import ScanOutcome
 from worker.cloud import npz
 from worker.jobs.step import Context, load, put
 from worker.pipeline import archive
-from worker.pipeline.registration.results import RegisteredScan, ScanFile, ScanResult, read_registered
+from worker.pipeline.registration.results import (
+    RegisteredScan,
+    ScanFile,
+    ScanResult,
+    read_registered,
+    with_carrier,
+)
+from worker.pipeline.settings import PipelineSettings
 
 
-def scan_files(context: Context, scans: Sequence[ScanOutcome], stack: ExitStack) -> list[ScanFile]:
-    """Return the uploads as local files for as long as the stack is open."""
+def scan_files(
+    context: Context, scans: Sequence[ScanOutcome], stack: ExitStack, settings: PipelineSettings
+) -> tuple[ScanFile, ...]:
+    """Return the uploads of one visit as local files for as long as the stack is open, less their carrier."""
     files = []
     for outcome in scans:
         scan = context.catalog.scans.get(outcome.scan_id)
         path = stack.enter_context(context.catalog.blobs.local(scan.key))
         pose = None if scan.pose is None else np.array(scan.pose, np.float64)
         files.append(ScanFile(name=scan.filename, path=path, pose=pose))
-    return files
+    return with_carrier(files, settings.carrier, max_points=settings.max_scan_points)
 
 
 def scan_outcomes(scans: Sequence[ScanOutcome], outcomes: Sequence[ScanResult]) -> tuple[ScanOutcome, ...]:

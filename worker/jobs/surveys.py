@@ -29,7 +29,7 @@ def register_survey(context: Context) -> None:
     survey, version, settings = _asked(context)
     reference = kept_reference(context, version)
     with ExitStack() as stack:
-        files = scan_files(context, survey.scans, stack)
+        files = scan_files(context, survey.scans, stack, settings)
         try:
             located = locate_survey(files, reference, settings=settings, progress=context.report)
         except NoScanAccepted as error:

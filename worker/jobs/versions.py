@@ -68,7 +68,7 @@ def make_version(context: Context, version: VersionRecord, settings: PipelineSet
 
 def _first(context: Context, version: VersionRecord, settings: PipelineSettings) -> Made:
     with ExitStack() as stack:
-        files = scan_files(context, version.scans, stack)
+        files = scan_files(context, version.scans, stack, settings)
         with _recorded_anyway(context, version.scans):
             pairs = StoredPairCache(context.catalog.blobs, context.job.job_id)
             built = build_map(files, settings=settings, pairs=pairs, progress=context.report)
@@ -81,7 +81,7 @@ def _extended(
 ) -> Made:
     older, further = _kept(base), _further(version, base)
     with ExitStack() as stack:
-        files = scan_files(context, further, stack)
+        files = scan_files(context, further, stack, settings)
         with _recorded_anyway(context, further):
             built = extend_map(_kept_map(context, base), files, settings=settings, progress=context.report)
         for scan in older:

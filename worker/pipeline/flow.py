@@ -16,7 +16,13 @@ from worker.pipeline.mapping.fusion import CurrentMap, ReferenceMap, current_map
 from worker.pipeline.mapping.map_registration import MapReport, register_map_scans
 from worker.pipeline.mapping.pair_registration import PairCache
 from worker.pipeline.mapping.survey_registration import register_survey_scans
-from worker.pipeline.registration.results import RegisteredScan, ScanFile, ScanResult, read_registered
+from worker.pipeline.registration.results import (
+    RegisteredScan,
+    ScanFile,
+    ScanResult,
+    read_registered,
+    with_carrier,
+)
 from worker.pipeline.registration.scan_to_scan import PairResult
 from worker.pipeline.results.changes import ChangeSet, decide
 from worker.pipeline.settings import PipelineSettings
@@ -78,6 +84,7 @@ def build_map(
     `pairs` keeps registered pairs, so that a build that was killed goes on; `processes` is one a core if None.
     Raises ScanError where no file can be read, MapFailed where no scan holds a pose, and NothingToTile.
     """
+    files = with_carrier(files, settings.carrier, max_points=settings.max_scan_points)
     registered = register_map_scans(
         files, settings=settings.joint_registration, pair_cache=pairs, processes=processes, progress=progress
     )
@@ -104,6 +111,7 @@ def locate_survey(
 
     Raises ScanError where no file can be read, NoScanAccepted where none is left to compare.
     """
+    files = with_carrier(files, settings.carrier, max_points=settings.max_scan_points)
     outcomes = register_survey_scans(
         files, reference.surface(), settings=settings.joint_registration, progress=progress
     )

@@ -12,7 +12,7 @@ from worker.pipeline.flow import BuiltMap, NoScanAccepted, accepted_scans, fused
 from worker.pipeline.mapping.fusion import ReferenceMap
 from worker.pipeline.mapping.map_registration import MapReport
 from worker.pipeline.mapping.survey_registration import register_survey_scans
-from worker.pipeline.registration.results import RegisteredScan, ScanFile
+from worker.pipeline.registration.results import RegisteredScan, ScanFile, with_carrier
 from worker.pipeline.settings import PipelineSettings
 from worker.progress import Progress, no_progress
 
@@ -33,6 +33,7 @@ def extend_map(
     The outcomes are those of the new files. Raises ScanError where no file can be read, NoScanAccepted where none
     finds a place, and NothingToTile.
     """
+    files = with_carrier(files, settings.carrier, max_points=settings.max_scan_points)
     outcomes = register_survey_scans(
         files, base.reference.surface(), settings=settings.joint_registration, growing=True, progress=progress
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pydantic import Field
 
+from worker.cloud.carrier import CarrierSettings
 from worker.cloud.settings import StrictModel
 from worker.cloud.tiling import TilingSettings
 from worker.detectors.card import Preprocessing
@@ -14,6 +15,7 @@ from worker.pipeline.registration.settings import RegistrationSettings
 class PipelineSettings(StrictModel):
     """One settings class a stage."""
 
+    carrier: CarrierSettings = CarrierSettings.model_validate({})
     registration: RegistrationSettings = Field(default_factory=RegistrationSettings)
     mapping: MappingSettings = Field(default_factory=MappingSettings)
     tiling: TilingSettings = Field(default_factory=TilingSettings)

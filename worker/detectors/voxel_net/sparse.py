@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from worker.cloud.voxel_keys import Keys, blocks, offsets, rows_of
+from worker.cloud.voxel_keys import BITS, Keys, blocks, offsets, rows_of
 
 NEIGHBOURS = 27
 CHILDREN = 8
@@ -62,7 +62,8 @@ def pyramid(keys: Keys, levels: int) -> list[Level]:
 
 def _child_of(keys: Keys) -> NDArray[np.int64]:
     """Return (N,) which of the eight children of its parent a cell is: the lowest bit of x, y and z."""
-    return ((keys >> 42) & 1) * 4 + ((keys >> 21) & 1) * 2 + (keys & 1)
+    which: NDArray[np.int64] = ((keys >> (2 * BITS)) & 1) * 4 + ((keys >> BITS) & 1) * 2 + (keys & 1)
+    return which
 
 
 def _neighbours(cells: Keys) -> NDArray[np.int64]:
@@ -79,21 +80,25 @@ def _neighbours(cells: Keys) -> NDArray[np.int64]:
 
 
 class _Gathered(torch.autograd.Function):
-    """Multiply each cell's neighbourhood by one matrix; the gradient is a gather through the mirrored table."""
+    """Multiply each cell's neighbourhood by one matrix; the gradient is a gather as well.
+
+    Where b is the neighbour of a in one direction, a is that of b in the opposite one: the table serves both ways,
+    with the matrix turned around.
+    """
 
     @staticmethod
-    def forward(ctx: Any, features: Tensor, weight: Tensor, table: Tensor, mirrored: Tensor) -> Tensor:
-        ctx.save_for_backward(features, weight, table, mirrored)
+    def forward(ctx: Any, features: Tensor, weight: Tensor, table: Tensor) -> Tensor:
+        ctx.save_for_backward(features, weight, table)
         return _columns(features, table) @ weight
 
     @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, Tensor | None, None, None]:
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, Tensor, None]:
         (grad,) = grads
-        features, weight, table, mirrored = ctx.saved_tensors
-        offsets_, inner = table.shape[1], features.shape[1]
+        features, weight, table = ctx.saved_tensors
         to_weight = _columns(features, table).T @ grad
-        turned = weight.view(offsets_, inner, -1).flip(0).transpose(1, 2).reshape(-1, inner)
-        return _columns(grad.contiguous(), mirrored) @ turned, to_weight, None, None
+        turned = weight.view(NEIGHBOURS, features.shape[1], -1).flip(0).transpose(1, 2)
+        to_features = _columns(grad.contiguous(), table) @ turned.reshape(-1, features.shape[1])
+        return to_features, to_weight, None
 
 
 def _columns(features: Tensor, table: Tensor) -> Tensor:
@@ -112,7 +117,7 @@ class Convolution(nn.Module):
 
     def forward(self, features: Tensor, level: Level) -> Tensor:
         """Map (N, inner) to (N, outer)."""
-        product: Tensor = _Gathered.apply(features, self.weight, level.neighbours, level.neighbours)
+        product: Tensor = _Gathered.apply(features, self.weight, level.neighbours)  # type: ignore[no-untyped-call]
         return product
 
 

@@ -15,7 +15,7 @@ from worker.cloud.voxel_keys import regions
 from worker.detectors.card import Card
 from worker.detectors.comparison import Comparison, Side
 from worker.detectors.detector import Detection
-from worker.detectors.voxels.evidence import Evidence, EvidenceSettings
+from worker.detectors.voxels.evidence import Evidence, EvidenceSettings, passing
 from worker.detectors.voxels.scores import Scorer, TileScoreSettings, detected
 from worker.progress import Progress, no_progress
 
@@ -34,8 +34,8 @@ class VoxelRuleSettings(StrictModel):
 class VoxelRule(Scorer):
     """Detector (worker.detectors.detector) whose every decision can be followed by hand.
 
-    A candidate is a voxel that one visit hit, where the other hit nothing within a voxel and saw through. A region of
-    at least `min_region` candidates has changed where scans surely saw through enough of it. The probability of its
+    A candidate is a voxel that one visit hit, where the other hit nothing within a voxel and saw through, and
+    which the first did not see through itself, as it does with people. A region of at least `min_region` candidates has changed where scans surely saw through enough of it. The probability of its
     voxels is the share of scans that saw through, of all that could tell.
     """
 
@@ -80,7 +80,7 @@ class VoxelRule(Scorer):
         Without free space there is no proof that anything is missing, and the rule says nothing: all 0.
         """
         answer = np.zeros(len(evidence.keys), np.float32)
-        rows = np.flatnonzero(evidence.candidate)
+        rows = np.flatnonzero(evidence.candidate & ~passing(evidence))
         count, region = regions(evidence.keys[rows])
         if not free_space or not count:
             return answer

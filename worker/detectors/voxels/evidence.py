@@ -123,19 +123,14 @@ def gathered(own: Seen, other: Seen, candidates: Keys, settings: EvidenceSetting
     )
 
 
-def moving(evidence: Evidence) -> Bools:
-    """Tell (N,) which candidates belong to what moved during the visit: it was hit and seen through in one visit.
+def passing(evidence: Evidence) -> Bools:
+    """Tell (N,) which candidates the very visit that hit them saw through as often as it confirmed them.
 
-    Decided a region of candidates at a time, by whether most of its voxels were seen through.
+    So looks what moved during the visit: a person, a door.
     """
-    answer = np.zeros(len(evidence.keys), bool)
-    rows = np.flatnonzero(evidence.candidate)
-    count, region = regions(evidence.keys[rows])
-    if not count:
-        return answer
-    passed = (evidence.own.surely > 0) & (evidence.own.surely >= evidence.own.confirmed)
-    share = np.bincount(region, weights=passed[rows], minlength=count) / np.bincount(region, minlength=count)
-    answer[rows] = share[region] > 0.5
+    answer: Bools = (
+        evidence.candidate & (evidence.own.surely > 0) & (evidence.own.surely >= evidence.own.confirmed)
+    )
     return answer
 
 

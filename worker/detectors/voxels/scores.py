@@ -22,7 +22,7 @@ from worker.detectors.voxels.evidence import (
     free_space,
     gathered,
     missing,
-    moving,
+    passing,
 )
 
 _SPOTS = (4, 4, 3)  # places along x, y, z of a tile that free space is asked at
@@ -57,8 +57,8 @@ class Scorer:
 def answered(own: Seen, other: Seen, scorer: Scorer, settings: EvidenceSettings) -> Answer:
     """Ask of what own hit, what is missing from other.
 
-    The gate: a voxel that own did not hit, that the other visit could not judge, or that belongs to something that
-    moved during the visit has no probability.
+    The gate: a voxel that own did not hit, or that the other visit could not judge, has no probability. What own saw
+    through as well, and so is not believed to stand there, moved during the visit.
     """
     lacks = missing(own, other, settings)
     if not len(lacks.candidates):
@@ -67,14 +67,9 @@ def answered(own: Seen, other: Seen, scorer: Scorer, settings: EvidenceSettings)
     evidence = gathered(own, other, lacks.candidates, settings)
     probabilities = scorer.score(evidence, free_space=free_space(own, other))
     rows = rows_of(evidence.keys, own.keys)
-    passing = moving(evidence)
-    counted = (rows >= 0) & lacks.judged[rows] & ~passing
-    return Answer(
-        missing=lacks,
-        keys=evidence.keys,
-        probabilities=np.where(counted, probabilities, 0).astype(np.float32),
-        moving=passing,
-    )
+    gated = np.where((rows >= 0) & lacks.judged[rows], probabilities, 0).astype(np.float32)
+    moving = passing(evidence) & (gated < 0.5)
+    return Answer(missing=lacks, keys=evidence.keys, probabilities=gated, moving=moving)
 
 
 def detected(
@@ -131,7 +126,7 @@ def observed_share(
 def _voxel_scores(reference: Seen, current: Seen, gone: Answer, new: Answer) -> VoxelScores:
     keys = np.union1d(reference.keys, current.keys)
     judged, through = np.zeros(len(keys), bool), np.zeros(len(keys), np.int16)
-    scores, passing = [], np.zeros(len(keys), bool)
+    scores, moving = [], np.zeros(len(keys), bool)
     for seen, answer in ((reference, gone), (current, new)):
         rows = np.searchsorted(keys, seen.keys)
         judged[rows] |= answer.missing.judged
@@ -139,14 +134,14 @@ def _voxel_scores(reference: Seen, current: Seen, gone: Answer, new: Answer) -> 
         rows = np.searchsorted(keys, answer.keys)
         score = np.zeros(len(keys), np.float32)
         score[rows] = answer.probabilities
-        passing[rows] |= answer.moving
+        moving[rows] |= answer.moving
         scores.append(score)
     return VoxelScores(
         keys=keys,
         appeared=scores[1],
         disappeared=scores[0],
         judged=judged,
-        moving=passing,
+        moving=moving,
         seen_through=through,
     )
 

@@ -5,17 +5,22 @@ Points are not kept here: a map of 500 scans is built with one of them in memory
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Self
 
 import numpy as np
 
+from worker.cloud.carrier import Carrier, CarrierSettings
 from worker.cloud.formats.scan import Scan, read_scan
 from worker.cloud.poses import inverse, transformed
 from worker.cloud.types import Colors, Floats, Matrix4, Points
 from worker.cloud.voxels import Voxels
-from worker.errors import RegistrationFailed
+from worker.errors import RegistrationFailed, ScanError
+
+_SAMPLED = 20  # scans of a visit that its carrier is looked for in
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -25,10 +30,19 @@ class ScanFile:
     name: str  #: what messages call it
     path: Path
     pose: Matrix4 | None = None  #: (4, 4) map_from_sensor as the client believes it, e.g. by odometry
+    carrier: Carrier | None = None  #: whose returns are cut; None: nobody looked for one
 
     def read(self, *, max_points: int) -> Scan:
-        """Read the file; raises ScanError, whose message names it."""
-        return read_scan(self.path, name=self.name, max_points=max_points)
+        """Read the file, less the carrier's returns; raises ScanError, whose message names it."""
+        scan = read_scan(self.path, name=self.name, max_points=max_points)
+        if self.carrier is None:
+            return scan
+        cut = self.carrier.hits(transformed(scan.points, inverse(scan.sensor_pose)))
+        return replace(
+            scan,
+            points=scan.points[~cut],
+            colors=None if scan.colors is None else scan.colors[~cut],
+        )
 
     def prior(self, sensor_pose: Matrix4) -> Matrix4 | None:
         """Return map_from_scan by the client's pose, which is the sensor's; the file may know where that stood."""
@@ -36,6 +50,26 @@ class ScanFile:
             return None
         map_from_scan: Matrix4 = self.pose @ inverse(sensor_pose)
         return map_from_scan
+
+
+def with_carrier(
+    files: Sequence[ScanFile], settings: CarrierSettings, *, max_points: int
+) -> tuple[ScanFile, ...]:
+    """Look for the carrier in the scans of one visit, in at most 20 of them, so that it is cut where they are read.
+
+    Files that have one are left as they are; what cannot be read is passed over here.
+    """
+    if all(file.carrier is not None for file in files):
+        return tuple(files)
+
+    def returns() -> Iterator[Floats]:
+        for index in np.unique(np.linspace(0, len(files) - 1, min(len(files), _SAMPLED)).astype(int)):
+            with suppress(ScanError):
+                scan = read_scan(files[index].path, name=files[index].name, max_points=max_points)
+                yield transformed(scan.points, inverse(scan.sensor_pose))
+
+    carrier = Carrier.of(returns(), settings)
+    return tuple(replace(file, carrier=file.carrier or carrier) for file in files)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
