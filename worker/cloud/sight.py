@@ -33,7 +33,7 @@ TOLERANCE = (
 )  #: metres, and times the depth, that a return may lie off and still be the same surface
 FARTHEST_RESIDUAL = 0.6  #: metres; a residual is no larger
 _MILLIMETRE = 0.001  # ranges are kept in these, as uint16: up to 65 m
-_FARTHEST = np.iinfo(np.uint16).max  # in these
+_FARTHEST = np.uint16(np.iinfo(np.uint16).max)  # in these
 
 Counts = NDArray[np.int16]
 
@@ -61,7 +61,7 @@ class Verdicts:
         return (self.through > 0) | (self.confirmed > 0)
 
 
-@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Sights:
     """The range images of S scans, map frame; 0 where a scan had no return."""
 
@@ -93,7 +93,7 @@ class Sights:
     def _of_one(cls, points: NDArray[Any], origin: Floats) -> Self:
         rays = (points - origin).astype(np.float32)
         cells = _cells_of(rays)
-        ranges = np.minimum(np.sqrt(np.einsum("ij,ij->i", rays, rays)) / _MILLIMETRE, _FARTHEST)
+        ranges = np.minimum(np.sqrt(np.einsum("ij,ij->i", rays, rays)) / _MILLIMETRE, float(_FARTHEST))
         nearest = np.full(6 * CELLS**2, np.inf, np.float32)
         farthest = np.zeros(6 * CELLS**2, np.float32)
         np.minimum.at(nearest, cells, ranges)
@@ -122,6 +122,7 @@ class Sights:
         answer = Verdicts.none(len(points))
         order = np.argsort(points[:, 0], kind="stable")
         ordered = np.ascontiguousarray(points[order], np.float32)
+        _ = self._around  # made once, before several threads ask for it
         with ThreadPoolExecutor(max(1, query_threads())) as pool:
             for rows, told in pool.map(functools.partial(self._verdicts_of_one, ordered), range(len(self))):
                 there = order[rows]
@@ -142,7 +143,10 @@ class Sights:
             rays = rays[rows]
         cells = _cells_of(rays)
         depth = np.sqrt(np.einsum("ij,ij->i", rays, rays))
-        nearest, farthest, around = (image[cells] for image in self._images(scan))
+        nearest, farthest, around = (
+            image[scan][cells] * np.float32(_MILLIMETRE)
+            for image in (self.nearest, self.farthest, self._around)
+        )
         tolerance = TOLERANCE[0] + TOLERANCE[1] * depth
         known = farthest > 0
         through = known & (nearest > depth + tolerance)
@@ -156,15 +160,14 @@ class Sights:
             residual=np.minimum(gap, FARTHEST_RESIDUAL).astype(np.float32),
         )
 
-    def _images(self, scan: int) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-        """Return nearest, farthest, and the nearest with the eight neighbours, of one scan, in metres."""
-        nearest = self.nearest[scan].astype(np.float32) * np.float32(_MILLIMETRE)
-        farthest = self.farthest[scan].astype(np.float32) * np.float32(_MILLIMETRE)
-        known = np.where(nearest > 0, nearest, np.float32(np.inf))
+    @functools.cached_property
+    def _around(self) -> NDArray[np.uint16]:
+        """(S, 6 CELLS^2) millimetres: the nearest return in a direction and in the eight around it, where any is."""
+        known = np.where(self.nearest > 0, self.nearest, _FARTHEST)
         around = known.copy()
         for neighbour in _neighbours():
-            np.minimum(around, known[neighbour], out=around)
-        return nearest, farthest, around
+            np.minimum(around, known[:, neighbour], out=around)
+        return around
 
 
 def _cells_of(rays: NDArray[np.float32]) -> NDArray[np.int32]:
