@@ -65,8 +65,8 @@ class Box:
         return _met(entry, leave)
 
     def holds(self, points: NDArray[Any], margin: float = 0.0) -> Bools:
-        inside: Bools = (np.abs(_turned(points - self.middle, -self.yaw)) <= self.half + margin).all(axis=1)
-        return inside
+        off = _turned(points - self.middle, -self.yaw)
+        return np.asarray((np.abs(off) <= self.half + margin).all(axis=1))
 
     def places(self) -> Floats:
         return self.middle + _turned(_lattice() * self.half, self.yaw)
@@ -121,7 +121,7 @@ class Union:
 
     @property
     def middle(self) -> Floats:
-        return np.mean([part.middle for part in self.parts], axis=0)
+        return np.asarray(np.mean([part.middle for part in self.parts], axis=0))
 
     @property
     def radius(self) -> float:
