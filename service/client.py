@@ -183,7 +183,10 @@ class Client:
         return self._json("GET", f"/surveys/{_quoted(survey_id)}/tiles")
 
     def changes(self, map_id: str, **filters: Any) -> Document:
-        """Return one page of changed tiles; filters are those of the API: `survey bbox datetime min_score limit`."""
+        """Return one page of changed tiles, each change once.
+
+        Filters are those of the API: `survey repeats bbox datetime min_score limit`.
+        """
         return self._json("GET", f"/maps/{_quoted(map_id)}/changes", params=_given(**filters))
 
     # jobs and models

@@ -48,13 +48,17 @@ def tile_feature(
     probabilities: Sequence[float] | None,
     n_reference: int,
     n_current: int,
+    observed_share: float | None = None,
+    appeared: int | None = None,
+    disappeared: int | None = None,
     survey: Mapping[str, Any],
     geometry: dict[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Return one tile of a survey.
 
     `survey` holds the properties that all its tiles share, `survey_id` and `captured_at` (RFC 3339) among them; where
-    the latter is None, `time` is null. `geometry` is the footprint in WGS 84.
+    the latter is None, `time` is null. `geometry` is the footprint in WGS 84. What a detector of voxels alone says is
+    None for others.
     """
     captured_at = survey["captured_at"]
     return {
@@ -72,6 +76,9 @@ def tile_feature(
             "probabilities": None if probabilities is None else list(probabilities),
             "n_reference": n_reference,
             "n_current": n_current,
+            "observed_share": observed_share,
+            "appeared": appeared,
+            "disappeared": disappeared,
             **survey,
         },
     }

@@ -76,7 +76,12 @@ def readable(read: Callable[[str], object]) -> AfterValidator:
 class ChangesRequest(Request):
     """Which changed tiles."""
 
-    survey: Annotated[Id | None, Field(description="of this survey only")] = None
+    survey: Annotated[
+        Id | None, Field(description="of this survey only, also what an earlier visit found before")
+    ] = None
+    repeats: Annotated[
+        bool, Field(description="a feature for each visit that saw a change, and not one for each change")
+    ] = False
     bbox: Annotated[
         Annotated[str, readable(bounds_of)] | None,
         Field(description="map frame, metres; tiles whose box meets it", examples=["0,0,7.5,4.5"]),
@@ -84,11 +89,15 @@ class ChangesRequest(Request):
     datetime: Annotated[
         Annotated[str, readable(span_of)] | None,
         Field(
-            description="of the visit: RFC 3339 instant, or interval with `..` for an open end",
+            description="in which a change was first seen; with `survey` or `repeats` that of the visit: RFC 3339 "
+            "instant, or interval with `..` for an open end",
             examples=["2026-03-01T00:00:00Z/.."],
         ),
     ] = None
-    min_score: Annotated[float | None, Field(ge=0, le=1, description="probability of change")] = None
+    min_score: Annotated[
+        float | None,
+        Field(ge=0, le=1, description="probability of change, in one at least of the visits that saw it"),
+    ] = None
     limit: Annotated[int, Field(ge=1, le=10000, description="most features in one answer")] = 100
     cursor: Cursor = None
 
@@ -109,7 +118,11 @@ def get_changes(
     map_id: Annotated[Id, Path()],
     asked: Annotated[ChangesRequest, Query()],
 ) -> FeatureResponse:
-    """The changed tiles of every finished survey: newest visit first, most certain first within a visit.
+    """The changed tiles of every finished survey, each change once: newest first, most certain first within a visit.
+
+    A change that stays over several visits is one feature, that of the visit which told it first, with `first_seen`,
+    `last_seen` and `max_score` over all of them. It ends where a visit sees the tile unchanged, or a version of the map
+    takes it over; a change after that is another one.
 
     A survey that still runs or failed has no say here; asked for by name it answers 409 and not an empty list,
     for nothing found is not the same as no change.
@@ -123,6 +136,7 @@ def get_changes(
         ChangeFilter(
             map_id=map_id,
             survey_id=asked.survey,
+            repeats=asked.repeats,
             bounds=None if asked.bbox is None else bounds_of(asked.bbox),
             since=since,
             until=until,
@@ -142,7 +156,7 @@ def get_changes(
 
 def cursor_of(position: ChangePosition) -> str:
     """Return the cursor behind a change."""
-    return encoded(rfc3339(position.captured_at), position.survey_id, position.score.hex(), position.tile_id)
+    return encoded(rfc3339(position.instant), position.survey_id, position.score.hex(), position.tile_id)
 
 
 def position_of(cursor: str | None) -> ChangePosition | None:

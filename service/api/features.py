@@ -80,11 +80,25 @@ class TileProperties(Document):
     threshold: float | None = Field(description="changed above this score", examples=[0.5])
     n_reference: int = Field(description="points of the map in the tile", examples=[1904])
     n_current: int = Field(description="points of the survey in the tile", examples=[2210])
+    observed_share: float | None = Field(
+        description="of the tile, that the survey could judge; null of models that tell tiles alone, like the next two",
+        examples=[0.87],
+    )
+    appeared: int | None = Field(description="voxels with something new", examples=[212])
+    disappeared: int | None = Field(description="voxels with something gone", examples=[0])
     map_id: str = Field(examples=["lobby"])
     map_version: int = Field(description="that the survey was compared with", examples=[1])
     survey_id: str = Field(examples=["survey-91c4"])
     model: str = Field(examples=["spicd-net/1"])
     captured_at: str = Field(examples=["2026-03-01T12:00:00Z"])
+    first_seen: str | None = Field(
+        description="by a visit that saw this change of the tile; null where it is not changed",
+        examples=["2026-03-01T12:00:00Z"],
+    )
+    last_seen: str | None = Field(
+        description="likewise, before it was gone again or taken over", examples=["2026-03-08T12:00:00Z"]
+    )
+    max_score: float | None = Field(description="over those visits", examples=[0.97])
 
 
 class TileFeature(Document):
@@ -131,7 +145,14 @@ def feature_response(
 def feature(change: ChangeRecord, convert: ToWgs84 | None) -> dict[str, Any]:
     """Return one tile of a survey; `convert` takes points of the map frame to the Earth."""
     tile, (lower, upper) = change.tile, (change.tile.bounds.min, change.tile.bounds.max)
-    survey = change.model_dump(exclude={"tile"}) | {"captured_at": rfc3339(change.captured_at)}
+    survey = change.model_dump(exclude={"tile"}) | {
+        name: None if instant is None else rfc3339(instant)
+        for name, instant in (
+            ("captured_at", change.captured_at),
+            ("first_seen", change.first_seen),
+            ("last_seen", change.last_seen),
+        )
+    }
     geometry = None if convert is None else on_earth(footprint(lower, upper), lower[2], convert)
     return tile_feature(
         **tile.model_dump(exclude={"bounds"}), lower=lower, upper=upper, survey=survey, geometry=geometry

@@ -44,6 +44,14 @@ class MapSettings(Request):
     """What of a map can be set. Voxel and tile size belong to the model, and so to its card."""
 
     registration: RegistrationRequest = RegistrationRequest()
+    alarms_per_survey: Annotated[
+        float,
+        Field(
+            gt=0,
+            description="false objects that a survey of a place without any change may have in the mean; a model that "
+            "tells objects turns it into thresholds on the map's own repeated scans",
+        ),
+    ] = 0.1
 
 
 class AnchorRequest(Anchor):

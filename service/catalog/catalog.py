@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from service.catalog import history
 from service.catalog.blobs import Blobs
 from service.catalog.changes import Changes
 from service.catalog.database import Database
@@ -43,6 +44,7 @@ def open_catalog(settings: Settings, *, migrate: bool = True) -> Catalog:
     database = Database(settings.resolved_database_url())
     if migrate:
         database.upgrade()
+        history.catch_up(database)
     blobs = Blobs(settings.resolved_blob_url())
     return Catalog(
         database=database,

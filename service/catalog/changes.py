@@ -7,19 +7,25 @@ from datetime import datetime
 from typing import Any, NamedTuple
 
 from sqlalchemy import Select, and_, func, or_, select
+from sqlalchemy.orm import InstrumentedAttribute
 
 from service.catalog import tables
 from service.catalog.database import Database
 from service.catalog.records import Bounds, ChangeRecord, TileRecord
 
-_TILE, _SURVEY = tables.SurveyTile, tables.Survey
-_TILES = select(_TILE, _SURVEY).join(_SURVEY, _SURVEY.survey_id == _TILE.survey_id)
+_TILE, _SURVEY, _TOLD = tables.SurveyTile, tables.Survey, tables.TileChange
+#: Every tile of every survey, with the change that it belongs to.
+_TILES = (
+    select(_TILE, _SURVEY, _TOLD)
+    .join(_SURVEY, _SURVEY.survey_id == _TILE.survey_id)
+    .outerjoin(_TOLD, and_(_TOLD.survey_id == _TILE.told_by, _TOLD.tile_id == _TILE.tile_id))
+)
 
 
 class ChangePosition(NamedTuple):
     """Where a page ended."""
 
-    captured_at: datetime
+    instant: datetime  #: by which the list is ordered
     survey_id: str
     score: float
     tile_id: str
@@ -31,15 +37,23 @@ class ChangeFilter:
 
     map_id: str
     survey_id: str | None = None
+    repeats: bool = False  #: each visit's, and not each change once; so it is too where a survey is named
     bounds: Bounds | None = None  #: map frame; a tile is in when its box meets this one
-    since: datetime | None = None  #: captured at or after
-    until: datetime | None = None  #: captured at or before
-    min_score: float | None = None  #: 0..1, inclusive
+    since: datetime | None = None  #: first seen, or with `repeats` captured, at or after
+    until: datetime | None = None  #: likewise, at or before
+    min_score: float | None = (
+        None  #: 0..1, inclusive; of a change that is told once: in one of the visits at least
+    )
+
+    @property
+    def once(self) -> bool:
+        """Whether a change that stays over several surveys is told once."""
+        return not self.repeats and self.survey_id is None
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class ChangePage:
-    """Some changes of a longer list: newest survey first, most certain first within it."""
+    """Some changes of a longer list: newest first, most certain first within a survey."""
 
     items: tuple[ChangeRecord, ...]
     matched: int  #: of all pages together
@@ -55,38 +69,48 @@ class Changes:
     def page(
         self, wanted: ChangeFilter, *, after: ChangePosition | None = None, limit: int = 100
     ) -> ChangePage:
-        """Return changed tiles of surveys that are ready."""
+        """Return changed tiles of surveys that are ready: each change once, or with `repeats` for each visit."""
         query = _matching(wanted)
         count = select(func.count()).select_from(query.subquery())
-        rows = query if after is None else query.where(_behind(after))
+        instant = _instant(wanted)
+        rows = query if after is None else query.where(_behind(instant, after))
         rows = rows.order_by(
-            _SURVEY.captured_at.desc(), _SURVEY.survey_id.desc(), _TILE.score.desc(), _TILE.tile_id.asc()
+            instant.desc(), _SURVEY.survey_id.desc(), _TILE.score.desc(), _TILE.tile_id.asc()
         ).limit(limit + 1)
         with self._database.read() as session:
             matched = session.scalar(count) or 0
-            records = [_record(tile, survey) for tile, survey in session.execute(rows)]
+            records = [_record(*row) for row in session.execute(rows)]
         items = tuple(records[:limit])
-        return ChangePage(
-            items=items, matched=matched, following=_position(items[-1]) if len(records) > limit else None
-        )
+        following = _position(items[-1], wanted) if len(records) > limit else None
+        return ChangePage(items=items, matched=matched, following=following)
 
     def of_survey(self, survey_id: str) -> tuple[ChangeRecord, ...]:
         """Return every tile of a survey, unobserved ones too, in the order of the grid."""
         query = _TILES.where(_TILE.survey_id == survey_id).order_by(_TILE.i, _TILE.j, _TILE.k)
         with self._database.read() as session:
-            return tuple(_record(tile, survey) for tile, survey in session.execute(query))
+            return tuple(_record(*row) for row in session.execute(query))
 
 
-def _matching(wanted: ChangeFilter) -> Select[tables.SurveyTile, tables.Survey]:
-    query = _TILES.where(_SURVEY.map_id == wanted.map_id, _SURVEY.status == "ready", _TILE.state == "changed")
+def _instant(wanted: ChangeFilter) -> InstrumentedAttribute[datetime]:
+    """Return the column by which changes are ordered and asked for in time."""
+    return _TOLD.first_seen if wanted.once else _SURVEY.captured_at
+
+
+def _matching(wanted: ChangeFilter) -> Select[tables.SurveyTile, tables.Survey, tables.TileChange]:
+    query: Select[Any] = _TILES.where(
+        _SURVEY.map_id == wanted.map_id, _SURVEY.status == "ready", _TILE.state == "changed"
+    )
+    if wanted.once:
+        query = query.where(_TILE.survey_id == _TILE.told_by)
+    instant, score = _instant(wanted), _TOLD.max_score if wanted.once else _TILE.score
     if wanted.survey_id is not None:
         query = query.where(_SURVEY.survey_id == wanted.survey_id)
     if wanted.since is not None:
-        query = query.where(_SURVEY.captured_at >= wanted.since)
+        query = query.where(instant >= wanted.since)
     if wanted.until is not None:
-        query = query.where(_SURVEY.captured_at <= wanted.until)
+        query = query.where(instant <= wanted.until)
     if wanted.min_score is not None:
-        query = query.where(_TILE.score >= wanted.min_score)
+        query = query.where(score >= wanted.min_score)
     if wanted.bounds is not None:
         low, high = wanted.bounds.min, wanted.bounds.max
         query = query.where(
@@ -96,22 +120,23 @@ def _matching(wanted: ChangeFilter) -> Select[tables.SurveyTile, tables.Survey]:
     return query
 
 
-def _behind(after: ChangePosition) -> Any:
-    same_time = _SURVEY.captured_at == after.captured_at
+def _behind(instant: InstrumentedAttribute[datetime], after: ChangePosition) -> Any:
+    same_time = instant == after.instant
     same_survey = and_(same_time, _SURVEY.survey_id == after.survey_id)
     return or_(
-        _SURVEY.captured_at < after.captured_at,
+        instant < after.instant,
         and_(same_time, _SURVEY.survey_id < after.survey_id),
         and_(same_survey, _TILE.score < after.score),
         and_(same_survey, _TILE.score == after.score, _TILE.tile_id > after.tile_id),
     )
 
 
-def _position(last: ChangeRecord) -> ChangePosition:
-    return ChangePosition(last.captured_at, last.survey_id, last.tile.score or 0.0, last.tile.tile_id)
+def _position(last: ChangeRecord, wanted: ChangeFilter) -> ChangePosition:
+    instant = last.first_seen if wanted.once and last.first_seen is not None else last.captured_at
+    return ChangePosition(instant, last.survey_id, last.tile.score or 0.0, last.tile.tile_id)
 
 
-def _record(tile: tables.SurveyTile, survey: tables.Survey) -> ChangeRecord:
+def _record(tile: tables.SurveyTile, survey: tables.Survey, told: tables.TileChange | None) -> ChangeRecord:
     return ChangeRecord(
         tile=TileRecord.of_row(tile),
         map_id=survey.map_id,
@@ -120,4 +145,7 @@ def _record(tile: tables.SurveyTile, survey: tables.Survey) -> ChangeRecord:
         model=survey.model,
         threshold=survey.threshold,
         captured_at=survey.captured_at,
+        first_seen=None if told is None else told.first_seen,
+        last_seen=None if told is None else told.last_seen,
+        max_score=None if told is None else told.max_score,
     )

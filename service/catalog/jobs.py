@@ -13,7 +13,7 @@ from typing import Any, cast
 from sqlalchemy import CursorResult, func, select, update
 from sqlalchemy.orm import Session
 
-from service.catalog import tables
+from service.catalog import history, tables
 from service.catalog.database import Database
 from service.catalog.records import JobRecord, JobStatus, Page, Position, Problem
 from service.catalog.steps import JobKind
@@ -135,15 +135,22 @@ class Jobs:
     def _end(self, job_id: str, status: JobStatus, **values: Any) -> bool:
         instant = now()
         with self._database.write() as session:
+            job = session.get(tables.Job, job_id)
+            if job is None:
+                return False
+            session.get(
+                tables.Map, job.map_id, with_for_update=True
+            )  # map, then survey, then job: in one order
             if not _changed(
                 session, job_id, {**values, "status": status, "finished": instant, "updated": instant}
             ):
                 return False
-            job = _row(session, job_id)
             subject = _subject(session, job)
             if subject is not None:
                 subject.status = "ready" if status == "successful" else "failed"
                 subject.updated = instant
+                if subject.status == "ready":
+                    history.note(session, subject)
             return True
 
 

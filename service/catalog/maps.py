@@ -49,6 +49,7 @@ class Maps:
             model=model,
             settings=dict(settings or {}),
             anchor=None if anchor is None else anchor.model_dump(),
+            objects={},
             created=job.created,
             updated=job.created,
         )
@@ -108,4 +109,4 @@ def _record(shown: tables.MapVersion) -> MapRecord:
     row = shown.of_map
     built = dict(Built.of_row(shown))
     built |= {"created": row.created, "updated": max(row.updated, shown.updated)}
-    return MapRecord(name=row.name, anchor=row.anchor, **built)
+    return MapRecord(name=row.name, anchor=row.anchor, objects=row.objects or {}, **built)

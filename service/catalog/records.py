@@ -16,7 +16,10 @@ MapStatus = Literal["building", "ready", "failed"]
 ModelStatus = Literal["training", "ready", "failed"]
 SurveyStatus = Literal["running", "ready", "failed"]
 TileState = Literal["unchanged", "changed", "inconsistent", "unobserved"]
+ObjectKind = Literal["appeared", "disappeared", "moved"]
+ObjectStatus = Literal["new", "still_there", "gone_again", "unknown", "accepted"]
 ScanFormat = Literal["ply", "pcd"]
+Vector2 = tuple[float, float]
 Vector3 = tuple[float, float, float]
 Row4 = tuple[float, float, float, float]
 Matrix = tuple[Row4, Row4, Row4, Row4]  #: (4, 4) row-major, rigid, target_from_source
@@ -134,12 +137,81 @@ class TileRecord(Record):
     probabilities: Vector3 | None = None  #: unchanged, changed, different place
     n_reference: int  #: points of the reference in the tile
     n_current: int  #: points of the survey in the tile
+    observed_share: float | None = Field(None, ge=0, le=1)  #: of the tile, that the survey could judge
+    appeared: int | None = Field(None, ge=0)  #: voxels; None of detectors without voxels
+    disappeared: int | None = Field(None, ge=0)  #: likewise
 
     @model_validator(mode="after")
     def _scored_where_observed(self) -> Self:
         unscored = self.score is None or self.probabilities is None
         if unscored != (self.state == "unobserved"):
             raise ValueError(f"{self.tile_id}: a tile has a score exactly where it was observed")
+        return self
+
+
+def _open_counter_clockwise(ring: tuple[Vector2, ...]) -> tuple[Vector2, ...]:
+    """Return an outline without its first corner at its end, counter-clockwise. Raises ValueError for less than three."""
+    corners = ring[:-1] if len(ring) > 1 and ring[0] == ring[-1] else ring
+    if len(corners) < 3:
+        raise ValueError(f"an outline has at least three corners, this one has {len(corners)}")
+    following = (*corners[1:], corners[0])
+    twice_area = sum(a[0] * b[1] - b[0] * a[1] for a, b in zip(corners, following, strict=True))
+    return corners if twice_area >= 0 else corners[::-1]
+
+
+class Place(Record):
+    """Where a thing stands or stood: an upright box and what lies in it; map frame, metres, z up."""
+
+    center: Vector3  #: of the box
+    size: Vector3  #: along the axes of the box: two that lie level, then its height
+    yaw: float  #: radians, counter-clockwise from the map's x axis to the first axis of the box
+    footprint: Annotated[tuple[Vector2, ...], AfterValidator(_open_counter_clockwise)]
+    #: x, y of the outline from above; taken closed or not and either way round, kept open and counter-clockwise
+    height_over_floor: float | None  #: of the lower side; None: no floor was seen
+    volume: float = Field(ge=0)  #: cubic metres, of the voxels
+    voxels: int = Field(ge=0)
+    points: int = Field(ge=0)
+    tiles: tuple[str, ...]  #: ids of the tiles that it touches
+
+    @property
+    def bounds(self) -> Bounds:
+        """The axis-aligned box around footprint and height."""
+        xs, ys = zip(*self.footprint, strict=True)
+        lower, upper = self.center[2] - self.size[2] / 2, self.center[2] + self.size[2] / 2
+        return Bounds(min=(min(xs), min(ys), lower), max=(max(xs), max(ys), upper))
+
+
+class Motion(Record):
+    """How a thing was moved, now_from_before: turned about its upright axis, then shifted."""
+
+    translation: Vector3  #: metres, from the earlier center to the later one
+    yaw: float  #: radians, counter-clockwise
+
+
+class ObjectRecord(Record):
+    """A thing that a survey found changed."""
+
+    number: int = Field(ge=1)  #: within the survey; `object_id` in its coloured cloud
+    kind: ObjectKind
+    now: Place | None  #: None where it disappeared
+    before: Place | None  #: None where it appeared
+    motion: Motion | None  #: of what moved
+    probability: float = Field(ge=0, le=1)  #: mean over its voxels
+    observed_share: float = Field(ge=0, le=1)  #: of it, that both visits could judge
+    scans_seen_through: int = Field(ge=0)  #: scans of the other visit that saw through where it is
+
+    @model_validator(mode="after")
+    def _placed_as_its_kind_says(self) -> Self:
+        told = (self.now is not None, self.before is not None, self.motion is not None)
+        expected = {
+            "appeared": (True, False, False),
+            "disappeared": (False, True, False),
+            "moved": (True, True, True),
+        }[self.kind]
+        if told != expected:
+            raise ValueError(
+                f"object {self.number}: {self.kind} does not go with (now, before, motion) = {told}"
+            )
         return self
 
 
@@ -171,6 +243,10 @@ class MapRecord(Built):
 
     name: str | None
     anchor: Anchor | None = Field(description="where the map lies on the Earth; null: nobody said")
+    objects: dict[str, int] = Field(
+        description="changed things, by status; empty while no survey tells any",
+        examples=[{"new": 2, "still_there": 5, "gone_again": 1, "unknown": 0, "accepted": 3}],
+    )
 
 
 class VersionRecord(Built):
@@ -194,6 +270,14 @@ class SurveyRecord(Record):
     scans: tuple[ScanOutcome, ...]  #: in the order of the request
     counts: dict[str, int] = Field(
         examples=[{"tiles": 172, "unchanged": 150, "changed": 9, "inconsistent": 1, "unobserved": 12}]
+    )
+    objects: dict[str, int] | None = Field(
+        description="things found, by kind; null until it is done and where the model tells tiles alone",
+        examples=[{"appeared": 2, "disappeared": 1, "moved": 1}],
+    )
+    moving: int | None = Field(
+        description="things that moved while the visit lasted, people for the most part; they are no objects",
+        examples=[3],
     )
     job_id: str
     problem: Problem | None
@@ -251,3 +335,8 @@ class ChangeRecord(Record):
     model: str
     threshold: float | None
     captured_at: Utc
+    first_seen: Utc | None = (
+        None  #: when a survey first saw this change of the tile; None where there is none
+    )
+    last_seen: Utc | None = None  #: when one last saw it, before it was gone
+    max_score: float | None = None  #: over the surveys that saw it

@@ -10,12 +10,14 @@ from typing import get_args
 from sqlalchemy import delete, select
 from sqlalchemy.orm import Session, selectinload
 
-from service.catalog import blob_keys, tables
+from service.catalog import blob_keys, history, tables
 from service.catalog.blobs import Blobs
 from service.catalog.database import Database
 from service.catalog.jobs import new_job
 from service.catalog.records import (
     JobRecord,
+    ObjectKind,
+    ObjectRecord,
     Page,
     Position,
     ScanOutcome,
@@ -24,7 +26,7 @@ from service.catalog.records import (
     TileState,
 )
 from service.catalog.scans import checked_scan_ids, scans_in_order, write_outcomes
-from service.catalog.tables import Survey, SurveyTile, new_id, now
+from service.catalog.tables import Survey, SurveyObject, SurveyTile, new_id, now
 from service.catalog.versions import map_row, version_in_use
 from service.errors import Conflict, NotFound, NotReady
 
@@ -104,20 +106,39 @@ class Surveys:
             write_outcomes(row.scans, outcomes)
             row.updated = now()
 
-    def save_result(self, survey_id: str, *, tiles: Iterable[TileRecord], threshold: float) -> None:
-        """Record the tiles, replacing those of an earlier run; `jobs.succeed` makes the survey ready.
+    def save_result(
+        self,
+        survey_id: str,
+        *,
+        tiles: Iterable[TileRecord],
+        threshold: float,
+        objects: Iterable[ObjectRecord] | None = None,
+        moving: int | None = None,
+    ) -> None:
+        """Record tiles and objects, replacing those of an earlier run; `jobs.succeed` makes the survey ready.
 
-        `threshold` is the one that was used. The number of tiles in each state is counted here. Raises NotFound.
+        `threshold` is the one that was used. `objects` is None where the detector tells tiles alone; such a survey has
+        no say in what became of the objects of the map. `moving` counts what moved while the visit lasted. Tiles by
+        state and objects by kind are counted here. Raises NotFound, and ValueError for a number that is given twice.
         """
-        tiles = tuple(tiles)
+        tiles, things = tuple(tiles), tuple(objects or ())
+        _check_numbers(things)
+        told = bool(things) or (
+            objects is not None and any(tile.observed_share is not None for tile in tiles)
+        )
         by_state = Counter(tile.state for tile in tiles)
+        by_kind = Counter(thing.kind for thing in things)
         with self._database.write() as session:
-            row = _row(session, survey_id)
-            session.execute(delete(SurveyTile).where(SurveyTile.survey_id == survey_id))
-            session.add_all(_tile_row(survey_id, tile) for tile in tiles)
+            row = _locked(session, survey_id)
+            _replace_tiles(session, survey_id, tiles)
+            _replace_objects(session, survey_id, things)
             row.threshold = threshold
             row.counts = {"tiles": len(tiles), **{state: by_state[state] for state in get_args(TileState)}}
+            row.objects = {kind: by_kind[kind] for kind in get_args(ObjectKind)} if told else None
+            row.moving = moving
             row.updated = now()
+            if row.status == "ready":  # a step that was thought lost runs beside its second run, and is late
+                history.rewrite(session, row.map_id)
 
     def delete(self, survey_id: str) -> None:
         """Delete a survey with its job and files; the scans stay.
@@ -125,9 +146,11 @@ class Surveys:
         Raises NotFound, and Conflict while a version is built of it.
         """
         with self._database.write() as session:
-            row = _row(session, survey_id, lock=True)
+            row = _locked(session, survey_id)
             _check_unused(session, row)
             session.delete(row)
+            if row.status == "ready":
+                history.rewrite(session, row.map_id)
         self._blobs.delete_prefix(blob_keys.survey_folder(survey_id))
 
 
@@ -143,11 +166,39 @@ def _check_unused(session: Session, row: Survey) -> None:
         )
 
 
+def _locked(session: Session, survey_id: str) -> Survey:
+    """Return the row of a survey while nobody else works on its map. Raises NotFound."""
+    map_row(session, _row(session, survey_id).map_id, lock=True)
+    return _row(session, survey_id, lock=True)
+
+
 def _row(session: Session, survey_id: str, *, lock: bool = False) -> Survey:
     row = session.get(Survey, survey_id, with_for_update=lock)
     if row is None:
         raise NotFound(f"no survey {survey_id!r}; GET /maps/<id>/surveys lists those there are")
     return row
+
+
+def _check_numbers(objects: Sequence[ObjectRecord]) -> None:
+    """Raise ValueError where two objects of a survey have one number."""
+    if len({thing.number for thing in objects}) < len(objects):
+        raise ValueError(f"objects have one number each, these have {[thing.number for thing in objects]}")
+
+
+def _replace_tiles(session: Session, survey_id: str, tiles: Iterable[TileRecord]) -> None:
+    session.execute(delete(SurveyTile).where(SurveyTile.survey_id == survey_id))
+    session.add_all(_tile_row(survey_id, tile) for tile in tiles)
+
+
+def _replace_objects(session: Session, survey_id: str, objects: Iterable[ObjectRecord]) -> None:
+    """Write the objects of a survey; one that an earlier run gave the same number keeps its id in the map."""
+    query = select(SurveyObject.number, SurveyObject.object_id).where(SurveyObject.survey_id == survey_id)
+    ids = dict(session.execute(query).all())
+    session.execute(delete(SurveyObject).where(SurveyObject.survey_id == survey_id))
+    session.add_all(
+        SurveyObject(survey_id=survey_id, object_id=ids.get(thing.number), **thing.model_dump(mode="json"))
+        for thing in objects
+    )
 
 
 def _tile_row(survey_id: str, tile: TileRecord) -> SurveyTile:
@@ -162,5 +213,5 @@ def _tile_row(survey_id: str, tile: TileRecord) -> SurveyTile:
         p_unchanged=p_unchanged,
         p_changed=p_changed,
         p_different=p_different,
-        **tile.model_dump(include={"tile_id", "state", "score", "n_reference", "n_current"}),
+        **tile.model_dump(exclude={"tile_index", "bounds", "probabilities"}),
     )

@@ -74,6 +74,7 @@ class Base(DeclarativeBase):
         dict[str, float]: JSON(none_as_null=True),
         list[list[float]]: JSON(none_as_null=True),
         list[str]: JSON(none_as_null=True),
+        list[dict[str, Any]]: JSON(none_as_null=True),
         str: String(),
     }
 
@@ -173,6 +174,7 @@ class Map(Base):
     model: Mapped[str]
     settings: Mapped[dict[str, Any]]
     anchor: Mapped[dict[str, float] | None]
+    objects: Mapped[dict[str, int] | None]  # by status; NULL until a survey's end has counted them
     created: Mapped[datetime]
     updated: Mapped[datetime]
 
@@ -193,6 +195,8 @@ class Survey(Base):
     device_id: Mapped[str | None]
     captured_at: Mapped[datetime]
     counts: Mapped[dict[str, int]]
+    objects: Mapped[dict[str, int] | None]
+    moving: Mapped[int | None]
     job_id: Mapped[str]
     created: Mapped[datetime]
     updated: Mapped[datetime]
@@ -229,6 +233,10 @@ class SurveyTile(Base):
     p_different: Mapped[float | None]
     n_reference: Mapped[int]
     n_current: Mapped[int]
+    observed_share: Mapped[float | None]
+    appeared: Mapped[int | None]
+    disappeared: Mapped[int | None]
+    told_by: Mapped[str | None]  # the survey whose tile of this id is told in `tile_changes`
 
     __table_args__ = (Index(None, "survey_id", "state", "score"),)
 
@@ -248,6 +256,76 @@ class SurveyTile(Base):
         if self.p_unchanged is None:
             return None
         return self.p_unchanged, self.p_changed, self.p_different
+
+
+class TileChange(Base):
+    """A change of one tile over all surveys that saw it stay, told as the tile of one of them."""
+
+    __tablename__ = "tile_changes"
+
+    survey_id: Mapped[str] = mapped_column(ForeignKey("surveys.id", ondelete="CASCADE"), primary_key=True)
+    tile_id: Mapped[str] = mapped_column(primary_key=True)
+    first_seen: Mapped[datetime]
+    last_seen: Mapped[datetime]
+    max_score: Mapped[float]
+
+
+class SurveyObject(Base):
+    """A thing that a survey found changed: one sighting of an object of the map."""
+
+    __tablename__ = "survey_objects"
+
+    survey_id: Mapped[str] = mapped_column(ForeignKey("surveys.id", ondelete="CASCADE"), primary_key=True)
+    number: Mapped[int] = mapped_column(primary_key=True)
+    kind: Mapped[str]
+    now: Mapped[dict[str, Any] | None]
+    before: Mapped[dict[str, Any] | None]
+    motion: Mapped[dict[str, Any] | None]
+    probability: Mapped[float]
+    observed_share: Mapped[float]
+    scans_seen_through: Mapped[int]
+    object_id: Mapped[str | None] = mapped_column(index=True)  # no foreign key: `map_objects` is written anew
+
+
+class MapObject(Base):
+    """A changed thing of a map over all of its surveys, as far as its latest sighting and the latest look tell."""
+
+    __tablename__ = "map_objects"
+
+    object_id: Mapped[str] = mapped_column("id", primary_key=True)
+    map_id: Mapped[str] = mapped_column(ForeignKey("maps.id", ondelete="CASCADE"))
+    kind: Mapped[str]
+    status: Mapped[str]
+    last_known: Mapped[str]
+    transient: Mapped[bool]
+    first_seen: Mapped[datetime]
+    last_seen: Mapped[datetime]
+    last_looked: Mapped[datetime]
+    accepted_in_version: Mapped[int | None]
+    sightings: Mapped[int]
+    survey_id: Mapped[str]
+    number: Mapped[int]
+    probability: Mapped[float]
+    min_x: Mapped[float]
+    min_y: Mapped[float]
+    min_z: Mapped[float]
+    max_x: Mapped[float]
+    max_y: Mapped[float]
+    max_z: Mapped[float]
+    created: Mapped[datetime]
+
+    __table_args__ = (Index(None, "map_id", "first_seen", "id"),)
+
+
+class Acceptance(Base):
+    """What a version took over of a survey; it outlives both, for later surveys do not find it changed any more."""
+
+    __tablename__ = "acceptances"
+
+    map_id: Mapped[str] = mapped_column(ForeignKey("maps.id", ondelete="CASCADE"), primary_key=True)
+    version: Mapped[int] = mapped_column("number", primary_key=True)
+    tiles: Mapped[list[str]]
+    objects: Mapped[list[dict[str, Any]]]
 
 
 class Model(Base):

@@ -60,11 +60,14 @@ def changes(
     bbox: Annotated[str | None, typer.Option(help="4 or 6 numbers with commas, map frame, metres.")] = None,
     datetime: Annotated[str | None, typer.Option(help="Instant or interval, `..` for open.")] = None,
     min_score: Annotated[float | None, typer.Option("--min-score", help="Probability of change.")] = None,
+    repeats: Annotated[bool, typer.Option("--repeats", help="Once for each visit that saw it.")] = False,
     limit: Annotated[int, typer.Option(help="At most so many.")] = 100,
 ) -> None:
-    """The changed tiles of a map, newest first."""
+    """The changed tiles of a map, each change once, newest first."""
     terminal: Terminal = ctx.obj
     filters = {"survey": survey, "bbox": bbox, "datetime": datetime, "min_score": min_score, "limit": limit}
+    if repeats:
+        filters["repeats"] = True
     terminal.ask(lambda client: client.changes(map_id, **filters), _change_table)
 
 
@@ -100,7 +103,7 @@ def _whole(url: str) -> Callable[[Document], Group]:
 
 
 def _change_table(collection: Document) -> Group:
-    table = columns("tile", "state", "score", "center (m)", "survey", "captured")
+    table = columns("tile", "state", "score", "center (m)", "survey", "first seen", "last seen")
     features = collection["features"]
     for tile in (feature["properties"] for feature in features):
         table.add_row(
@@ -109,7 +112,8 @@ def _change_table(collection: Document) -> Group:
             number(tile.get("score"), 2),
             point(tile["center"]),
             tile["survey_id"],
-            tile.get("captured_at"),
+            tile.get("first_seen"),
+            tile.get("last_seen"),
         )
     total = collection.get("numberMatched", len(features))
     return Group(table, f"{len(features)} of {total} changed tiles")

@@ -42,6 +42,7 @@ def test_a_tile_is_a_prism_over_its_footprint_in_the_map_frame() -> None:
 def test_what_is_shared_by_all_tiles_of_a_survey_stands_in_each() -> None:
     properties = tile_feature(**TILE, survey=SURVEY)["properties"]
     own = {"tile_id", "tile_index", "center", "state", "score", "probabilities", "n_reference", "n_current"}
+    own |= {"observed_share", "appeared", "disappeared"}
     assert set(properties) == own | set(SURVEY)
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
@@ -23,7 +23,17 @@ from sqlalchemy import create_engine, make_url, text
 from service.api.app import create_app
 from service.api.http.dependencies import Services
 from service.catalog.catalog import Catalog
-from service.catalog.records import Bounds, ScanOutcome, ScanRecord, TileRecord, TileState
+from service.catalog.records import (
+    Bounds,
+    Motion,
+    ObjectKind,
+    ObjectRecord,
+    Place,
+    ScanOutcome,
+    ScanRecord,
+    TileRecord,
+    TileState,
+)
 from service.errors import QueueUnavailable
 from service.settings import Settings
 
@@ -153,7 +163,9 @@ def add_version(
     return job.job_id
 
 
-def tile(i: int, j: int, state: TileState = "changed", score: float = 0.9) -> TileRecord:
+def tile(
+    i: int, j: int, state: TileState = "changed", score: float = 0.9, *, observed_share: float | None = None
+) -> TileRecord:
     """A tile of 1.5 x 1.5 x 1.0 m with its corner at (1.5 i, 1.5 j, 0)."""
     seen = state != "unobserved"
     return TileRecord(
@@ -165,6 +177,49 @@ def tile(i: int, j: int, state: TileState = "changed", score: float = 0.9) -> Ti
         probabilities=(1 - score, score, 0) if seen else None,
         n_reference=900,
         n_current=800 if seen else 3,
+        observed_share=observed_share,
+    )
+
+
+def place(x: float, y: float, *, size: tuple[float, float, float] = (0.5, 0.5, 0.9), yaw: float = 0) -> Place:
+    """A box on the floor around (x, y), in one of the tiles of `tile`."""
+    (dx, dy, height), volume = size, size[0] * size[1] * size[2]
+    corners = ((-dx, -dy), (dx, -dy), (dx, dy), (-dx, dy))
+    return Place(
+        center=(x, y, height / 2),
+        size=size,
+        yaw=yaw,
+        footprint=tuple((x + a / 2, y + b / 2) for a, b in corners),
+        height_over_floor=0.0,
+        volume=volume,
+        voxels=round(volume / 0.05**3),
+        points=4 * round(volume / 0.05**3),
+        tiles=(f"tile_{int(x // 1.5):03}_{int(y // 1.5):03}_000",),
+    )
+
+
+def thing(
+    number: int,
+    *,
+    now: Place | None = None,
+    before: Place | None = None,
+    probability: float = 0.9,
+) -> ObjectRecord:
+    """An object that appeared, disappeared or moved, as its places say."""
+    kind: ObjectKind = "moved" if now and before else "appeared" if now else "disappeared"
+    motion = None
+    if now is not None and before is not None:
+        dx, dy, dz = (a - b for a, b in zip(now.center, before.center, strict=True))
+        motion = Motion(translation=(dx, dy, dz), yaw=now.yaw - before.yaw)
+    return ObjectRecord(
+        number=number,
+        kind=kind,
+        now=now,
+        before=before,
+        motion=motion,
+        probability=probability,
+        observed_share=0.8,
+        scans_seen_through=3,
     )
 
 
@@ -175,6 +230,8 @@ def add_survey(
     map_id: str = "lobby",
     captured_at: datetime = NOON,
     ready: bool = True,
+    objects: Sequence[ObjectRecord] | None = None,
+    moving: int | None = None,
 ) -> tuple[str, str]:
     """A survey of one scan, done or not; its id and its job's."""
     scan = add_scan(catalog, f"visit-{captured_at.isoformat()}")
@@ -182,6 +239,8 @@ def add_survey(
         map_id, scan_ids=[scan.scan_id], model=MODEL, captured_at=captured_at
     )
     if ready:
-        catalog.surveys.save_result(record.survey_id, tiles=tiles or [], threshold=0.5)
+        catalog.surveys.save_result(
+            record.survey_id, tiles=tiles or [], threshold=0.5, objects=objects, moving=moving
+        )
         catalog.jobs.succeed(job.job_id)
     return record.survey_id, job.job_id

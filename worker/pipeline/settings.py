@@ -20,6 +20,9 @@ class PipelineSettings(StrictModel):
     mapping: MappingSettings = Field(default_factory=MappingSettings)
     tiling: TilingSettings = Field(default_factory=TilingSettings)
     max_scan_points: int = Field(50_000_000, gt=0)
+    alarms_per_survey: float = Field(
+        0.1, gt=0, description="false objects in a survey of a place without any change, in the mean"
+    )
 
     def for_model(self, needs: Preprocessing) -> PipelineSettings:
         """Return the same settings with what is tied to a model's weights put in its place."""

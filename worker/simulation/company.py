@@ -138,13 +138,3 @@ class Carrier:
         return Caster(
             self.mesh.vertices, self.mesh.triangles, np.full(len(self.mesh.triangles), CARRIER_ID, np.int32)
         )
-
-
-def nearest(first: Hits, second: Hits) -> Hits:
-    """Return of two answers to the same rays (N,) the nearer one of each."""
-    nearer = second.ranges < first.ranges
-    return Hits(
-        ranges=np.where(nearer, second.ranges, first.ranges),
-        cosines=np.where(nearer, second.cosines, first.cosines),
-        object_ids=np.where(nearer, second.object_ids, first.object_ids),
-    )

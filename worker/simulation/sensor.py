@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from worker.cloud.types import Floats, Matrix4, Points
-from worker.simulation.company import Carrier, Walker, nearest
-from worker.simulation.scenes.caster import Hits
+from worker.simulation.company import Carrier, Walker
+from worker.simulation.scenes.caster import Hits, chosen, nearest
 from worker.simulation.scenes.scene import Scene
 
 TURN = 360.0  #: degrees
@@ -42,6 +42,9 @@ class SensorModel:
     faint_range: float = 10.0  #: metres, `faint_share` of the returns arrives here; the fall is linear
     faint_share: float = 0.2
     loss: float = 0.06  #: share lost at random
+    glass_share: float = 0.05  #: of the pulses that a pane sends back, from any direction
+    glass_glint: float = 0.5  #: share that it sends back besides, met within `glint_deg` of its normal
+    glint_deg: float = 10.0
     grazing_deg: float = 75.0  #: degrees from the normal from which returns grow fewer, down to none at 90
 
 
@@ -97,6 +100,7 @@ def scan(
     edge = _perturbed(fired, sensor.beam_deg, rng)
     both = np.concatenate([fired, edge])  # (2N, 3)
     hit = _first_hits(scene, world_from_sensor, both, duration_s, walkers, carrier)
+    hit = _past_gloss(scene, world_from_sensor, both, hit, sensor, rng)
     count = len(reported)
     first, other = np.split(np.minimum(hit.ranges, NOWHERE), 2)
     mixed = _mixed(first, other, hit.cosines[:count], sensor, rng)
@@ -142,14 +146,57 @@ def _first_hits(
     walkers: Sequence[Walker],
     carrier: Carrier | None,
 ) -> Hits:
-    """Cast rays (2N, 3), sensor frame, the second half fired at the same times as the first."""
+    """Cast rays (2N, 3), sensor frame, the second half fired at the same times as the first; glass is air."""
     origin = world_from_sensor[:3, 3]
     turned = rays @ world_from_sensor[:3, :3].T
-    hits = scene.caster.cast(origin, turned)
+    hits = scene.opaque.cast(origin, turned)
     seconds = np.tile(np.linspace(0.0, duration_s, len(rays) // 2, endpoint=False), 2)
     for walker in walkers:
         hits = nearest(hits, walker.cast(origin, turned, seconds))
     return hits if carrier is None else nearest(hits, carrier.cast(rays))
+
+
+def _past_gloss(
+    scene: Scene,
+    world_from_sensor: Matrix4,
+    rays: Floats,
+    hits: Hits,
+    sensor: SensorModel,
+    rng: np.random.Generator,
+) -> Hits:
+    """Turn the rays (2N, 3), sensor frame, that met a mirror, and send a few back from panes of glass.
+
+    What a mirror shows lies behind it, as far as the whole way was, under the mirror's id. A ray is turned once; what
+    it meets then sends it back, be it glass or another mirror. Scenes without either draw no random number here.
+    """
+    if not scene.mirror_ids and scene.glass is None:
+        return hits
+    origin, turned = world_from_sensor[:3, 3], rays @ world_from_sensor[:3, :3].T
+    first = hits.ranges
+    if scene.mirror_ids:
+        hits = _mirrored(scene, origin, turned, hits)
+    if scene.glass is not None:
+        panes = scene.glass.cast(origin, turned)
+        glint = panes.cosines > np.cos(np.radians(sensor.glint_deg))
+        chance = sensor.glass_share + sensor.glass_glint * glint
+        back = np.tile(rng.random(len(rays) // 2), 2) < chance
+        hits = chosen(back & (panes.ranges < first), panes, hits)
+    return hits
+
+
+def _mirrored(scene: Scene, origin: Floats, rays: Floats, hits: Hits) -> Hits:
+    """Send the rays (N, 3), world frame, that met a mirror on to what it shows."""
+    met = np.flatnonzero(np.isin(hits.object_ids, scene.mirror_ids))
+    if hits.normals is None or not len(met):
+        return hits
+    normals, fired = hits.normals[met], rays[met]
+    turned = fired - 2 * np.einsum("ij,ij->i", fired, normals)[:, None] * normals
+    places = origin + hits.ranges[met, None] * fired + 1e-4 * turned
+    shown = scene.opaque.cast(places, turned)
+    ranges, cosines = hits.ranges.copy(), hits.cosines.copy()
+    ranges[met] += shown.ranges
+    cosines[met] = shown.cosines
+    return Hits(ranges=ranges, cosines=cosines, object_ids=hits.object_ids, normals=hits.normals)
 
 
 def _perturbed(rays: Floats, sigma_deg: float, rng: np.random.Generator) -> Floats:

@@ -66,7 +66,7 @@ def changed_tiles(
     cells = np.zeros((*grid.shape, len(KINDS)), dtype=np.int32)
     old = {item.name: item for item in before.objects}
     new = {item.name: item for item in after.objects}
-    edited = {name for name in old.keys() & new.keys() if not _same(old[name], new[name])}
+    edited = {name for name in old.keys() & new.keys() if not same_place(old[name], new[name])}
     for kind, names, own, other, sensors in (
         ("remove", old.keys() - new.keys(), before, after, sensors_before),
         ("move", edited, before, after, sensors_before),
@@ -136,5 +136,6 @@ def _reached(points: Floats, scene: Scene, sensors: Sequence[Matrix4]) -> Bools:
     return reached
 
 
-def _same(a: SceneObject, b: SceneObject) -> bool:
+def same_place(a: SceneObject, b: SceneObject) -> bool:
+    """Tell whether two states of a thing are the same solid at the same place."""
     return a.mesh.vertices.shape == b.mesh.vertices.shape and np.allclose(a.mesh.vertices, b.mesh.vertices)

@@ -12,6 +12,7 @@ from fastapi.testclient import TestClient
 from service.api.features import TileCollection
 from service.api.http.paging import encoded
 from service.catalog.catalog import Catalog
+from service.catalog.records import TileState
 from tests.support.samples import (
     NOON,
     RememberingQueue,
@@ -25,7 +26,7 @@ from tests.support.samples import (
 )
 
 Visited = tuple[TestClient, dict[str, str]]  #: a service, and the ids of the visits by month
-MARCH, APRIL, MAY = (NOON + timedelta(days=days) for days in (0, 31, 61))
+MARCH, APRIL, MAY, JUNE = (NOON + timedelta(days=days) for days in (0, 31, 61, 91))
 
 
 def add_visits(catalog: Catalog) -> dict[str, str]:
@@ -155,6 +156,100 @@ def test_pages_hold_every_change_once_while_new_ones_arrive(
             add_survey(catalog, [tile(9, 9)], captured_at=MAY + timedelta(days=2))
     assert sizes == [3, 3, 3, 1]
     assert len(set(seen)) == len(seen) == 10
+
+
+def add_stay(catalog: Catalog) -> list[str]:
+    """A tile that is changed in March and April, as it was in May, and changed again in June; ids of the visits."""
+    add_map(catalog)
+    states: list[tuple[TileState, float]] = [
+        ("changed", 0.6),
+        ("changed", 0.9),
+        ("unchanged", 0.1),
+        ("changed", 0.7),
+    ]
+    return [
+        add_survey(catalog, [tile(0, 0, *state)], captured_at=month)[0]
+        for state, month in zip(states, (MARCH, APRIL, MAY, JUNE), strict=True)
+    ]
+
+
+def told(client: TestClient, **asked: str) -> list[tuple[str, str, str, float]]:
+    """Survey, days of first and last sight, largest score of each feature."""
+    features = client.get("/maps/lobby/changes", params=asked).json()["features"]
+    return [
+        (p["survey_id"], p["first_seen"][5:10], p["last_seen"][5:10], p["max_score"])
+        for p in (feature["properties"] for feature in features)
+    ]
+
+
+def test_a_change_that_stays_is_told_once_and_again_when_it_returns(
+    client: TestClient, catalog: Catalog
+) -> None:
+    march, april, _, june = add_stay(catalog)
+    again, stayed = (june, "05-31", "05-31", 0.7), (march, "03-01", "04-01", 0.9)
+    assert told(client) == [again, stayed]
+    assert told(client, repeats="true") == [again, (april, *stayed[1:]), stayed]
+    assert told(client, survey=april) == [(april, *stayed[1:])]  # though March told it first
+
+
+@pytest.mark.parametrize(
+    ("asked", "expected"),
+    [
+        ({"datetime": "2026-03-15T00:00:00Z/2026-04-15T00:00:00Z"}, []),  # it was there before
+        ({"datetime": "2026-03-15T00:00:00Z/2026-04-15T00:00:00Z", "repeats": "true"}, [0.9]),
+        ({"datetime": "../2026-04-15T00:00:00Z"}, [0.6]),
+        ({"min_score": "0.8"}, [0.6]),  # the April visit was that sure
+        ({"min_score": "0.8", "repeats": "true"}, [0.9]),
+    ],
+)
+def test_a_change_is_asked_for_by_when_it_was_first_seen_and_by_its_surest_visit(
+    client: TestClient, catalog: Catalog, asked: dict[str, str], expected: list[float]
+) -> None:
+    add_stay(catalog)
+    assert [score for _, score in found(client, **asked)] == expected
+
+
+def test_a_visit_that_comes_late_makes_a_change_older_and_no_second_one(
+    client: TestClient, catalog: Catalog
+) -> None:
+    add_map(catalog)
+    april, _ = add_survey(catalog, [tile(0, 0, "changed", 0.9)], captured_at=APRIL)
+    before = client.get("/maps/lobby/changes").json()["features"]
+    add_survey(catalog, [tile(0, 0, "changed", 0.6)], captured_at=MARCH)
+    after = client.get("/maps/lobby/changes").json()["features"]
+    assert [feature["id"] for feature in after] == [feature["id"] for feature in before]
+    assert told(client) == [(april, "03-01", "04-01", 0.9)]
+    assert told(client, datetime="2026-03-01T12:00:00Z") == told(client)
+
+
+def test_a_change_whose_first_visit_is_deleted_is_told_by_the_next(
+    client: TestClient, catalog: Catalog
+) -> None:
+    march, april, may, june = add_stay(catalog)
+    catalog.surveys.delete(march)
+    assert told(client) == [(june, "05-31", "05-31", 0.7), (april, "04-01", "04-01", 0.9)]
+    catalog.surveys.delete(may)
+    assert told(client) == [(april, "04-01", "05-31", 0.9)]
+
+
+def test_pages_of_changes_that_are_told_once_go_by_when_they_were_first_seen(
+    client: TestClient, catalog: Catalog
+) -> None:
+    add_map(catalog)
+    add_survey(catalog, [tile(i, 0) for i in range(3)], captured_at=APRIL)
+    add_survey(catalog, [tile(i, 0) for i in (1, 2, 3)], captured_at=MARCH)  # late: two of them are older
+    add_survey(catalog, [tile(i, 0) for i in range(4)], captured_at=MAY)
+    url: str | None = "/maps/lobby/changes?limit=1"
+    seen = []
+    while url:
+        body = client.get(url).json()
+        assert (body["numberMatched"], body["numberReturned"]) == (4, 1)
+        seen += [feature["properties"] for feature in body["features"]]
+        url = next((link["href"] for link in body["links"] if link["rel"] == "next"), None)
+    assert [(p["tile_id"][5:8], p["first_seen"][5:10]) for p in seen] in (
+        [("000", "04-01"), ("001", "03-01"), ("002", "03-01"), ("003", "03-01")],
+        [("000", "04-01"), ("003", "03-01"), ("001", "03-01"), ("002", "03-01")],
+    )
 
 
 def test_only_a_survey_that_is_done_and_of_this_map_can_be_named(

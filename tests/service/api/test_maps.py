@@ -32,7 +32,7 @@ def test_a_map_of_known_scans_is_accepted_and_its_job_submitted(
     found = client.get("/maps/lobby").json()
     assert (found["status"], found["name"], found["model"]) == ("building", "Lobby", MODEL)
     assert (found["version"], found["registration"], found["anchor"]) == (1, None, None)
-    assert found["settings"] == {"registration": {"min_fitness": 0.6}}
+    assert found["settings"] == {"registration": {"min_fitness": 0.6}, "alarms_per_survey": 0.1}
     assert found["scans"] == [
         {
             "scan_id": scan.scan_id,

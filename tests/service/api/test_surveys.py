@@ -62,7 +62,11 @@ def test_when_the_queue_is_down_no_survey_stays_recorded(
 
 def test_the_tiles_are_features_in_the_frame_of_the_map(client: TestClient, catalog: Catalog) -> None:
     add_map(catalog)
-    tiles = [tile(1, 2, "changed", 0.93), tile(0, 0, "unobserved"), tile(0, 1, "unchanged", 0.1)]
+    tiles = [
+        tile(1, 2, "changed", 0.93, observed_share=0.75),
+        tile(0, 0, "unobserved"),
+        tile(0, 1, "unchanged", 0.1),
+    ]
     survey_id, _ = add_survey(catalog, tiles)
     answer = client.get(f"/surveys/{survey_id}/tiles")
     assert answer.headers["content-type"] == "application/geo+json"
@@ -96,12 +100,19 @@ def test_the_tiles_are_features_in_the_frame_of_the_map(client: TestClient, cata
         "threshold": 0.5,
         "n_reference": 900,
         "n_current": 800,
+        "observed_share": 0.75,
+        "appeared": None,
+        "disappeared": None,
         "map_id": "lobby",
         "map_version": 1,
         "survey_id": survey_id,
         "model": "spicd-net/1",
         "captured_at": "2026-03-01T12:00:00Z",
+        "first_seen": "2026-03-01T12:00:00Z",
+        "last_seen": "2026-03-01T12:00:00Z",
+        "max_score": 0.93,
     }
+    assert unobserved["properties"]["first_seen"] is None
     assert unobserved["properties"]["state"] == "unobserved"
     assert unobserved["properties"]["score"] is None
 

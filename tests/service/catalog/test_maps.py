@@ -11,9 +11,28 @@ from pydantic import ValidationError
 
 from service.catalog import blob_keys
 from service.catalog.catalog import Catalog
-from service.catalog.records import Bounds, ScanOutcome, ScanRecord, TileRecord, TileState
+from service.catalog.records import (
+    Bounds,
+    ObjectRecord,
+    Place,
+    ScanOutcome,
+    ScanRecord,
+    TileRecord,
+    TileState,
+)
 from service.errors import BadRequest, Conflict, NotFound, NotReady
-from tests.support.samples import IDENTITY, MODEL, NOON, add_map, add_scan, add_survey, ply, tile
+from tests.support.samples import (
+    IDENTITY,
+    MODEL,
+    NOON,
+    add_map,
+    add_scan,
+    add_survey,
+    place,
+    ply,
+    thing,
+    tile,
+)
 
 
 def accepted(scan_id: str, fitness: float) -> ScanOutcome:
@@ -99,6 +118,63 @@ def test_a_survey_saved_twice_has_its_tiles_once_and_counts_them(catalog: Catalo
         "inconsistent": 0,
         "unobserved": 1,
     }
+
+
+def test_a_survey_counts_its_objects_by_kind_and_what_moved_meanwhile(catalog: Catalog) -> None:
+    add_map(catalog)
+    survey_id, _ = add_survey(catalog, ready=False)
+    assert (catalog.surveys.get(survey_id).objects, catalog.surveys.get(survey_id).moving) == (None, None)
+    tiles = [tile(0, 0, observed_share=0.9)]
+    objects = [
+        thing(1, now=place(1, 1)),
+        thing(2, now=place(4, 1), before=place(1, 4)),
+        thing(3, now=place(9, 9)),
+    ]
+    catalog.surveys.save_result(survey_id, tiles=tiles, threshold=0.5, objects=objects, moving=2)
+    found = catalog.surveys.get(survey_id)
+    assert found.objects == {"appeared": 2, "disappeared": 0, "moved": 1}
+    assert found.moving == 2
+    catalog.surveys.save_result(survey_id, tiles=tiles, threshold=0.5, objects=[], moving=0)
+    found = catalog.surveys.get(survey_id)
+    assert (found.objects, found.moving) == ({"appeared": 0, "disappeared": 0, "moved": 0}, 0)
+
+
+@pytest.mark.parametrize("objects", [None, []])
+def test_a_survey_of_a_detector_of_tiles_tells_no_objects_rather_than_none_found(
+    catalog: Catalog, objects: Any
+) -> None:
+    add_map(catalog)
+    survey_id, _ = add_survey(catalog, [tile(0, 0)], objects=objects)
+    assert catalog.surveys.get(survey_id).objects is None
+
+
+def test_objects_of_one_survey_have_a_number_each(catalog: Catalog) -> None:
+    add_map(catalog)
+    with pytest.raises(ValueError, match=r"\[1, 1\]"):
+        add_survey(catalog, objects=[thing(1, now=place(1, 1)), thing(1, now=place(4, 1))])
+
+
+def test_what_a_survey_says_of_its_tiles_is_kept(catalog: Catalog) -> None:
+    add_map(catalog)
+    told = tile(0, 0).model_copy(update={"observed_share": 0.75, "appeared": 41, "disappeared": 7})
+    survey_id, _ = add_survey(catalog, [told])
+    assert [change.tile for change in catalog.changes.of_survey(survey_id)] == [told]
+
+
+@pytest.mark.parametrize(
+    "ring", [((0, 0), (2, 0), (2, 1)), ((0, 0), (2, 1), (2, 0)), ((0, 0), (2, 0), (2, 1), (0, 0))]
+)
+def test_an_outline_is_kept_open_and_counter_clockwise(ring: Any) -> None:
+    kept = Place.model_validate({**place(1, 1).model_dump(), "footprint": ring}).footprint
+    doubled = (*kept, *kept)
+    assert ((0, 0), (2, 0), (2, 1)) in {doubled[start : start + 3] for start in range(3)}
+
+
+def test_an_object_has_the_places_of_its_kind() -> None:
+    moved = thing(1, now=place(1, 1), before=place(4, 1)).model_dump()
+    for wrong in ({"now": None}, {"before": None}, {"motion": None}, {"kind": "appeared"}):
+        with pytest.raises(ValidationError, match="does not go with"):
+            ObjectRecord.model_validate(moved | wrong)
 
 
 def test_a_survey_is_as_late_as_its_latest_scan(catalog: Catalog) -> None:

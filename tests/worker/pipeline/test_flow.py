@@ -229,7 +229,7 @@ def test_a_detector_gets_both_clouds_and_the_scans_behind_them_but_loads_none(to
     assert comparison.grid == reference.grid
     assert comparison.tiles.tolist() == told.built.tiles.indices.tolist()
     assert comparison.observed.tolist() == told.survey.comparison.observed.tolist()
-    assert comparison.reference.evidence is None
+    assert comparison.reference.seen is None
 
 
 def test_a_survey_of_another_place_is_refused_with_every_scans_numbers(told: Told, tmp_path: Path) -> None:

@@ -1,1 +1,1 @@
-"""What a survey leaves: states of tiles, coloured cloud, picture, manifest."""
+"""What a survey leaves: states of tiles, objects, coloured cloud, picture, manifest."""

@@ -8,7 +8,7 @@ import numpy as np
 import open3d as o3d
 from numpy.typing import NDArray
 
-from worker.cloud.types import Floats
+from worker.cloud.types import Bools, Floats
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
@@ -18,6 +18,7 @@ class Hits:
     ranges: Floats  #: (N,) metres, inf where they met nothing
     cosines: Floats  #: (N,) cosine of the angle between ray and normal; 0 where they met nothing
     object_ids: NDArray[np.int32]  #: (N,) 0 where they met nothing
+    normals: Floats | None = None  #: (N, 3) unit length, of the triangles; any where they met nothing
 
 
 class Caster:
@@ -41,11 +42,13 @@ class Caster:
         hit = np.isfinite(ranges)
         # Open3D marks a miss with the largest uint32, which is no index.
         triangle = np.where(hit, answer["primitive_ids"].numpy(), 0).astype(np.int64)
-        cosines = np.abs(np.einsum("ij,ij->i", answer["primitive_normals"].numpy(), packed[:, 3:]))
+        normals = answer["primitive_normals"].numpy()
+        cosines = np.abs(np.einsum("ij,ij->i", normals, packed[:, 3:]))
         return Hits(
             ranges=ranges,
             cosines=np.where(hit, cosines, 0.0).astype(np.float64),
             object_ids=np.where(hit, self._owners[triangle], 0).astype(np.int32),
+            normals=normals,
         )
 
     def distances(self, points: Floats) -> Floats:
@@ -53,3 +56,18 @@ class Caster:
         query = o3d.core.Tensor.from_numpy(np.ascontiguousarray(points, dtype=np.float32))
         distances: Floats = self._scene.compute_distance(query).numpy().astype(np.float64)
         return distances
+
+
+def nearest(first: Hits, second: Hits) -> Hits:
+    """Return of two answers to the same rays (N,) the nearer one of each; the normals are the first's."""
+    return chosen(second.ranges < first.ranges, second, first)
+
+
+def chosen(where: Bools, these: Hits, others: Hits) -> Hits:
+    """Return `these` answers where asked for (N,), and the others elsewhere; the normals are the others'."""
+    return Hits(
+        ranges=np.where(where, these.ranges, others.ranges),
+        cosines=np.where(where, these.cosines, others.cosines),
+        object_ids=np.where(where, these.object_ids, others.object_ids),
+        normals=others.normals,
+    )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
@@ -13,6 +14,8 @@ from worker.simulation.scenes.caster import Caster
 from worker.simulation.scenes.mesh import Mesh, rigid
 
 ChangeKind = Literal["add", "remove", "move"]
+#: `matt` sends a pulse back, `glass` lets most of them through, a `mirror` turns them to what it shows
+Surface = Literal["matt", "glass", "mirror"]
 
 TOUCHING = 0.005  #: metres; boxes that meet by less than this stand beside each other
 
@@ -25,6 +28,7 @@ class SceneObject:
     object_id: int  #: unique in its scene, kept through edits, never used again
     mesh: Mesh  #: world frame
     fixed: bool = False  #: part of the building: never edited by chance
+    surface: Surface = "matt"
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -77,11 +81,25 @@ class Scene:
     @cached_property
     def caster(self) -> Caster:
         """Built once: it costs more than a scan, and every scan uses it again."""
-        starts = np.cumsum([0, *(len(item.mesh.vertices) for item in self.objects)])
-        triangles = [item.mesh.triangles + start for item, start in zip(self.objects, starts, strict=False)]
-        owners = [np.full(len(item.mesh.triangles), item.object_id, dtype=np.int32) for item in self.objects]
-        vertices = np.concatenate([item.mesh.vertices for item in self.objects])
-        return Caster(vertices, np.concatenate(triangles).astype(np.int32), np.concatenate(owners))
+        return _caster_of(self.objects)
+
+    @cached_property
+    def opaque(self) -> Caster:
+        """Of all but glass; the same as `caster` where there is none."""
+        if self.glass is None:
+            return self.caster
+        return _caster_of([item for item in self.objects if item.surface != "glass"])
+
+    @cached_property
+    def glass(self) -> Caster | None:
+        """Of the panes alone; None where there is none."""
+        panes = [item for item in self.objects if item.surface == "glass"]
+        return _caster_of(panes) if panes else None
+
+    @cached_property
+    def mirror_ids(self) -> tuple[int, ...]:
+        """The object ids of the mirrors."""
+        return tuple(item.object_id for item in self.objects if item.surface == "mirror")
 
     def placed(self, target_from_world: Matrix4) -> Scene:
         """Return the same solids in another frame; rooms and route, which know no turn, are left out."""
@@ -96,11 +114,15 @@ class Scene:
                 return False
         return True
 
-    def with_added(self, name: str, mesh: Mesh) -> tuple[Scene, Change]:
+    def with_added(
+        self, name: str, mesh: Mesh, *, fixed: bool = False, surface: Surface = "matt"
+    ) -> tuple[Scene, Change]:
         """Return a new scene with one solid more. Raises ValueError where the name is taken."""
         if any(item.name == name for item in self.objects):
             raise ValueError(f"scene {self.name} already has {name!r}")
-        added = SceneObject(name=name, object_id=1 + self._highest_id, mesh=mesh)
+        added = SceneObject(
+            name=name, object_id=1 + self._highest_id, mesh=mesh, fixed=fixed, surface=surface
+        )
         scene = replace(self, objects=(*self.objects, added))
         return scene, Change(kind="add", name=name, before=None, after=mesh.bounds)
 
@@ -129,6 +151,14 @@ class Scene:
     def _highest_id(self) -> int:
         # An id is never given twice, so that the labels of two visits cannot be mixed up.
         return max([self.used_id, *(item.object_id for item in self.objects)])
+
+
+def _caster_of(objects: Sequence[SceneObject]) -> Caster:
+    starts = np.cumsum([0, *(len(item.mesh.vertices) for item in objects)])
+    triangles = [item.mesh.triangles + start for item, start in zip(objects, starts, strict=False)]
+    owners = [np.full(len(item.mesh.triangles), item.object_id, dtype=np.int32) for item in objects]
+    vertices = np.concatenate([item.mesh.vertices for item in objects])
+    return Caster(vertices, np.concatenate(triangles).astype(np.int32), np.concatenate(owners))
 
 
 def _overlap(bounds: Floats, low: Floats, high: Floats) -> bool:

@@ -1,0 +1,297 @@
+"""What holds over all surveys of a map: tile changes told once, objects, and what versions took over.
+
+It is derived from the surveys that are ready, and written anew whenever one of them comes, changes or goes, in the
+transaction that does so and with the row of the map locked: so it is the same whatever the order in which they end.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from typing import Any, get_args
+
+from sqlalchemy import ColumnElement, Select, and_, delete, exists, select, tuple_, update
+from sqlalchemy.orm import Session
+
+from service.catalog import tables
+from service.catalog.database import Database
+from service.catalog.records import ObjectRecord, ObjectStatus, Place
+from service.catalog.stays import Look, Stay, stays
+from service.catalog.tables import (
+    Acceptance,
+    MapObject,
+    Survey,
+    SurveyObject,
+    SurveyTile,
+    TileChange,
+    new_id,
+    now,
+)
+from service.catalog.tracking import Accepted, Part, Parts, Side, Sighting, Track, Visit, track_objects
+
+_MANY = 500  #: tiles; beyond that it is cheaper to read all than to name them
+
+
+def note(session: Session, ready: tables.MapVersion | Survey | tables.Model) -> None:
+    """Take in that something of a map became ready; the caller has locked the map."""
+    if isinstance(ready, tables.MapVersion) and ready.survey_id is not None:
+        _accept(session, ready, ready.survey_id)
+        rewrite(session, ready.map_id)
+    elif isinstance(ready, Survey):
+        rewrite(session, ready.map_id)
+
+
+def rewrite(session: Session, map_id: str) -> None:
+    """Write tile changes, objects and their counts of a map anew; the caller has locked the map."""
+    session.flush()
+    accepted = list(session.scalars(select(Acceptance).where(Acceptance.map_id == map_id)))
+    _rewrite_tiles(session, map_id, accepted)
+    tracks = _rewrite_objects(session, map_id, accepted)
+    told = session.scalar(select(exists().where(_ready(map_id), Survey.objects.is_not(None))))
+    counts = Counter(track.status for track in tracks)
+    row = session.get_one(tables.Map, map_id)
+    row.objects = {status: counts[status] for status in get_args(ObjectStatus)} if told else {}
+
+
+def catch_up(database: Database) -> None:
+    """Write it for maps whose surveys ended under a release that did not."""
+    waiting = select(tables.Map.map_id).where(tables.Map.objects.is_(None))
+    with database.read() as session:
+        map_ids = list(session.scalars(waiting))
+    for map_id in map_ids:
+        with database.write() as session:
+            row = session.get(tables.Map, map_id, with_for_update=True)
+            if row is not None and row.objects is None:
+                rewrite(session, map_id)
+
+
+def _ready(map_id: str) -> ColumnElement[bool]:
+    return and_(Survey.map_id == map_id, Survey.status == "ready")
+
+
+def _accept(session: Session, version: tables.MapVersion, survey_id: str) -> None:
+    """Keep what a version took over of a survey, for either may be deleted later."""
+    tiles = select(SurveyTile.tile_id).where(SurveyTile.survey_id == survey_id, SurveyTile.state == "changed")
+    objects = select(SurveyObject).where(SurveyObject.survey_id == survey_id).order_by(SurveyObject.number)
+    session.add(
+        Acceptance(
+            map_id=version.map_id,
+            version=version.version,
+            tiles=list(session.scalars(tiles.order_by(SurveyTile.tile_id))),
+            objects=[ObjectRecord.of_row(row).model_dump(mode="json") for row in session.scalars(objects)],
+        )
+    )
+
+
+# tiles
+
+
+def _rewrite_tiles(session: Session, map_id: str, accepted: Sequence[Acceptance]) -> None:
+    """Write the changes of every tile that ever changed, and which of them each changed tile belongs to."""
+    accepted_in: dict[str, list[int]] = {}
+    for taken in accepted:
+        for tile_id in taken.tiles:
+            accepted_in.setdefault(tile_id, []).append(taken.version)
+    before = {(row.survey_id, row.tile_id): row for row in session.scalars(_changes_of(map_id))}
+    told_by: dict[str, set[str]] = {}
+    for survey_id, tile_id in before:
+        told_by.setdefault(tile_id, set()).add(survey_id)
+    looks, told = _looks(session, map_id)
+    after: dict[tuple[str, str], Stay] = {}
+    links: list[dict[str, Any]] = []
+    for tile_id, of_tile in looks.items():
+        found = stays(of_tile, accepted_in=accepted_in.get(tile_id, ()), told_by=told_by.get(tile_id, ()))
+        for stay in found:
+            after[stay.told_by, tile_id] = stay
+            links += [
+                {"survey_id": survey_id, "tile_id": tile_id, "told_by": stay.told_by}
+                for survey_id in stay.survey_ids
+                if told[survey_id, tile_id] != stay.told_by
+            ]
+    if links:
+        session.execute(update(SurveyTile), links)
+    _write_changes(session, before, after)
+
+
+def _changes_of(map_id: str) -> Select[TileChange]:
+    return (
+        select(TileChange)
+        .join(Survey, Survey.survey_id == TileChange.survey_id)
+        .where(Survey.map_id == map_id)
+    )
+
+
+def _looks(session: Session, map_id: str) -> tuple[dict[str, list[Look]], dict[tuple[str, str], str | None]]:
+    """Return the looks at each tile that ever changed, and by (survey, tile) what each changed one is told by now."""
+    ever = select(SurveyTile.tile_id).join(Survey, Survey.survey_id == SurveyTile.survey_id)
+    ever = ever.where(_ready(map_id), SurveyTile.state == "changed")
+    query = select(
+        SurveyTile.tile_id,
+        SurveyTile.survey_id,
+        Survey.captured_at,
+        Survey.map_version,
+        SurveyTile.state,
+        SurveyTile.score,
+        SurveyTile.told_by,
+    ).join(Survey, Survey.survey_id == SurveyTile.survey_id)
+    query = query.where(
+        _ready(map_id), SurveyTile.state.in_(("changed", "unchanged")), SurveyTile.tile_id.in_(ever)
+    )
+    looks: dict[str, list[Look]] = {}
+    told: dict[tuple[str, str], str | None] = {}
+    for tile_id, survey_id, captured_at, map_version, state, score, told_by in session.execute(query):
+        changed = state == "changed"
+        look = Look(
+            survey_id=survey_id,
+            captured_at=captured_at,
+            map_version=map_version,
+            score=score if changed else None,
+        )
+        looks.setdefault(tile_id, []).append(look)
+        if changed:
+            told[survey_id, tile_id] = told_by
+    return looks, told
+
+
+def _write_changes(
+    session: Session,
+    before: Mapping[tuple[str, str], TileChange],
+    after: Mapping[tuple[str, str], Stay],
+) -> None:
+    gone = [key for key in before if key not in after]
+    if gone:
+        session.execute(delete(TileChange).where(tuple_(TileChange.survey_id, TileChange.tile_id).in_(gone)))
+    for (survey_id, tile_id), stay in after.items():
+        row = before.get((survey_id, tile_id))
+        if row is None:
+            row = TileChange(survey_id=survey_id, tile_id=tile_id)
+            session.add(row)
+        row.first_seen, row.last_seen, row.max_score = stay.first_seen, stay.last_seen, stay.max_score
+
+
+# objects
+
+
+def _rewrite_objects(session: Session, map_id: str, accepted: Sequence[Acceptance]) -> tuple[Track, ...]:
+    """Write which object each sighting is of, and what became of each object."""
+    sightings = _sightings(session, map_id)
+    visits = _visits(session, map_id, sightings)
+    rows = {
+        row.object_id: row
+        for row in session.scalars(
+            select(MapObject)
+            .where(MapObject.map_id == map_id)
+            .order_by(MapObject.created, MapObject.object_id)
+        )
+    }
+    taken = [
+        Accepted(
+            version=one.version, parts=tuple(_parts(thing["now"], thing["before"]) for thing in one.objects)
+        )
+        for one in accepted
+    ]
+    tracks = track_objects(visits, taken, ids=list(rows))
+    kept, links = set(), []
+    for track in tracks:
+        object_id = track.object_id or new_id("object")
+        kept.add(object_id)
+        links += [
+            {"survey_id": visit.survey_id, "number": one.number, "object_id": object_id}
+            for visit, one in track.sightings
+            if one.object_id != object_id
+        ]
+        row = rows.get(object_id)
+        if row is None:
+            row = MapObject(object_id=object_id, map_id=map_id, created=now())
+            session.add(row)
+        _write_track(row, track, sightings)
+    if links:
+        session.execute(update(SurveyObject), links)
+    for object_id, row in rows.items():
+        if object_id not in kept:
+            session.delete(row)
+    return tracks
+
+
+def _sightings(session: Session, map_id: str) -> dict[tuple[str, int], SurveyObject]:
+    query = select(SurveyObject).join(Survey, Survey.survey_id == SurveyObject.survey_id)
+    query = query.where(_ready(map_id)).order_by(SurveyObject.survey_id, SurveyObject.number)
+    return {(row.survey_id, row.number): row for row in session.scalars(query)}
+
+
+def _visits(session: Session, map_id: str, sightings: Mapping[tuple[str, int], SurveyObject]) -> list[Visit]:
+    """Return the surveys that tell objects, with what they could judge of the tiles that any object touches."""
+    found: dict[str, list[Sighting]] = {}
+    for (survey_id, number), row in sightings.items():
+        one = Sighting(number=number, parts=_parts(row.now, row.before), object_id=row.object_id)
+        found.setdefault(survey_id, []).append(one)
+    touched = {
+        tile_id
+        for of_survey in found.values()
+        for one in of_survey
+        for part in one.parts.values()
+        for tile_id in part.tiles
+    }
+    observed = _observed(session, map_id, touched)
+    query = select(Survey.survey_id, Survey.captured_at, Survey.map_version).where(
+        Survey.objects.is_not(None)
+    )
+    return [
+        Visit(
+            survey_id=survey_id,
+            captured_at=captured_at,
+            map_version=map_version,
+            sightings=tuple(found.get(survey_id, ())),
+            observed=observed.get(survey_id, {}),
+        )
+        for survey_id, captured_at, map_version in session.execute(query.where(_ready(map_id)))
+    ]
+
+
+def _observed(session: Session, map_id: str, tile_ids: set[str]) -> dict[str, dict[str, float]]:
+    """Return the share observed of these tiles, by survey and tile."""
+    query = select(SurveyTile.survey_id, SurveyTile.tile_id, SurveyTile.observed_share).join(
+        Survey, Survey.survey_id == SurveyTile.survey_id
+    )
+    query = query.where(SurveyTile.observed_share.is_not(None))
+    if len(tile_ids) <= _MANY:
+        query = query.where(SurveyTile.tile_id.in_(sorted(tile_ids)))
+    observed: dict[str, dict[str, float]] = {}
+    for survey_id, tile_id, share in session.execute(query.where(_ready(map_id))):
+        observed.setdefault(survey_id, {})[tile_id] = share or 0.0
+    return observed
+
+
+def _parts(now_at: Mapping[str, Any] | None, before_at: Mapping[str, Any] | None) -> Parts:
+    """Return the parts of an object, whose places are JSON."""
+    places: dict[Side, Mapping[str, Any] | None] = {"now": now_at, "before": before_at}
+    return {side: _part(place) for side, place in places.items() if place is not None}
+
+
+def _part(place: Mapping[str, Any]) -> Part:
+    return Part(
+        center=tuple(place["center"]),
+        size=tuple(place["size"]),
+        yaw=place["yaw"],
+        tiles=tuple(place["tiles"]),
+    )
+
+
+def _latest(seen: tuple[Visit, Sighting]) -> tuple[Any, ...]:
+    """Order sightings by time; of two of one visit the one that says where the thing is now comes last."""
+    visit, one = seen
+    return visit.captured_at, visit.survey_id, "now" in one.parts, one.number
+
+
+def _write_track(row: MapObject, track: Track, sightings: Mapping[tuple[str, int], SurveyObject]) -> None:
+    visit, one = max(track.sightings, key=_latest)
+    latest = sightings[visit.survey_id, one.number]
+    place = Place.model_validate(latest.now or latest.before)
+    row.kind, row.probability = latest.kind, latest.probability
+    row.survey_id, row.number = visit.survey_id, one.number
+    row.status, row.last_known, row.transient = track.status, track.last_known, track.transient
+    row.first_seen, row.last_seen = track.sightings[0][0].captured_at, visit.captured_at
+    row.last_looked, row.accepted_in_version = track.last_looked, track.accepted_in_version
+    row.sightings = track.visits
+    row.min_x, row.min_y, row.min_z = place.bounds.min
+    row.max_x, row.max_y, row.max_z = place.bounds.max
