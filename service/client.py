@@ -196,7 +196,7 @@ class Client:
     def objects(self, map_id: str, **filters: Any) -> Document:
         """Return one page of the changed things of a map, each once over all surveys.
 
-        Filters are those of the API: `kind status transient bbox datetime min_probability limit cursor`.
+        Filters are those of the API: `kind status last_known transient bbox datetime min_probability limit cursor`.
         """
         return self._json("GET", f"/maps/{_quoted(map_id)}/objects", params=_given(**filters))
 

@@ -221,7 +221,10 @@ class ObjectsRequest(Request):
     """Which objects of a map."""
 
     kind: Annotated[ObjectKind | None, Field(description="as its latest sighting tells it")] = None
-    status: ObjectStatus | None = None
+    status: Annotated[ObjectStatus | None, Field(description="as of the latest survey")] = None
+    last_known: Annotated[
+        ObjectStatus | None, Field(description="as of the latest survey that looked there")
+    ] = None
     transient: Annotated[
         bool | None, Field(description="true: what comes and goes; false: what does not")
     ] = None
@@ -305,6 +308,7 @@ def get_objects(
         map_id=map_id,
         kind=asked.kind,
         status=asked.status,
+        last_known=asked.last_known,
         transient=asked.transient,
         bounds=None if asked.bbox is None else bounds_of(asked.bbox),
         since=since,

@@ -123,28 +123,23 @@ def _changes_of(map_id: str) -> Select[TileChange]:
 
 def _looks(session: Session, map_id: str) -> tuple[dict[str, list[Look]], dict[tuple[str, str], str | None]]:
     """Return the looks at each tile that ever changed, and by (survey, tile) what each changed one is told by now."""
-    ever = select(SurveyTile.tile_id).join(Survey, Survey.survey_id == SurveyTile.survey_id)
-    ever = ever.where(_ready(map_id), SurveyTile.state == "changed")
-    query = select(
-        SurveyTile.tile_id,
-        SurveyTile.survey_id,
-        Survey.captured_at,
-        Survey.map_version,
-        SurveyTile.state,
-        SurveyTile.score,
-        SurveyTile.told_by,
-    ).join(Survey, Survey.survey_id == SurveyTile.survey_id)
-    query = query.where(
-        _ready(map_id), SurveyTile.state.in_(("changed", "unchanged")), SurveyTile.tile_id.in_(ever)
-    )
+    surveys = select(Survey.survey_id, Survey.captured_at, Survey.map_version).where(_ready(map_id))
+    about = {
+        survey_id: (captured_at, version) for survey_id, captured_at, version in session.execute(surveys)
+    }
+    tile, of_survey = SurveyTile, Survey.survey_id == SurveyTile.survey_id
+    ever = select(tile.tile_id).join(Survey, of_survey).where(_ready(map_id), tile.state == "changed")
+    query = select(tile.tile_id, tile.survey_id, tile.state, tile.score, tile.told_by).join(Survey, of_survey)
+    query = query.where(_ready(map_id), tile.state.in_(("changed", "unchanged")), tile.tile_id.in_(ever))
     looks: dict[str, list[Look]] = {}
     told: dict[tuple[str, str], str | None] = {}
-    for tile_id, survey_id, captured_at, map_version, state, score, told_by in session.execute(query):
+    for tile_id, survey_id, state, score, told_by in session.execute(query):
+        captured_at, version = about[survey_id]
         changed = state == "changed"
         look = Look(
             survey_id=survey_id,
             captured_at=captured_at,
-            map_version=map_version,
+            map_version=version,
             score=score if changed else None,
         )
         looks.setdefault(tile_id, []).append(look)

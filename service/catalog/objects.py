@@ -43,6 +43,7 @@ class ObjectFilter:
     map_id: str
     kind: ObjectKind | None = None
     status: ObjectStatus | None = None
+    last_known: ObjectStatus | None = None
     transient: bool | None = None
     bounds: Bounds | None = None  #: map frame; an object is in when its box meets this one
     since: datetime | None = None  #: last seen at or after
@@ -138,6 +139,8 @@ def _matching(
         query = query.where(_OBJECT.kind == wanted.kind)
     if wanted.status is not None:
         query = query.where(_OBJECT.status == wanted.status)
+    if wanted.last_known is not None:
+        query = query.where(_OBJECT.last_known == wanted.last_known)
     if wanted.transient is not None:
         query = query.where(_OBJECT.transient.is_(wanted.transient))
     if wanted.since is not None:

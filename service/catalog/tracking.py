@@ -26,7 +26,7 @@ MIN_REACH = 0.3  #: metres; how far apart the centers of two sightings of a smal
 MAX_SIZE_RATIO = 2.0  #: of each side of the box; what is seen from one side only looks smaller
 SIZE_SLACK = 0.1  #: metres, added to each side before the ratio: two voxels
 MIN_LOOK = 0.5  #: mean share observed of the tiles that a part touches; less is no look
-CELL = 2.0  #: metres; only how fast it goes depends on it
+CELL = 1.0  #: metres; only how fast it goes depends on it
 SETTLED = 3  #: looks in a row that see a thing which came back; then it stays
 
 

@@ -21,6 +21,9 @@ def objects(
     status: Annotated[
         str | None, typer.Option(help="new, still_there, gone_again, unknown or accepted.")
     ] = None,
+    last_known: Annotated[
+        str | None, typer.Option("--last-known", help="Likewise, when somebody last looked there.")
+    ] = None,
     transient: Annotated[
         bool | None, typer.Option("--transient/--standing", help="What comes and goes, or what does not.")
     ] = None,
@@ -32,7 +35,13 @@ def objects(
     """The changed objects of a map, each once, newest first."""
     terminal: Terminal = ctx.obj
     common = {"kind": kind, "min_probability": min_probability}
-    over_time = {"status": status, "transient": transient, "bbox": bbox, "datetime": datetime}
+    over_time = {
+        "status": status,
+        "last_known": last_known,
+        "transient": transient,
+        "bbox": bbox,
+        "datetime": datetime,
+    }
     if object_id is not None:
         _refuse(f"object {object_id} is one already", survey=survey, **common, **over_time)
         terminal.ask(lambda client: client.object(map_id, object_id), _history)

@@ -161,6 +161,7 @@ def test_an_object_over_time_has_an_interval_and_each_of_its_sightings(
         ({"kind": "moved"}, ["moved"]),
         ({"status": "still_there"}, ["disappeared", "moved"]),
         ({"status": "new"}, []),
+        ({"last_known": "gone_again"}, ["appeared"]),
         ({"transient": "false"}, ALL),
         ({"transient": "true"}, []),
         ({"bbox": "0,0,2,2"}, ["appeared"]),
