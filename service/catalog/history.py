@@ -15,7 +15,7 @@ from sqlalchemy.orm import Session
 
 from service.catalog import tables
 from service.catalog.database import Database
-from service.catalog.records import ObjectRecord, ObjectStatus, Place
+from service.catalog.records import ObjectStatus, Place
 from service.catalog.stays import Look, Stay, stays
 from service.catalog.tables import (
     Acceptance,
@@ -72,15 +72,28 @@ def _ready(map_id: str) -> ColumnElement[bool]:
 def _accept(session: Session, version: tables.MapVersion, survey_id: str) -> None:
     """Keep what a version took over of a survey, for either may be deleted later."""
     tiles = select(SurveyTile.tile_id).where(SurveyTile.survey_id == survey_id, SurveyTile.state == "changed")
-    objects = select(SurveyObject).where(SurveyObject.survey_id == survey_id).order_by(SurveyObject.number)
+    replaced = list(session.scalars(tiles.order_by(SurveyTile.tile_id)))
+    objects = select(SurveyObject.now, SurveyObject.before).where(SurveyObject.survey_id == survey_id)
+    objects = objects.order_by(SurveyObject.number)
     session.add(
         Acceptance(
             map_id=version.map_id,
             version=version.version,
-            tiles=list(session.scalars(tiles.order_by(SurveyTile.tile_id))),
-            objects=[ObjectRecord.of_row(row).model_dump(mode="json") for row in session.scalars(objects)],
+            tiles=replaced,
+            objects=[
+                _taken_over(now_at, before_at, set(replaced))
+                for now_at, before_at in session.execute(objects)
+            ],
         )
     )
+
+
+def _taken_over(
+    now_at: dict[str, Any] | None, before_at: dict[str, Any] | None, replaced: set[str]
+) -> dict[str, Any]:
+    """Return the places of an object that the map follows: what is new joins it; what is gone leaves replaced tiles."""
+    left = before_at is not None and not replaced.isdisjoint(before_at["tiles"])
+    return {"now": now_at, "before": before_at if left else None}
 
 
 # tiles
