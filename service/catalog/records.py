@@ -340,3 +340,31 @@ class ChangeRecord(Record):
     )
     last_seen: Utc | None = None  #: when one last saw it, before it was gone
     max_score: float | None = None  #: over the surveys that saw it
+
+
+class SightingRecord(Record):
+    """An object of a survey with what a client needs beside it."""
+
+    thing: ObjectRecord
+    object_id: str | None  #: of the object that it is a sighting of; None before the survey is ready
+    map_id: str
+    map_version: int
+    survey_id: str
+    model: str
+    captured_at: Utc
+    first_seen: Utc | None  #: of the object, by any survey
+
+
+class MapObjectRecord(Record):
+    """A changed thing of a map, over all surveys that tell objects."""
+
+    object_id: str
+    status: ObjectStatus
+    last_known: ObjectStatus  #: as the latest survey that looked there told it
+    transient: bool  #: it comes and goes
+    first_seen: Utc
+    last_seen: Utc
+    last_looked: Utc
+    accepted_in_version: int | None  #: the version of the map that has taken it over
+    sightings: int  #: surveys that saw it
+    latest: SightingRecord
