@@ -22,6 +22,7 @@ BITS = 21  #: of a signed cell index; 2^20 cells of 5 cm reach 52 km from the or
 _X, _Y = 1 << (2 * BITS), 1 << BITS
 _MASK = _Y - 1
 _HALF = 1 << (BITS - 1)
+_WORD, _LAST = 6, 63  # bits of a place in a word of 64 voxels along z, and the last place
 
 
 def packed(cells: NDArray[np.integer[Any]]) -> Keys:
@@ -60,18 +61,49 @@ def offsets(reach: int) -> Keys:
 
 
 def near(keys: Keys, others: Keys, reach: int = 1) -> Bools:
-    """Tell (N,) which keys (N,) have one of `others` (M,), ascending, within `reach` voxels along each axis."""
-    answer = np.zeros(len(keys), bool)
-    if not len(others):
-        return answer
+    """Tell (N,) which keys (N,) have one of `others` (M,), both ascending, within `reach` voxels along each axis.
+
+    Columns of 64 voxels along z are words of bits, so that one look-up serves all voxels of a column.
+    """
+    if not len(others) or not len(keys):
+        return np.zeros(len(keys), bool)
+    columns, words = _columns(others, reach)
+    column = keys >> _WORD
+    first = np.r_[True, column[1:] != column[:-1]]
+    wanted = column[first]
     steps = range(-reach, reach + 1)
+    around = np.zeros(len(wanted), np.uint64)
     for i, j in itertools.product(steps, steps):
-        lowest = keys + (i * _X + j * _Y - reach)
-        place = np.searchsorted(others, lowest)
-        past_all = place == len(others)
-        place[past_all] = 0
-        answer |= (others[place] - lowest <= 2 * reach) & ~past_all
+        row = rows_of(wanted + (i * _X + j * _Y) // (_LAST + 1), columns)
+        around |= np.where(row >= 0, words[row], np.uint64(0))
+    around = np.repeat(around, np.diff(np.r_[np.flatnonzero(first), len(keys)]))
+    answer: Bools = ((around >> _bit(keys)) & np.uint64(1)).astype(bool)
     return answer
+
+
+def _columns(keys: Keys, reach: int) -> tuple[Keys, NDArray[np.uint64]]:
+    """Return the columns (C,) of 64 voxels that hold the keys, ascending, and their bits, grown by `reach` along z."""
+    column, bits = keys >> _WORD, np.uint64(1) << _bit(keys)
+    column, bits = _united(column, bits)
+    for _ in range(reach):
+        up = (bits >> np.uint64(_LAST)) > 0  # these reach into the column above, the others into that below
+        down = (bits & np.uint64(1)) > 0
+        grown = bits | (bits << np.uint64(1)) | (bits >> np.uint64(1))
+        over = [np.ones(int(up.sum()), np.uint64), np.full(int(down.sum()), np.uint64(1) << np.uint64(_LAST))]
+        beyond = [column[up] + 1, column[down] - 1]
+        order = np.argsort(joined := np.concatenate([column, *beyond]), kind="stable")
+        column, bits = _united(joined[order], np.concatenate([grown, *over])[order])
+    return column, bits
+
+
+def _united(column: Keys, bits: NDArray[np.uint64]) -> tuple[Keys, NDArray[np.uint64]]:
+    """Join the bits of each column; columns ascend and may come several times."""
+    starts = np.flatnonzero(np.r_[True, column[1:] != column[:-1]])
+    return column[starts], np.bitwise_or.reduceat(bits, starts)
+
+
+def _bit(keys: Keys) -> NDArray[np.uint64]:
+    return (keys & _LAST).astype(np.uint64)
 
 
 def rows_of(keys: Keys, among: Keys) -> NDArray[np.int64]:

@@ -32,6 +32,17 @@ class Preprocessing(StrictModel):
     )
 
 
+class QuietRecord(StrictModel):
+    """What the model found where nothing had changed: the map's own calibration leans on it."""
+
+    surveys: int = Field(
+        gt=0, description="in which nothing had changed, of other buildings than it was trained on"
+    )
+    scores: tuple[float, ...] = Field(
+        description="of the regions found in them all the same: expected voxels"
+    )
+
+
 class Card(StrictModel):
     """`model_store/<name>/<version>/card.json`."""
 
@@ -47,6 +58,7 @@ class Card(StrictModel):
     detector_settings: dict[str, Any] = Field(
         default_factory=dict, description="the detector's own; it validates them when it is loaded"
     )
+    quiet: QuietRecord | None = Field(default=None, description="of models that score voxels")
     weights: str | None = Field(default=None, description="file beside the card")
     sha256: str | None = Field(default=None, description="of the weights file")
     training: dict[str, Any] = Field(default_factory=dict, description="how it was made, with the command")

@@ -50,6 +50,15 @@ def test_near_is_what_lies_within_so_many_voxels_along_each_axis(reach: int) -> 
     assert np.array_equal(near(packed(ours), packed(theirs), reach), apart <= reach)
 
 
+def test_near_reaches_over_the_ends_of_words_of_64_voxels() -> None:
+    ours = np.array([[0, 0, z] for z in range(-70, 140)])
+    theirs = np.array([[0, 0, -1], [0, 0, 63], [1, 0, 128], [0, 0, -64]])
+    for reach in (1, 2):
+        apart = np.abs(ours[:, None] - theirs[None]).max(axis=2).min(axis=1)
+        order = np.argsort(packed(theirs))
+        assert np.array_equal(near(packed(ours), packed(theirs)[order], reach), apart <= reach)
+
+
 def test_nothing_is_near_to_nothing() -> None:
     assert not near(packed(some_cells(5)), np.empty(0, np.int64)).any()
 
