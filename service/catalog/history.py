@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any, get_args
 
-from sqlalchemy import ColumnElement, Select, and_, delete, exists, select, tuple_, update
+from sqlalchemy import ColumnElement, Row, Select, and_, delete, exists, select, tuple_, update
 from sqlalchemy.orm import Session
 
 from service.catalog import tables
@@ -213,13 +213,17 @@ def _rewrite_objects(session: Session, map_id: str, accepted: Sequence[Acceptanc
     return tracks
 
 
-def _sightings(session: Session, map_id: str) -> dict[tuple[str, int], SurveyObject]:
-    query = select(SurveyObject).join(Survey, Survey.survey_id == SurveyObject.survey_id)
-    query = query.where(_ready(map_id)).order_by(SurveyObject.survey_id, SurveyObject.number)
-    return {(row.survey_id, row.number): row for row in session.scalars(query)}
+def _sightings(session: Session, map_id: str) -> dict[tuple[str, int], Row[Any]]:
+    """Return the columns of every sighting by survey and number; whole objects would cost ten times as much."""
+    row = SurveyObject
+    query = select(
+        row.survey_id, row.number, row.object_id, row.kind, row.probability, row.now, row.before
+    ).join(Survey, Survey.survey_id == row.survey_id)
+    query = query.where(_ready(map_id)).order_by(row.survey_id, row.number)
+    return {(found.survey_id, found.number): found for found in session.execute(query)}
 
 
-def _visits(session: Session, map_id: str, sightings: Mapping[tuple[str, int], SurveyObject]) -> list[Visit]:
+def _visits(session: Session, map_id: str, sightings: Mapping[tuple[str, int], Row[Any]]) -> list[Visit]:
     """Return the surveys that tell objects, with what they could judge of the tiles that any object touches."""
     found: dict[str, list[Sighting]] = {}
     for (survey_id, number), row in sightings.items():
@@ -283,7 +287,7 @@ def _latest(seen: tuple[Visit, Sighting]) -> tuple[Any, ...]:
     return visit.captured_at, visit.survey_id, "now" in one.parts, one.number
 
 
-def _write_track(row: MapObject, track: Track, sightings: Mapping[tuple[str, int], SurveyObject]) -> None:
+def _write_track(row: MapObject, track: Track, sightings: Mapping[tuple[str, int], Row[Any]]) -> None:
     visit, one = max(track.sightings, key=_latest)
     latest = sightings[visit.survey_id, one.number]
     place = Place.model_validate(latest.now or latest.before)
