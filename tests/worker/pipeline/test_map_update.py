@@ -148,7 +148,7 @@ def _standing(points: Points) -> RegisteredScan:
 
 def test_where_a_survey_replaces_a_map_its_older_scans_no_longer_count_as_having_looked() -> None:
     """A wall at x = 5 m was seen through the place of a second one, which the survey found at 2 m."""
-    older, newer = _standing(_across(5.0) * np.float32([1, 3, 1])), _standing(_across(2.0))
+    older, newer = _standing(_across(5.0) * np.array([1, 3, 1], np.float32)), _standing(_across(2.0))
     grid = TileGrid(origin=np.array([1.5, -0.5, -0.5]), size=np.ones(3), shape=(4, 1, 1))
     reference = reference_map(fuse([older], voxel_size=0.05), grid=grid, settings=SETTINGS.registration)
     base = KeptMap(reference=reference, scans=[lambda: older], seen=Seen.of([older], voxel_size=0.05))

@@ -124,7 +124,10 @@ def write_coloured_cloud(path: Path, reference: Points, current: Points, changes
         _survey_points(current, changes.voxels, changes.objects),
         _lost_points(reference, changes.voxels, changes.objects),
     ]
-    points, kind, score, number = (np.concatenate(column) for column in zip(*told, strict=True))
+    points = np.concatenate([points for points, _, _, _ in told])
+    kind = np.concatenate([kind for _, kind, _, _ in told])
+    score = np.concatenate([score for _, _, score, _ in told])
+    number = np.concatenate([number for _, _, _, number in told])
     state, _ = _of_tiles(points, changes)
     scalars = {"change_score": score, "tile_state": state, "kind": kind, "object_id": number}
     write_ply(path, points, colors=_colors(KIND_COLORS)[kind], scalars=scalars)

@@ -55,10 +55,9 @@ def legend_entries(objects: ChangeObjects) -> list[Patch]:
     entries = []
     for kind, count in objects.counts().items():
         color = color_of_kind(kind)  # type: ignore[arg-type]
-        style = "--" if kind == "disappeared" else "-"
-        entries.append(
-            Patch(facecolor=(*color, 0.25), edgecolor=color, linestyle=style, label=f"{count} {kind}")
-        )
+        sample = Patch(facecolor=(*color, 0.25), edgecolor=color, label=f"{count} {kind}")
+        sample.set_linestyle("dashed" if kind == "disappeared" else "solid")
+        entries.append(sample)
     return entries
 
 
@@ -212,11 +211,8 @@ def _crowding(at: Floats, taken: Sequence[Floats], size: float) -> float:
     return float(sum(max(0.0, 1 - np.linalg.norm(at - other) / (1.2 * size)) for other in taken))
 
 
-def _covered(at: Floats, boxes: Sequence[Floats], size: float) -> float:
-    """Return how many boxes a number would stand on, roughly: by their axis-aligned bounds."""
-    return float(
-        sum(
-            bool(np.all(at > box.min(axis=0) - size / 2) and np.all(at < box.max(axis=0) + size / 2))
-            for box in boxes
-        )
+def _covered(at: Floats, boxes: Sequence[Floats], size: float) -> int:
+    """Count the boxes that a number would stand on, roughly: by their axis-aligned bounds."""
+    return sum(
+        bool(((at > box.min(axis=0) - size / 2) & (at < box.max(axis=0) + size / 2)).all()) for box in boxes
     )
