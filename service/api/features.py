@@ -74,7 +74,9 @@ class TileProperties(Document):
     tile_index: tuple[int, int, int] = Field(examples=[[4, 2, 0]])
     center: Vector3 = Field(description="metres, map frame", examples=[[6.75, 3.75, 0.5]])
     state: TileState = Field(examples=["changed"])
-    score: float | None = Field(description="probability of change; null where unobserved", examples=[0.93])
+    score: float | None = Field(
+        description="probability of change; null where nothing could be compared", examples=[0.93]
+    )
     probabilities: Vector3 | None = Field(
         description="unchanged, changed, different place", examples=[[0.05, 0.93, 0.02]]
     )

@@ -129,7 +129,12 @@ def write_coloured_cloud(path: Path, reference: Points, current: Points, changes
     score = np.concatenate([score for _, _, score, _ in told])
     number = np.concatenate([number for _, _, _, number in told])
     state, _ = _of_tiles(points, changes)
-    scalars = {"change_score": score, "tile_state": state, "kind": kind, "object_id": number}
+    scalars: dict[str, NDArray[Any]] = {
+        "change_score": score,
+        "tile_state": state,
+        "kind": kind,
+        "object_id": number,
+    }
     write_ply(path, points, colors=_colors(KIND_COLORS)[kind], scalars=scalars)
 
 

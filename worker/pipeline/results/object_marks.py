@@ -213,6 +213,6 @@ def _crowding(at: Floats, taken: Sequence[Floats], size: float) -> float:
 
 def _covered(at: Floats, boxes: Sequence[Floats], size: float) -> int:
     """Count the boxes that a number would stand on, roughly: by their axis-aligned bounds."""
-    return sum(
-        bool(((at > box.min(axis=0) - size / 2) & (at < box.max(axis=0) + size / 2)).all()) for box in boxes
-    )
+    low = np.array([box.min(axis=0) for box in boxes]) - size / 2
+    high = np.array([box.max(axis=0) for box in boxes]) + size / 2
+    return int(((at > low) & (at < high)).all(axis=1).sum())
