@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -46,14 +47,18 @@ def simulated_visits(folder: Path) -> Visits:
     )
 
 
-def free_place(room: Scene) -> tuple[float, float]:
-    """Return where a crate may stand (x, y)."""
+def free_place(room: Scene, *, around: tuple[float, float] | None = None) -> tuple[float, float]:
+    """Return where a crate may stand (x, y): the first place, or the nearest one at least 1.2 m off a place."""
     low, high = room.rooms[0].low, room.rooms[0].high
-    for x in np.linspace(low[0] + 0.6, high[0] - 0.6, 12):
-        for y in np.linspace(low[1] + 0.6, high[1] - 0.6, 12):
-            if room.is_free(crate(0.7, 0.5, 0.6).at(x, y).bounds):
-                return float(x), float(y)
-    raise AssertionError("no room for a crate")
+    places = [
+        (float(x), float(y))
+        for x in np.linspace(low[0] + 0.6, high[0] - 0.6, 12)
+        for y in np.linspace(low[1] + 0.6, high[1] - 0.6, 12)
+        if room.is_free(crate(0.7, 0.5, 0.6).at(x, y).bounds)
+    ]
+    if around is None:
+        return places[0]
+    return min((math.dist(place, around), place) for place in places if math.dist(place, around) > 1.2)[1]
 
 
 def _written(path: Path, points: Any) -> Path:
