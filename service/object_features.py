@@ -113,7 +113,8 @@ def _box(place: Mapping[str, Any] | None) -> dict[str, Any] | None:
 def _motion(motion: Mapping[str, Any] | None) -> dict[str, Any] | None:
     if motion is None:
         return None
-    return {"translation": list(motion["translation"]), "yaw_degrees": _degrees(motion["yaw"])}
+    yaw = None if motion["yaw"] is None else _degrees(motion["yaw"])
+    return {"translation": list(motion["translation"]), "yaw_degrees": yaw}
 
 
 def _degrees(angle: float) -> float:

@@ -78,7 +78,9 @@ class TileProperties(Document):
         "registration there is in doubt",
         examples=["changed"],
     )
-    score: float | None = Field(description="probability of change; null where unobserved", examples=[0.93])
+    score: float | None = Field(
+        description="probability of change; null where nothing could be compared", examples=[0.93]
+    )
     probabilities: Vector3 | None = Field(
         description="unchanged, changed, different place", examples=[[0.05, 0.93, 0.02]]
     )

@@ -78,7 +78,7 @@ class Box(Document):
     height_over_floor: float | None = Field(
         description="of its lower side, metres; null where no floor was seen", examples=[0.0]
     )
-    volume: float = Field(description="cubic metres, of its voxels", examples=[0.06])
+    volume: float = Field(description="cubic metres, of the convex hull of what was seen", examples=[0.06])
     voxels: int = Field(examples=[480])
     points: int = Field(examples=[1950])
     tiles: tuple[str, ...] = Field(
@@ -92,7 +92,9 @@ class Move(Document):
     translation: Vector3 = Field(
         description="metres, from the earlier center to the later one", examples=[[1.2, 0.0, 0.0]]
     )
-    yaw_degrees: float = Field(description="counter-clockwise", examples=[90.0])
+    yaw_degrees: float | None = Field(
+        description="counter-clockwise; null where the thing is round", examples=[90.0]
+    )
 
 
 class SightingProperties(Document):

@@ -114,6 +114,19 @@ class Sights:
             origins=self.origins[chosen], nearest=self.nearest[chosen], farthest=self.farthest[chosen]
         )
 
+    def blinded(self, low: Floats, high: Floats) -> Sights:
+        """Return the images without the rays that meet a box: lowest and highest corners (B, 3), metres, map frame.
+
+        So that scans say no more of places that are known not to be as they were. What those rays saw elsewhere is
+        forgotten as well.
+        """
+        nearest, farthest = self.nearest.copy(), self.farthest.copy()
+        for scan, origin in enumerate(self.origins):
+            reach = self.farthest[scan].astype(np.float64) * _MILLIMETRE
+            gone = _met(origin, reach, low - TOLERANCE[0], high + TOLERANCE[0])
+            nearest[scan, gone] = farthest[scan, gone] = 0
+        return Sights(origins=self.origins, nearest=nearest, farthest=farthest)
+
     def verdicts(self, points: NDArray[Any]) -> Verdicts:
         """Hold points (N, 3), metres, map frame, against every scan; each costs only the points within its reach.
 
@@ -184,6 +197,30 @@ def _cells_of(rays: NDArray[np.float32]) -> NDArray[np.int32]:
     v = np.minimum((second * half + np.float32(CELLS / 2)).astype(np.int32), CELLS - 1)
     cells: NDArray[np.int32] = (face * CELLS + u) * CELLS + v
     return cells
+
+
+def _met(origin: Floats, reach: Floats, low: Floats, high: Floats) -> NDArray[np.bool_]:
+    """Tell (6 CELLS^2,) in which directions a ray of `reach` (6 CELLS^2,) metres meets a box (slab method)."""
+    met = np.zeros(len(reach), bool)
+    rays = _middles()
+    for corners in zip(low - origin, high - origin, strict=True):
+        sides = np.stack(corners)[:, None] / rays
+        first, last = sides.min(axis=0).max(axis=1), sides.max(axis=0).min(axis=1)
+        met |= (first <= last) & (last >= 0) & (first <= reach)
+    return met
+
+
+@functools.cache
+def _middles() -> NDArray[np.float64]:
+    """Return (6 CELLS^2, 3) the unit vector through the middle of each cell; none lies along an axis."""
+    faces, u, v = np.unravel_index(np.arange(6 * CELLS**2), (6, CELLS, CELLS))
+    axis, rows = faces // 2, np.arange(6 * CELLS**2)
+    rays = np.empty((len(rows), 3))
+    rays[rows, axis] = np.where(faces % 2, 1.0, -1.0)
+    rays[rows, np.where(axis == 0, 1, 0)] = 2 * (u + 0.5) / CELLS - 1
+    rays[rows, np.where(axis == 2, 1, 2)] = 2 * (v + 0.5) / CELLS - 1
+    unit: NDArray[np.float64] = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    return unit
 
 
 @functools.cache

@@ -62,9 +62,10 @@ def encode_reference(context: Context, version: VersionRecord, detector: Detecto
 
 
 def _put_map(context: Context, built: BuiltMap, card: Card) -> None:
-    """Keep the map's files: cloud, reference, manifest."""
+    """Keep the map's files: cloud, reference, what its scans saw, manifest."""
     job_id, reference, needs = context.job.job_id, built.reference, card.preprocessing
     put(context, blob_keys.map_reference(job_id), lambda path: npz.save(path, reference))
+    put(context, blob_keys.map_seen(job_id), lambda path: npz.save(path, built.seen))
     put(
         context,
         blob_keys.map_cloud(job_id),

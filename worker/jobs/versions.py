@@ -13,10 +13,11 @@ import numpy as np
 from service.catalog import blob_keys
 from service.catalog.records import ScanOutcome, VersionRecord
 from worker.cloud import npz
+from worker.cloud.seen import Seen
 from worker.cloud.types import Indices
 from worker.errors import MapFailed
 from worker.jobs.pair_cache import StoredPairCache
-from worker.jobs.scans import kept_scans, save_scans, scan_files, scan_outcomes
+from worker.jobs.scans import kept_scans, save_scans, scan_files, scan_outcomes, seen_by
 from worker.jobs.step import Context, put
 from worker.pipeline import archive
 from worker.pipeline.flow import BuiltMap, NoScanAccepted, NothingToTile, build_map
@@ -56,6 +57,27 @@ def kept_reference(context: Context, version: VersionRecord) -> ReferenceMap:
             ) from unknown
 
 
+def kept_seen(context: Context, version: VersionRecord, *, voxel_size: float) -> Seen:
+    """Return what the scans of a version saw; of a map of release 0.1, whose scans are kept, it is made now and kept.
+
+    Raises MapFailed where the scans are gone.
+    """
+    key_of = functools.partial(blob_keys.map_scan, version.job_id)
+    try:
+        return seen_by(
+            context,
+            blob_keys.map_seen(version.job_id),
+            kept_scans(context, version.scans, key_of),
+            voxel_size=voxel_size,
+        )
+    except FileNotFoundError as missing:
+        raise MapFailed(
+            f"version {version.version} of map {version.map_id} comes from a release that did not keep what its scans "
+            "saw, and not all of the scans are there; build the map anew from its scans, or ask for a model that "
+            "compares tiles by their points"
+        ) from missing
+
+
 def make_version(context: Context, version: VersionRecord, settings: PipelineSettings) -> Made:
     """Build a version. What became of its scans is recorded also where that fails."""
     if version.base_version is None:
@@ -83,7 +105,8 @@ def _extended(
     with ExitStack() as stack:
         files = scan_files(context, further, stack, settings)
         with _recorded_anyway(context, further):
-            built = extend_map(_kept_map(context, base), files, settings=settings, progress=context.report)
+            kept = _kept_map(context, base, settings)
+            built = extend_map(kept, files, settings=settings, progress=context.report)
         for scan in older:
             context.catalog.blobs.copy(
                 blob_keys.map_scan(base.job_id, scan.scan_id), _key_of(context)(scan.scan_id)
@@ -96,7 +119,7 @@ def _renewed(
     context: Context, version: VersionRecord, base: VersionRecord, survey_id: str, settings: PipelineSettings
 ) -> Made:
     older, seen = _kept(base), _further(version, base)
-    kept, replaced = _kept_map(context, base), _changed(context, survey_id)
+    kept, replaced = _kept_map(context, base, settings), _changed(context, survey_id)
     survey_key = functools.partial(blob_keys.survey_scan, survey_id)
     loads = kept_scans(context, seen, survey_key)
     built = renew_map(kept, loads, replaced=replaced, settings=settings, progress=context.report)
@@ -109,9 +132,13 @@ def _renewed(
     return Made(built=built, outcomes=(*older, *seen))
 
 
-def _kept_map(context: Context, base: VersionRecord) -> KeptMap:
+def _kept_map(context: Context, base: VersionRecord, settings: PipelineSettings) -> KeptMap:
     key_of = functools.partial(blob_keys.map_scan, base.job_id)
-    return KeptMap(reference=kept_reference(context, base), scans=kept_scans(context, base.scans, key_of))
+    return KeptMap(
+        reference=kept_reference(context, base),
+        scans=kept_scans(context, base.scans, key_of),
+        seen=kept_seen(context, base, voxel_size=settings.registration.voxel_size),
+    )
 
 
 def _kept(base: VersionRecord) -> list[ScanOutcome]:
