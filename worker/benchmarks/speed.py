@@ -55,7 +55,7 @@ class BenchSettings:
     tiles: int = PAPER_TILES  #: that are scored
     repeats: int = 3  #: of each way of scoring, in turn
     model_store: Path = MODEL_STORE
-    model: str = "spicd-net/1"
+    model: str = "voxel-net/1"
 
 
 def bench(settings: BenchSettings, progress: Progress = no_progress) -> Document:

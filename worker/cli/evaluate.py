@@ -14,7 +14,7 @@ import typer
 
 from worker.cli import terminal
 from worker.cli.command_line import command_line
-from worker.cli.options import DEFAULT_MODEL, AsJson, Model, ModelStore
+from worker.cli.options import DEFAULT_MODEL, PAPER_MODEL, AsJson, Model, ModelStore
 from worker.detectors.card import MODEL_STORE
 
 
@@ -87,7 +87,7 @@ def registration(
 
 def paper(
     context: typer.Context,
-    model: Model = DEFAULT_MODEL,
+    model: Model = PAPER_MODEL,
     model_store: ModelStore = MODEL_STORE,
     weights: Annotated[
         Path | None, typer.Option(help="Checkpoint of training to measure, under the model's card.")

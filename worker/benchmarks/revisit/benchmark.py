@@ -49,7 +49,7 @@ class RevisitBenchmarkSettings:
     visits: int = 48
     validation: int = 48  #: visits that thresholds are chosen on
     hard: bool = True  #: also the hard part
-    model: str = "spicd-net/1"
+    model: str = "voxel-net/1"
     model_store: Path = MODEL_STORE
     weights: tuple[Path, ...] = ()  #: checkpoints, measured instead of the model's own weights
     others: bool = True  #: also the other models of the store, and the baselines
