@@ -23,7 +23,7 @@ from worker.benchmarks.revisit.plan import (
     plan_visits,
 )
 from worker.benchmarks.revisit.report import draw
-from worker.benchmarks.revisit.things import Things, things_of
+from worker.benchmarks.revisit.things import HARD_MIN_VOXELS, MIN_VOXELS, Things, things_of
 from worker.benchmarks.revisit.tiles import TileTable, tile_table
 from worker.benchmarks.revisit.visits import (
     Revisit,
@@ -138,7 +138,15 @@ def visited(settings: RevisitBenchmarkSettings, progress: Progress = no_progress
         "hard": plan_hard_visits(settings.made) if settings.hard else (),
     }
     parts = {
-        name: _part(chosen, settings.made, settings.out, progress) for name, chosen in plans.items() if chosen
+        name: _part(
+            chosen,
+            settings.made,
+            settings.out,
+            progress,
+            min_voxels=HARD_MIN_VOXELS if name == "hard" else MIN_VOXELS,
+        )
+        for name, chosen in plans.items()
+        if chosen
     }
     _check(parts["test"].tiles, "--visits")
     _check(parts["validation"].tiles, "--validation")
@@ -169,7 +177,9 @@ def summary(part: RevisitPart) -> Document:
     }
 
 
-def _part(plans: tuple[VisitPlan, ...], made: RevisitSettings, out: Path, progress: Progress) -> RevisitPart:
+def _part(
+    plans: tuple[VisitPlan, ...], made: RevisitSettings, out: Path, progress: Progress, *, min_voxels: int
+) -> RevisitPart:
     place, new = make_visits(plans, made, out / VISITS, progress)
     visits = load_visits(plans, place)
     sites = {plan.site.name: load_site(plan.site, place) for plan in plans}
@@ -179,7 +189,7 @@ def _part(plans: tuple[VisitPlan, ...], made: RevisitSettings, out: Path, progre
         sites=sites,
         place=place,
         tiles=tile_table(plans, visits, sites, min_points=made.pipeline.tiling.min_points),
-        things=things_of(plans, visits),
+        things=things_of(plans, visits, min_voxels=min_voxels),
         made=new,
     )
 
