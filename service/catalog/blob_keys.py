@@ -69,6 +69,12 @@ def map_embedding(job_id: str, model: str, fingerprint: str) -> str:
     return f"{map_folder(job_id)}description-{safe_name(made_by)}.npz"
 
 
+def map_alarms(job_id: str, model: str, fingerprint: str) -> str:
+    """Name what one model found on the map's own scans, where nothing had changed; named as an embedding is."""
+    made_by = f"{model.replace('/', '-')}-{fingerprint[:12]}"
+    return f"{map_folder(job_id)}alarms-{safe_name(made_by)}.npz"
+
+
 def map_scan(job_id: str, scan_id: str) -> str:
     """Name the points, pose and sensor origin of one accepted scan of the map."""
     return f"{map_folder(job_id)}scans/{scan_id}.npz"

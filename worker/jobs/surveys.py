@@ -17,12 +17,15 @@ from service.catalog.records import (
     VersionRecord,
 )
 from worker.cloud import npz
+from worker.detectors.card import Card
 from worker.detectors.comparison import Comparison
 from worker.detectors.detector import Detection
+from worker.detectors.voxels.scores import tile_threshold
 from worker.jobs.models import card_of, card_that_fits, kept_detector, pipeline_settings
 from worker.jobs.scans import kept_scans, save_scans, scan_files, scan_outcomes, seen_by
 from worker.jobs.step import Context, load, put, step
-from worker.jobs.versions import kept_reference, kept_seen
+from worker.jobs.versions import kept_alarms, kept_reference, kept_seen
+from worker.pipeline.alarms import AlarmCalibration
 from worker.pipeline.flow import NoScanAccepted, compare, concluded, locate_survey
 from worker.pipeline.mapping.fusion import CurrentMap
 from worker.pipeline.results.changes import ChangeSet
@@ -66,6 +69,8 @@ def score_survey(context: Context) -> None:
     comparison = _compared(context, survey, version, settings)
     progress = scoring(context.report, encoded=embedding is not None)
     detection = detector.detect(comparison, embedding=embedding, progress=progress)
+    if detection.voxels is not None:  # kept with the map, for the next step, which opens no network
+        kept_alarms(context, version, detector, survey.model, settings)
     put(context, blob_keys.survey_scores(survey.survey_id), lambda path: npz.save(path, detection))
 
 
@@ -77,8 +82,13 @@ def export_survey(context: Context) -> None:
     context.report("exporting", 0.0)
     comparison = _compared(context, survey, version, settings)
     detection = load(context, blob_keys.survey_scores(survey_id), functools.partial(npz.load, kind=Detection))
-    threshold = card_of(context, survey.model).threshold if survey.threshold is None else survey.threshold
-    changes = concluded(comparison, detection, threshold=threshold, settings=settings)
+    card = card_of(context, survey.model)
+    limit = _least_score(context, version, card, survey.model) if detection.voxels is not None else 0.0
+    threshold = tile_threshold(card, limit) if survey.threshold is None else survey.threshold
+    objects = settings.objects.with_values(min_score=max(limit, settings.objects.min_score))
+    changes = concluded(
+        comparison, detection, threshold=threshold, settings=settings.with_values(objects=objects)
+    )
     context.report("exporting", 0.3)
     _put_cloud_and_picture(context, survey, comparison, changes)
     context.report("exporting", 0.9)
@@ -90,6 +100,12 @@ def export_survey(context: Context) -> None:
         moving=None if changes.objects is None else changes.objects.moving,
     )
     context.catalog.jobs.succeed(context.job.job_id)
+
+
+def _least_score(context: Context, version: VersionRecord, card: Card, model: str) -> float:
+    """Return the limit on a region's score that the step before has kept with the map."""
+    key = blob_keys.map_alarms(version.job_id, model, card.fingerprint)
+    return load(context, key, functools.partial(npz.load, kind=AlarmCalibration)).min_score
 
 
 def _put_cloud_and_picture(

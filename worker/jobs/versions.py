@@ -15,11 +15,13 @@ from service.catalog.records import ScanOutcome, VersionRecord
 from worker.cloud import npz
 from worker.cloud.seen import Seen
 from worker.cloud.types import Indices
+from worker.detectors.detector import Detector
 from worker.errors import MapFailed
 from worker.jobs.pair_cache import StoredPairCache
 from worker.jobs.scans import kept_scans, save_scans, scan_files, scan_outcomes, seen_by
-from worker.jobs.step import Context, put
+from worker.jobs.step import Context, load, put
 from worker.pipeline import archive
+from worker.pipeline.alarms import AlarmCalibration, calibrated, visits_of
 from worker.pipeline.flow import BuiltMap, NoScanAccepted, NothingToTile, build_map
 from worker.pipeline.map_update import KeptMap, extend_map, renew_map, without
 from worker.pipeline.mapping.fusion import ReferenceMap
@@ -78,6 +80,24 @@ def kept_seen(context: Context, version: VersionRecord, *, voxel_size: float) ->
         ) from missing
 
 
+def kept_alarms(
+    context: Context, version: VersionRecord, detector: Detector, model: str, settings: PipelineSettings
+) -> AlarmCalibration:
+    """Return how strong a region has to be on this map for this model; made of the map's own scans on first use."""
+    key = blob_keys.map_alarms(version.job_id, model, detector.card.fingerprint)
+    if context.catalog.blobs.exists(key):
+        return load(context, key, functools.partial(npz.load, kind=AlarmCalibration))
+    key_of = functools.partial(blob_keys.map_scan, version.job_id)
+    visits = visits_of(
+        kept_scans(context, version.scans, key_of), voxel_size=settings.registration.voxel_size
+    )
+    calibration = calibrated(
+        visits, detector, alarms_per_survey=settings.alarms_per_survey, progress=context.report
+    )
+    put(context, key, functools.partial(npz.save, value=calibration))
+    return calibration
+
+
 def make_version(context: Context, version: VersionRecord, settings: PipelineSettings) -> Made:
     """Build a version. What became of its scans is recorded also where that fails."""
     if version.base_version is None:
@@ -123,9 +143,9 @@ def _renewed(
     survey_key = functools.partial(blob_keys.survey_scan, survey_id)
     loads = kept_scans(context, seen, survey_key)
     built = renew_map(kept, loads, replaced=replaced, settings=settings, progress=context.report)
-    for done, (scan, load) in enumerate(zip(older, kept.scans, strict=True)):
+    for done, (scan, load_kept) in enumerate(zip(older, kept.scans, strict=True)):
         context.report("saving", done / len(older))
-        rest = without(load(), kept.reference.grid, replaced)
+        rest = without(load_kept(), kept.reference.grid, replaced)
         put(context, _key_of(context)(scan.scan_id), functools.partial(npz.save, value=rest))
     for scan in seen:
         context.catalog.blobs.copy(survey_key(scan.scan_id), _key_of(context)(scan.scan_id))

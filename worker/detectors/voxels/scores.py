@@ -14,6 +14,7 @@ from worker.cloud.settings import StrictModel
 from worker.cloud.tiling import TileGrid
 from worker.cloud.types import Bools, Floats, Indices
 from worker.cloud.voxel_keys import Keys, rows_of, union
+from worker.detectors.card import Card
 from worker.detectors.comparison import Comparison
 from worker.detectors.detector import Detection, VoxelScores
 from worker.detectors.voxels.evidence import (
@@ -102,6 +103,12 @@ def detected(
 def tile_score(sums: Floats, settings: TileScoreSettings) -> Floats:
     """Return the probability of change (T,) of tiles with so many changed voxels to be expected (T,)."""
     return np.asarray(1 / (1 + np.exp(-(settings.slope * np.log1p(sums) + settings.offset))))
+
+
+def tile_threshold(card: Card, least_score: float) -> float:
+    """Return the threshold of the card's tiles, or the score of one with so many expected changed voxels if higher."""
+    settings = TileScoreSettings.model_validate(card.detector_settings.get("tiles", {}))
+    return max(card.threshold, float(tile_score(np.array(least_score), settings)))
 
 
 def observed_share(
