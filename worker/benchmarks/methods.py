@@ -35,36 +35,15 @@ TileScore = NDArray[np.floating[Any]]
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Method:
-    """A way of comparing tiles."""
+    """A way of comparing tiles that needs no training."""
 
     name: str
     score: Callable[[TilePairs], TileScore]
-    stated: float | None = None  #: the threshold it comes with; None where it has none
-    sha256: str | None = None  #: of its weights; None where it has none
 
 
 def baseline_methods() -> tuple[Method, ...]:
     """Return the baselines that this machine can run."""
     return tuple(Method(name=baseline.name, score=baseline.score) for baseline in installed_baselines())
-
-
-def detector_methods(model_store: Path, model: str, weights: tuple[Path, ...]) -> tuple[Method, ...]:
-    """Return the model with the threshold of its card; or, without one, the checkpoints in its place.
-
-    Raises DetectorUnavailable.
-    """
-    methods = []
-    for path in weights or (None,):
-        detector = open_model(model_store, model, path)
-        methods.append(
-            Method(
-                name=model if path is None else "/".join(path.parts[-2:]),
-                score=CachedDetector(detector=detector).score,
-                stated=detector.card.threshold if path is None else None,
-                sha256=detector.card.sha256,
-            )
-        )
-    return tuple(methods)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
