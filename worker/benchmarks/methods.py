@@ -178,16 +178,16 @@ def encode_reference(detector: Detector, tiles: Tiles, progress: Progress = no_p
     return detector.encode_reference(side_of(tiles), tiles, progress=progress)
 
 
-def tile_scores(detector: Detector, pairs: TilePairs, embedding: Arrays | None = None) -> Detection:
+def tile_scores(detector: Detector, comparison: Comparison, embedding: Arrays | None = None) -> Detection:
     """Compare every observed pair; `embedding` is that of the map, if kept."""
-    return detector.detect(Comparison.of_tiles(pairs), embedding=embedding)
+    return detector.detect(comparison, embedding=embedding)
 
 
 def change_scores(
     detector: Detector, pairs: TilePairs, embedding: Arrays | None = None
 ) -> NDArray[np.float32]:
     """Return the probability of change (T,), NaN where not observed."""
-    return tile_scores(detector, pairs, embedding).change
+    return tile_scores(detector, Comparison.of_tiles(pairs), embedding).change
 
 
 @dataclass(kw_only=True, slots=True)

@@ -131,7 +131,7 @@ def _survey(
     except NoScanAccepted as refused:
         return {"rejected": str(refused), **clock.seconds()}
     clock("score", 0.0)
-    scores = tile_scores(detector, survey.comparison.tile_pairs, embedding)
+    scores = tile_scores(detector, survey.comparison, embedding)
     clock("decide and export", 0.0)
     changes = decide(survey.comparison.tile_pairs, scores, threshold=detector.card.threshold)
     write_coloured_cloud(folder / "cloud.ply", reference.points, survey.current.points, changes)
