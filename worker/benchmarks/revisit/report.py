@@ -29,6 +29,7 @@ TITLES = {
 OBJECT_TITLES = {
     "kind": "kind of change",
     "voxels": "decidable voxels",
+    "size": "longest edge of the thing",
     "case": "second visit",
     "building": "building",
 }

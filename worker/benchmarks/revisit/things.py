@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 from worker.benchmarks.documents import Document
 from worker.benchmarks.revisit.answers import PredictedObject, VisitAnswer
 from worker.benchmarks.revisit.plan import VisitPlan
+from worker.benchmarks.revisit.tiles import binned
 from worker.benchmarks.revisit.visits import Revisit
 from worker.cloud.types import Bools
 from worker.cloud.voxel_keys import Keys, near
@@ -23,8 +23,9 @@ HARD_MIN_VOXELS = 12  #: the same in the hard part, whose small things have 12 t
 COVERED = 0.25  #: share of a region's voxels that one object has to cover
 TRUE = 0.5  #: share of an object's voxels that has to lie by a true change
 MATCH, NEARBY = 1, 2  #: voxels; poses are off by a centimetre, and so are the surfaces
-#: Voxels, edges of bins by a region's size.
-SIZES = (HARD_MIN_VOXELS, MIN_VOXELS, 100, 250, 600, np.inf)
+#: Edges of bins, by the decidable voxels of a region and by the longest edge of its thing in metres.
+VOXEL_EDGES = (HARD_MIN_VOXELS, MIN_VOXELS, 100, 250, 600, np.inf)
+SIZE_EDGES = (0.0, 0.2, 0.4, 0.7, 1.0, 1.5, np.inf)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
@@ -64,7 +65,6 @@ class Things:
 
     def groups(self) -> dict[str, dict[str, Bools]]:
         """Return the regions (R,) of each group, by what they are grouped by."""
-        sizes = np.array([len(region.keys) for region in self.regions])
         columns = {
             "kind": [f"{region.kind}, {_gone_or_come(region.side)}" for region in self.regions],
             "case": [self.case[region.visit] for region in self.regions],
@@ -74,12 +74,13 @@ class Things:
             by: {name: np.array([one == name for one in names]) for name in dict.fromkeys(sorted(names))}
             for by, names in columns.items()
         }
-        edges = itertools.pairwise(SIZES)
-        groups["voxels"] = {
-            f"over {low:g}" if np.isinf(high) else f"{low:g} to {high:g}": (sizes >= low) & (sizes < high)
-            for low, high in edges
+        voxels = np.array([len(region.keys) for region in self.regions], np.float64)
+        metres = np.array([region.size for region in self.regions], np.float64)
+        return {
+            **groups,
+            "voxels": binned(voxels, VOXEL_EDGES, "{:g}"),
+            "size": binned(metres, SIZE_EDGES, "{:g} m"),
         }
-        return groups
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
