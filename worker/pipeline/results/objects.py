@@ -151,7 +151,7 @@ def regions_of(voxels: VoxelScores, chances: Probabilities, settings: ObjectSett
 
 
 def moving_things(voxels: VoxelScores, *, min_voxels: int) -> int:
-    """Count the regions of at least `min_voxels` voxels that were hit and seen through by one and the same visit."""
+    """Count what moved while a visit lasted: connected regions of at least `min_voxels` such voxels."""
     return sum(len(rows) >= min_voxels for rows in _connected(voxels.keys, voxels.moving))
 
 
