@@ -14,6 +14,9 @@ def demo(
     out: Annotated[Path, typer.Option(help="Folder for scans, results and the service's data.")] = Path(
         "demo"
     ),
+    model: Annotated[
+        str | None, typer.Option(help="Model, name/version; left out: the service's own choice.")
+    ] = None,
     seed: Annotated[int, typer.Option(help="Of the noise and of the robot's way.")] = 1,
 ) -> None:
     """Simulate two visits to a small building, run the whole service on them, and show what it found."""
@@ -21,4 +24,9 @@ def demo(
     from worker.demo.run import run  # noqa: PLC0415
     from worker.demo.story import DemoSettings  # noqa: PLC0415
 
-    run(out, DemoSettings(seed=seed), out_console=terminal.output(), err_console=terminal.messages())
+    run(
+        out,
+        DemoSettings(seed=seed, model=model),
+        out_console=terminal.output(),
+        err_console=terminal.messages(),
+    )

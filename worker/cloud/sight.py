@@ -31,6 +31,7 @@ TOLERANCE = (
     0.08,
     0.01,
 )  #: metres, and times the depth, that a return may lie off and still be the same surface
+BEYOND = 0.3  #: metres behind a place, from which on a return shows that nothing blocked the view for good
 FARTHEST_RESIDUAL = 0.6  #: metres; a residual is no larger
 _MILLIMETRE = 0.001  # ranges are kept in these, as uint16: up to 65 m
 _FARTHEST = np.uint16(np.iinfo(np.uint16).max)  # in these
@@ -144,6 +145,22 @@ class Sights:
                 answer.confirmed[there] += told.confirmed
                 answer.hidden[there] += told.hidden
                 answer.residual[there] = np.minimum(answer.residual[there], told.residual)
+        return answer
+
+    def stands(self, points: NDArray[Any]) -> NDArray[np.bool_]:
+        """Tell (N,) at which places, metres, map frame, a scan had a return and none from well beyond it.
+
+        What stands there as long as a scan lasts blocks its view. Past somebody who walked by, the scan saw what is
+        behind as well, in every direction in which it saw him; past a thing that stands it does so along its edges.
+        """
+        answer = np.zeros(len(points), bool)
+        for origin, nearest, farthest in zip(self.origins, self.nearest, self.farthest, strict=True):
+            rays = (points - origin).astype(np.float32)
+            cells = _cells_of(rays)
+            depth = np.sqrt(np.einsum("ij,ij->i", rays, rays))
+            tolerance = TOLERANCE[0] + TOLERANCE[1] * depth
+            near, far = (image[cells] * np.float32(_MILLIMETRE) for image in (nearest, farthest))
+            answer |= (far >= depth - tolerance) & (far <= depth + BEYOND) & (near <= depth + tolerance)
         return answer
 
     def _verdicts_of_one(self, ordered: NDArray[np.float32], scan: int) -> tuple[NDArray[np.int64], Verdicts]:

@@ -127,7 +127,7 @@ def show_judgement(console: Console, judgement: Judgement) -> None:
     """Show what was done and whether it was found, then tile by tile."""
     console.print(_edit_table(judgement))
     console.print(_tile_table(judgement))
-    console.print(_counts(judgement), highlight=False)
+    console.print(counts_line(judgement), highlight=False)
 
 
 def _edit_table(judgement: Judgement) -> Table:
@@ -157,7 +157,8 @@ def _of(judgement: Judgement, verdict: Verdict) -> list[JudgedTile]:
     return tiles[:MOST_FALSE_ALARMS] if verdict is Verdict.FALSE_ALARM else tiles
 
 
-def _counts(judgement: Judgement) -> str:
+def counts_line(judgement: Judgement) -> str:
+    """Count the tiles by verdict."""
     counts = judgement.counts()
     hits, misses, alarms = (counts[v] for v in (Verdict.HIT, Verdict.MISS, Verdict.FALSE_ALARM))
     unseen, quiet = counts[Verdict.UNOBSERVED], counts[Verdict.RIGHT]

@@ -15,9 +15,17 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.text import Text
 
 from service.client import Client, ClientError, Document
-from worker.demo.judgement import Judgement, grid_of, judge, placement_line, show_judgement
+from worker.demo.judgement import (
+    Judgement,
+    counts_line,
+    grid_of,
+    judge,
+    placement_line,
+    show_judgement,
+)
 from worker.demo.service import DemoFailed, ServiceChild
 from worker.demo.story import DemoSettings, Story, tell
+from worker.demo.things import ThingsJudgement, judge_things, show_things
 from worker.simulation.sensor import SimulatedScan
 
 MAP_ID = "office"
@@ -28,6 +36,7 @@ RESULTS = {
     "cloud": ("/surveys/{survey_id}/cloud.ply", "cloud.ply"),
     "picture": ("/surveys/{survey_id}/picture.png", "picture.png"),
 }
+OBJECTS = ("/surveys/{survey_id}/objects?limit=10000", "objects.geojson")  #: of models that score voxels
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -37,6 +46,7 @@ class DemoResult:
     map: Document
     survey: Document
     judgement: Judgement
+    things: ThingsJudgement | None  #: None where the model tells tiles alone
     files: dict[str, Path] = field(default_factory=dict)
 
 
@@ -56,7 +66,11 @@ def run(out: Path, settings: DemoSettings, *, out_console: Console, err_console:
             result, story = _through_the_service(child, out, settings, progress)
     except ClientError as error:
         raise DemoFailed(str(error)) from error
-    show_judgement(out_console, result.judgement)
+    if result.things is None:
+        show_judgement(out_console, result.judgement)
+    else:
+        show_things(out_console, result.things, moving=result.survey["moving"] or 0)
+        out_console.print(counts_line(result.judgement), highlight=False)
     for visit, outcomes, scans in (
         ("map", result.map["scans"], story.first),
         ("survey", result.survey["scans"], story.second),
@@ -111,22 +125,23 @@ def _through_the_service(
         with _step(progress, "upload the first visit") as step:
             first = _uploaded(client, story.first, step)
         with _step(progress, "build the map") as step:
-            accepted = client.create_map(first, map_id=MAP_ID, name="The demo's office")
+            accepted = client.create_map(first, map_id=MAP_ID, name="The demo's office", model=settings.model)
             client.wait(accepted["job_id"], step.follow)
         with _step(progress, "upload the second visit") as step:
             second = _uploaded(client, story.second, step)
         with _step(progress, "compare it with the map") as step:
-            accepted = client.submit_survey(MAP_ID, second, device_id="demo-robot")
+            accepted = client.submit_survey(MAP_ID, second, device_id="demo-robot", model=settings.model)
             client.wait(accepted["job_id"], step.follow)
         survey_id = accepted["survey_id"]
         with _step(progress, "fetch the results"):
+            survey, built = client.survey(survey_id), client.map(MAP_ID)
+            wanted = RESULTS if survey["objects"] is None else {"objects": OBJECTS, **RESULTS}
             files = {
                 what: client.download(path.format(survey_id=survey_id), out / name)
-                for what, (path, name) in RESULTS.items()
+                for what, (path, name) in wanted.items()
             }
-            survey, built = client.survey(survey_id), client.map(MAP_ID)
-            judgement = _judged(client, survey_id, story, out)
-    return DemoResult(map=built, survey=survey, judgement=judgement, files=files), story
+            judgement, things = _judged(client, survey_id, story, out, files.get("objects"))
+    return DemoResult(map=built, survey=survey, judgement=judgement, things=things, files=files), story
 
 
 def _uploaded(client: Client, scans: Sequence[SimulatedScan], step: _Step) -> list[str]:
@@ -141,10 +156,19 @@ def _uploaded(client: Client, scans: Sequence[SimulatedScan], step: _Step) -> li
     return ids
 
 
-def _judged(client: Client, survey_id: str, story: Story, out: Path) -> Judgement:
+def _judged(
+    client: Client, survey_id: str, story: Story, out: Path, objects: Path | None
+) -> tuple[Judgement, ThingsJudgement | None]:
+    """Hold tiles and, where the survey tells any, objects against the story."""
     manifest = json.loads(client.download(f"/maps/{MAP_ID}/manifest", out / "manifest.json").read_text())
     grid = grid_of(manifest)
-    edits = [
-        (edit.sentence, truth) for edit, truth in zip(story.edits, story.truth_of_each(grid), strict=True)
+    truths = story.truth_of_each(grid)
+    edits = [(edit.sentence, truth) for edit, truth in zip(story.edits, truths, strict=True)]
+    judgement = judge(client.tiles(survey_id)["features"], story.truth(grid), edits)
+    if objects is None:
+        return judgement, None
+    done = [
+        (edit.sentence, edit.change, int(truth.cells.sum()))
+        for edit, truth in zip(story.edits, truths, strict=True)
     ]
-    return judge(client.tiles(survey_id)["features"], story.truth(grid), edits)
+    return judgement, judge_things(json.loads(objects.read_text())["features"], done)

@@ -18,12 +18,13 @@ OFFICE = 2  #: seed of the building
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class DemoSettings:
-    """How long the robot works."""
+    """How long the robot works, and what judges its scans."""
 
     seed: int = 1
     stops: tuple[int, int] = (22, 16)  #: scans of both visits; with fewer, rooms hang together by too little
     duration_s: float = 5.0  #: seconds of standing at each
     prior_error: tuple[float, float] = (0.1, 2.0)  #: sigma of the robot's odometry, metres and degrees
+    model: str | None = None  #: that the service is asked for; None: its own choice
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
@@ -33,6 +34,7 @@ class Edit:
     sentence: str  #: what a person would call it
     before: Scene
     after: Scene
+    change: Change  #: where the thing was and is
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
@@ -82,8 +84,8 @@ def edits(scene: Scene) -> tuple[Edit, ...]:
     done: list[Edit] = []
     for sentence, step in _STEPS:
         before = done[-1].after if done else scene
-        after, _ = step(before)
-        done.append(Edit(sentence=sentence, before=before, after=after))
+        after, change = step(before)
+        done.append(Edit(sentence=sentence, before=before, after=after, change=change))
     return tuple(done)
 
 

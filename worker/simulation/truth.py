@@ -38,8 +38,9 @@ class TileTruth:
         return enough
 
     def cells_of(self, indices: Indices) -> NDArray[np.int32]:
-        """Return the changed cells of the tiles at these indices (T, 3), by kind of change: (T, 3)"""
-        return self.cells.reshape(-1, len(KINDS))[self.grid.cells(indices)]
+        """Return the changed cells of the tiles at these indices (T, 3), by kind of change: (T, 3), 0 off the grid."""
+        at = self.grid.cells(indices)
+        return np.where(at[:, None] >= 0, self.cells.reshape(-1, len(KINDS))[at], 0)
 
     def of(self, indices: Indices) -> Bools:
         """Tell whether the tiles at these indices (T, 3) truly changed: (T,)"""

@@ -8,6 +8,7 @@ import shutil
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -232,7 +233,7 @@ def test_detect_tells_objects_where_the_model_scores_voxels(
 
 def test_the_summary_lists_objects_with_how_they_moved(capsys: pytest.CaptureFixture[str]) -> None:
     place = {"center": [1.0, 2.0, 0.5], "size": [0.5, 0.4, 0.9], "height_over_floor": None}
-    moved = {
+    moved: dict[str, Any] = {
         "number": 1,
         "kind": "moved",
         "now": place,

@@ -126,3 +126,17 @@ def test_a_box_behind_the_wall_or_behind_the_sensor_blinds_no_scan() -> None:
         assert np.array_equal(sights.blinded(low, high).farthest, sights.farthest)
     nothing = np.empty((0, 3))
     assert np.array_equal(sights.blinded(nothing, nothing).farthest, sights.farthest)
+
+
+def test_what_stands_blocks_the_view_and_what_walked_by_does_not() -> None:
+    """A board 2 m ahead was there all the time, one beside it while every tenth return of its directions came."""
+    board = wall(2.0, half=0.3)
+    aside = board + np.array((0.0, 1.0, 0.0))
+    behind = wall(4.0, half=3.0)
+    hidden = np.all(np.abs((behind - ORIGIN)[:, 1:]) < 0.6, axis=1)
+    sights = Sights.of([(np.concatenate([board, aside[::10], behind[~hidden]]), ORIGIN)])
+    assert sights is not None
+    inner = np.array([[2.0, 0.0, 0.0], [2.0, 0.1, 0.1], [2.0, 1.0, 0.0], [2.0, 1.1, -0.1], [4.0, -2.0, 0.0]])
+    assert sights.stands(ORIGIN + inner).tolist() == [True, True, False, False, True]
+    nowhere = np.array([[2.0, -0.5, 0.5], [-2.0, 0.0, 0.0]])
+    assert not sights.stands(ORIGIN + nowhere).any()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,10 @@ from worker.demo.judgement import Verdict, grid_of, judge, placement_line, show_
 from worker.demo.run import run
 from worker.demo.service import DemoFailed, ServiceChild
 from worker.demo.story import OFFICE, DemoSettings, Story, edits, tell
-from worker.simulation.scenes import small_office
+from worker.demo.things import Find, ThingsJudgement, judge_things, show_things
+from worker.detectors.card import MODEL_STORE
+from worker.simulation.scenes import Change, small_office
+from worker.simulation.scenes.scene import ChangeKind
 from worker.simulation.truth import TileTruth
 
 MANIFEST = {
@@ -107,6 +111,87 @@ def test_an_edit_counts_the_tiles_that_it_changed_and_those_found(judged: Any) -
     ]
 
 
+def test_a_tile_off_the_maps_grid_is_not_taken_for_its_last_one() -> None:
+    whole = truth((4, 80))
+    judged = judge(
+        [feature(5, "changed", 0.9), feature(-1, "unchanged", 0.1)], whole, [("crate added", whole)]
+    )
+    assert [tile.verdict for tile in judged.tiles] == [Verdict.FALSE_ALARM, Verdict.RIGHT]
+
+
+def thing(number: int, kind: str, *, now: float | None = None, before: float | None = None) -> dict[str, Any]:
+    """A feature of an object at x metres along a wall."""
+    places = [
+        None if x is None else {"center": [x, 0.0, 0.5], "size": [0.8, 0.5, 0.8]} for x in (now, before)
+    ]
+    motion = {"translation": [1.0, 0.0, 0.0], "yaw_degrees": -25.0} if kind == "moved" else None
+    return {
+        "properties": {
+            "number": number,
+            "kind": kind,
+            "now": places[0],
+            "before": places[1],
+            "motion": motion,
+        }
+    }
+
+
+def edit(kind: ChangeKind, *, before: float | None = None, after: float | None = None) -> Change:
+    boxes = [
+        None if x is None else np.array([[x - 0.4, -0.25, 0.0], [x + 0.4, 0.25, 0.8]])
+        for x in (before, after)
+    ]
+    return Change(kind=kind, name=kind, before=boxes[0], after=boxes[1])
+
+
+@pytest.fixture
+def told() -> ThingsJudgement:
+    """A crate added at 0 m and told, a table moved from 4 to 6 m and told in pieces, a plant missed, one unseen."""
+    return judge_things(
+        [
+            thing(1, "appeared", now=0.2),
+            thing(2, "appeared", now=6.5),
+            thing(3, "disappeared", before=4.0),
+            thing(4, "moved", now=21.0, before=20.0),
+        ],
+        [
+            ("crate added", edit("add", after=0.0), 100),
+            ("table moved", edit("move", before=4.0, after=6.0), 100),
+            ("plant removed", edit("remove", before=10.0), 100),
+            ("bin removed", edit("remove", before=12.0), 3),
+        ],
+    )
+
+
+def test_what_was_done_is_found_told_otherwise_missed_or_out_of_sight(told: ThingsJudgement) -> None:
+    assert [one.find for one in told.things] == [Find.FOUND, Find.OTHERWISE, Find.MISSED, Find.UNSEEN]
+    assert [[one["number"] for one in each.told] for each in told.things] == [[1], [2, 3], [], []]
+    assert [one["number"] for one in told.made_up] == [4]
+
+
+def test_a_thing_that_came_is_not_what_was_taken_away_there() -> None:
+    judged = judge_things(
+        [thing(1, "appeared", now=3.0)], [("plant removed", edit("remove", before=3.0), 100)]
+    )
+    assert judged.things[0].find is Find.MISSED
+    assert len(judged.made_up) == 1
+
+
+def test_the_story_is_told_by_objects(told: ThingsJudgement) -> None:
+    page = io.StringIO()
+    show_things(Console(file=page, width=200), told, moving=2)
+    shown = page.getvalue()
+    for said in (
+        "1 appeared: 0.8 x 0.5 x 0.8 m at (0.20, 0.00)",
+        "2 appeared: 0.8 x 0.5 x 0.8 m at (6.50, 0.00); 3 disappeared",
+        "4 moved by 1.0 m, turned by 25°",
+        "2 of 4 changes found, 1 false alarms",
+        "1 could not be seen by the robot",
+        "2 things moved while the robot looked",
+    ):
+        assert said in shown
+
+
 def test_misses_and_false_alarms_are_told(judged: Any) -> None:
     page = io.StringIO()
     show_judgement(Console(file=page, width=160), judged)
@@ -162,6 +247,7 @@ def test_a_short_demo_leaves_its_results_and_no_process(
         tmp_path, settings, out_console=Console(file=page, width=160), err_console=Console(file=io.StringIO())
     )
     assert result.map["status"] == result.survey["status"] == "ready"
+    assert result.things is None
     assert len(result.judgement.tiles) == result.survey["counts"]["tiles"]
     assert sum(result.judgement.counts().values()) == result.survey["counts"]["tiles"]
     for what, start in (("changes", b'{"type":"Feature'), ("cloud", b"ply\n"), ("picture", b"\x89PNG")):
@@ -169,6 +255,21 @@ def test_a_short_demo_leaves_its_results_and_no_process(
         assert str(result.files[what]) in page.getvalue()
     assert (tmp_path / "mine.txt").exists()
     assert _started_for(tmp_path) == []
+
+
+def test_a_demo_with_voxels_tells_objects(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SPICD_MODEL_STORE", str(MODEL_STORE))
+    page = io.StringIO()
+    settings = DemoSettings(stops=(2, 2), prior_error=(0.02, 0.5), model="voxel-rule/1")
+    result = run(
+        tmp_path, settings, out_console=Console(file=page, width=160), err_console=Console(file=io.StringIO())
+    )
+    assert result.survey["model"] == "voxel-rule/1"
+    assert result.things is not None
+    assert len(result.things.things) == 6
+    told = sum(result.survey["objects"].values())
+    assert told == len(json.loads(result.files["objects"].read_text())["features"])
+    assert "of 6 changes found" in page.getvalue()
 
 
 def _started_for(folder: Path) -> list[str]:

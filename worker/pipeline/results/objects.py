@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -22,7 +23,7 @@ from worker.cloud.types import Bools, Floats, Points
 from worker.cloud.voxel_keys import Keys, regions, rows_of
 from worker.detectors.comparison import Comparison
 from worker.detectors.detector import Probabilities, VoxelScores
-from worker.pipeline.results.places import Place, floor_below, place_of, within
+from worker.pipeline.results.places import Place, around, floor_below, place_of, within
 from worker.pipeline.results.shapes import Motion, Shape, ShapeSettings, Surroundings, moved_things
 
 ObjectKind = Literal["appeared", "disappeared", "moved"]
@@ -150,7 +151,7 @@ def regions_of(voxels: VoxelScores, chances: Probabilities, settings: ObjectSett
 
 
 def moving_things(voxels: VoxelScores, *, min_voxels: int) -> int:
-    """Count the regions of at least `min_voxels` voxels that were hit and seen through by one and the same visit."""
+    """Count what moved while a visit lasted: connected regions of at least `min_voxels` such voxels."""
     return sum(len(rows) >= min_voxels for rows in _connected(voxels.keys, voxels.moving))
 
 
@@ -237,7 +238,7 @@ class _Side:
         place = place_of(
             points,
             hits=int(self.seen.hits[self._rows(region)].sum()),
-            floor=floor_below(points, self.floors),
+            floor=floor_below(points, self.floors, voxel_size=self.seen.voxel_size),
             grid=self.grid,
             voxel_size=self.seen.voxel_size,
         )
@@ -253,7 +254,11 @@ class _Side:
     def surroundings(self) -> Surroundings:
         """Return all that the visit hit, and what of it the other could not judge."""
         rows = rows_of(self.seen.keys, self.voxels.keys)
-        return Surroundings(points=self.seen.points, unjudged=(rows < 0) | ~self.voxels.judged[rows])
+        return Surroundings(
+            points=self.seen.points,
+            unjudged=(rows < 0) | ~self.voxels.judged[rows],
+            voxel_size=self.seen.voxel_size,
+        )
 
     def _rows(self, region: Region) -> NDArray[np.int64]:
         rows = rows_of(self.voxels.keys[region.rows], self.seen.keys)
@@ -267,8 +272,11 @@ class _Side:
 
     def _observed_share(self, place: Place) -> float:
         """Return the share of what the visit hit in and around a place that the other could judge."""
-        around = self.seen.keys[within(place, self.seen.points, margin=(AROUND,) * 3)]
-        rows = rows_of(around, self.voxels.keys)
+        reach = math.hypot(*place.size[:2]) / 2 + 2 * AROUND
+        x, _, _ = place.center
+        near = around(self.seen.points, x - reach, x + reach, voxel_size=self.seen.voxel_size)
+        inside = within(place, self.seen.points[near], margin=(AROUND,) * 3)
+        rows = rows_of(self.seen.keys[near][inside], self.voxels.keys)
         judged = self.voxels.judged[rows[rows >= 0]]
         return float(judged.mean()) if len(judged) else 0.0
 

@@ -56,6 +56,15 @@ def place_of(points: Floats, *, hits: int, floor: float | None, grid: TileGrid, 
     )
 
 
+def around(points: Points, low: float, high: float, *, voxel_size: float) -> slice:
+    """Return where points (N, 3) of a visit lie that can have an x between the two.
+
+    They are one a voxel and in the order of the voxels' keys, so that x ascends but for less than a voxel.
+    """
+    first, last = np.searchsorted(points[:, 0], [low - voxel_size, high + voxel_size])
+    return slice(int(first), int(last))
+
+
 def within(place: Place, points: Points | Floats, *, margin: tuple[float, float, float]) -> Bools:
     """Tell (N,) which points (N, 3) lie in a place's box grown by so many metres along its axes, both ways."""
     reach = np.asarray(place.size) / 2 + margin
@@ -66,13 +75,14 @@ def within(place: Place, points: Points | Floats, *, margin: tuple[float, float,
     return answer
 
 
-def floor_below(points: Floats, reference: Points) -> float | None:
+def floor_below(points: Floats, reference: Points, *, voxel_size: float) -> float | None:
     """Return the height of the lowest surface that the map (M, 3) has near a thing (n, 3); None where it has none.
 
     Where walls go on down to the deepest that is looked at, nothing can be said.
     """
     middle, bottom = points.mean(axis=0), points[:, 2].min()
-    near = reference[np.abs(reference[:, 0] - middle[0]) < NEIGHBOURHOOD]
+    low, high = middle[0] - NEIGHBOURHOOD, middle[0] + NEIGHBOURHOOD
+    near = reference[around(reference, low, high, voxel_size=voxel_size)]
     near = near[np.hypot(near[:, 0] - middle[0], near[:, 1] - middle[1]) < NEIGHBOURHOOD]
     heights = near[(near[:, 2] > bottom - DEEPEST) & (near[:, 2] < bottom + 0.1), 2]
     if len(heights) < FEWEST:

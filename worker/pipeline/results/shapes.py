@@ -17,10 +17,13 @@ from scipy.spatial import KDTree
 
 from worker.cloud.settings import StrictModel
 from worker.cloud.types import Bools, Floats, Points
+from worker.pipeline.results.places import around
 
 TOLERANCE = 0.075  #: metres; voxels this near are the same: one and a half
-YAWS = 24  #: turns that are tried
-SHARES = (0.33, 0.67, 1.0)  #: of the way between the two, tried where they are near each other
+YAWS = (
+    24  #: turns that are tried, or half as many, with three shifts each, where two places are near each other
+)
+SHARES = (0.33, 0.67, 1.0)  #: of the way between the two: those shifts
 AS_GOOD = 0.1  #: of overlap: of motions that fit as well, the least is taken
 ROUND = 0.1  #: of overlap that no turn loses, where a shape is round
 PER_METRE = (0.1, 1.0)  #: of overlap that a metre of way weighs, level and up: things are seldom carried far
@@ -28,8 +31,9 @@ RIVAL = 0.05  #: of overlap and way together: a second pair as good as that leav
 BELONGS = 0.6  #: of a further region, that the motion lays upon the thing: then it is a part of it
 FRAGMENT = 0.08  #: of the larger of two shapes; a smaller one fits anywhere, and proves nothing
 _NEAR = (1.5, 1.0)  # times the larger size, or metres, between two places that may overlap
-_COARSE, _FINE, _KEPT = 64, 250, 4  # points a shape, and poses that are refined
+_COARSE, _FINE, _KEPT = 64, 250, 6  # points a shape, and poses that are refined
 _COARSE_REACHES, _FINE_REACHES = (0.5, 0.3, 0.2), (0.15, 0.1)  # metres to a partner, step by step
+_MOST_TURN = 0.15  # radians a step
 _LAST_REACHES = (0.1,) * 10  # sides that slide on each other take many steps
 _SAME_YAW, _SAME_SHIFT = np.radians(20), 0.15  # poses that come to rest at the same
 
@@ -78,8 +82,9 @@ class Shape:
 class Surroundings:
     """What one visit saw."""
 
-    points: Points  #: (V, 3) metres, map frame, ascending in the cells of x
+    points: Points  #: (V, 3) metres, map frame, one a voxel, in the order of the voxels' keys
     unjudged: Bools  #: (V,) what the other visit could not judge
+    voxel_size: float  #: metres
 
     def within(self, low: Floats, high: Floats) -> Floats:
         """Return the points (n, 3) in a box."""
@@ -91,10 +96,10 @@ class Surroundings:
         return points[unjudged]
 
     def _boxed(self, low: Floats, high: Floats) -> tuple[Floats, Bools]:
-        first, last = np.searchsorted(self.points[:, 0], [low[0] - TOLERANCE, high[0] + TOLERANCE])
-        points = self.points[first:last].astype(np.float64)
+        rows = around(self.points, low[0], high[0], voxel_size=self.voxel_size)
+        points = self.points[rows].astype(np.float64)
         inside = np.all((points >= low) & (points <= high), axis=1)
-        return points[inside], self.unjudged[first:last][inside]
+        return points[inside], self.unjudged[rows][inside]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
@@ -196,11 +201,11 @@ class Fit:
         way = now.points.mean(axis=0) - middle
         if near:
             way[2] = 0.0  # of parts of a thing, which may be of different heights
-        yaws = np.arange(YAWS) * 2 * np.pi / YAWS
+        turns = YAWS // 2 if near else YAWS
         shares = np.array(SHARES) if near else np.ones(1)
         poses = _Poses(
-            yaws=np.tile(_halved(yaws), len(shares)),
-            shifts=np.repeat(shares, YAWS)[:, None] * way,
+            yaws=np.tile(_halved(np.arange(turns) * 2 * np.pi / turns), len(shares)),
+            shifts=np.repeat(shares, turns)[:, None] * way,
             middle=middle,
         )
         coarse = _Pair(
@@ -209,7 +214,7 @@ class Fit:
         poses = coarse.refined(poses, _COARSE_REACHES)
         overlaps = coarse.overlaps(poses)
         is_round = not near and bool(overlaps.min() > overlaps.max() - ROUND)
-        best = np.argsort(-overlaps, kind="stable")[: _KEPT * len(shares)]
+        best = np.argsort(-overlaps, kind="stable")[:_KEPT]
         fine = _Pair(before=_thinned(before.points, _FINE), now=_thinned(now.points, _FINE), trees=trees)
         poses = fine.refined(poses.subset(best), _FINE_REACHES)
         poses = fine.refined(poses.subset(poses.least(fine.overlaps(poses))), _LAST_REACHES)
@@ -385,7 +390,7 @@ def _stepped(poses: _Poses, at: Floats, residuals: Floats) -> _Poses:
     center = np.where(known[:, :, None], at, 0.0).sum(axis=1) / count[:, None]
     arms = np.where(known[:, :, None], at - center[:, None], 0.0)
     torque = (arms[:, :, 0] * gaps[:, :, 1] - arms[:, :, 1] * gaps[:, :, 0]).sum(axis=1)
-    turn = np.clip(torque / np.maximum((arms[:, :, :2] ** 2).sum(axis=(1, 2)), 1e-6), -0.1, 0.1)
+    turn = np.clip(torque / np.maximum((arms[:, :, :2] ** 2).sum(axis=(1, 2)), 1e-6), -_MOST_TURN, _MOST_TURN)
     turned = _Poses(yaws=turn, shifts=np.zeros((len(turn), 3)), middle=np.zeros(3)).turns
     # about the partners' centre: where the poses' own middle comes to lie
     arm = poses.middle + poses.shifts - center

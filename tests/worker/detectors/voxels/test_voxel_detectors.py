@@ -18,6 +18,7 @@ from worker.detectors.detector import Detection, Detector, VoxelScores
 from worker.detectors.store import make_detector, open_detector
 from worker.detectors.voxel_net.detector import BLIND, SEEING, VoxelNet, VoxelNetSettings
 from worker.detectors.voxels.evidence import EvidenceSettings, gathered, missing
+from worker.pipeline.results.objects import ObjectSettings, regions_of
 from worker.simulation.scenes import Scene, random_room
 from worker.simulation.scenes.mesh import box
 from worker.simulation.visits import visit
@@ -50,7 +51,8 @@ class Story:
         self.first = seen_by(visit(before, 5, seed=1))
         self.second = seen_by(visit(after, 4, seed=2))
         self.again = seen_by(visit(before, 4, seed=3))
-        self.peopled = seen_by(visit(before, 4, seed=3, people=2))
+        self.crowd = visit(before, 4, seed=3, people=2)
+        self.peopled = seen_by(self.crowd)
 
 
 @pytest.fixture(scope="module")
@@ -123,6 +125,18 @@ def test_people_who_walk_by_are_no_change_but_told_as_moving(story: Story) -> No
     _, voxels = scores(rule(), compared(story.first, story.peopled))
     assert voxels.moving.sum() > 100 > quiet.moving.sum()
     assert not (voxels.moving & (voxels.appeared > 0.5)).any()
+
+
+@pytest.mark.parametrize("scans", [4, 1])
+def test_who_walked_past_makes_neither_a_region_nor_a_tile_also_in_a_survey_of_one_scan(
+    story: Story, scans: int
+) -> None:
+    """Every scan saw people, and past them what is behind; in one scan no other tells that they were gone."""
+    peopled = seen_by(story.crowd[:scans])
+    detection, voxels = scores(rule(), compared(story.first, peopled))
+    assert voxels.moving.sum() > 100
+    assert regions_of(voxels, voxels.appeared, ObjectSettings()) == []
+    assert not (detection.change > 0.5).any()
 
 
 def test_a_tile_that_the_survey_did_not_look_at_is_not_called_unchanged(story: Story) -> None:

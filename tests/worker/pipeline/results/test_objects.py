@@ -74,18 +74,25 @@ def told(
 ) -> tuple[Comparison, VoxelScores]:
     """Compare two visits: what only one of them has has changed, and what walked has as well, but moved."""
     first, second = (_seen([floor(), *parts]) for parts in (before, [*now, *walking]))
+    moving = _seen([np.empty((0, 3)), *walking]).keys
+    return compared(first, second, moving=moving, probability=probability)
+
+
+def compared(
+    first: Seen, second: Seen, *, moving: np.ndarray | None = None, probability: float = 0.9
+) -> tuple[Comparison, VoxelScores]:
+    """Call every voxel changed that only one of two visits hit."""
     keys = np.union1d(first.keys, second.keys)
     come, gone = (
         (rows_of(keys, own.keys) >= 0) & (rows_of(keys, other.keys) < 0)
         for own, other in ((second, first), (first, second))
     )
-    moving = rows_of(keys, _seen([np.empty((0, 3)), *walking]).keys) >= 0
     voxels = VoxelScores(
         keys=keys,
         appeared=np.where(come, probability, 0).astype(np.float32),
         disappeared=np.where(gone, probability, 0).astype(np.float32),
         judged=np.ones(len(keys), bool),
-        moving=moving,
+        moving=np.isin(keys, [] if moving is None else moving),
         seen_through=np.where(come | gone, 3, 0).astype(np.int16),
     )
     grid = grid_over(first.points, tile_size=(1.5, 1.5, 1.0), voxel_size=VOXEL)
