@@ -29,9 +29,10 @@ SIDES = ("first", "second")
 Side = Literal["first", "second"]
 
 _SIZE = (0.2, 1.0)  # metres, extents of boxes and cylinders
+_BLIND_SIZE = (0.2, 0.6)  # metres, likewise where rays are unknown: what lies farther in, nobody knows
 _SOLIDS = 5  # that are put into a visit
 _KNOWN = 0.3  # metres from what a blind visit hit, within which it is said to know what stands there
-_TRIES = 60
+_TRIES = 200
 _NOISE = 0.01  # metres
 _VIEWS = 8  # places around a solid from which its surface is sampled, where there are no rays
 _THING_POINTS, _THING_SIZE, _THINNEST = 150, (0.4, 1.2), 0.25  # points; metres, longest and middle extent
@@ -126,7 +127,7 @@ def _beside(points: Points, things: Sequence[CloudObject], rng: np.random.Genera
     inwards = points.mean(axis=0)
     for _ in range(_SOLIDS):
         for _ in range(_TRIES):
-            half = np.exp(rng.uniform(np.log(_SIZE[0]), np.log(_SIZE[1]), 3)) / 2
+            half = np.exp(rng.uniform(np.log(_BLIND_SIZE[0]), np.log(_BLIND_SIZE[1]), 3)) / 2
             thing = things[int(rng.integers(len(things)))] if things and rng.random() < 2 / 3 else None
             half = half if thing is None else thing.half
             spot = points[int(rng.integers(len(points)))].astype(np.float64)

@@ -120,7 +120,7 @@ def _close_up(axes: Axes, visits: TwoVisits, thing: FoundObject, across: tuple[i
 
 def _plan(axes: Axes, visits: TwoVisits) -> None:
     points = _points((*visits.first, *visits.second))
-    low, high = np.percentile(points[:, :2], [0.5, 99.5], axis=0)
+    low, high = np.percentile(points[:, :2], [1.5, 98.5], axis=0)
     plots.draw_plan(axes, points[((points[:, :2] > low - 0.5) & (points[:, :2] < high + 0.5)).all(axis=1)])
     for scan in (*visits.first, *visits.second):
         if scan.sensor_origin is not None:
