@@ -28,7 +28,7 @@ def changed_tiles(before: list[ScanFile], after: list[ScanFile], cloud: Path) ->
     built = build_map(before, settings=settings)
     survey = locate_survey(after, built.reference, settings=settings)
     changes = detect(survey.comparison, detector)
-    write_coloured_cloud(cloud, survey.current, changes)
+    write_coloured_cloud(cloud, built.reference.points, survey.current.points, changes)
     return [tile for tile in tile_results(changes) if tile.state == "changed"]
 
 

@@ -189,6 +189,21 @@ class Client:
         """
         return self._json("GET", f"/maps/{_quoted(map_id)}/changes", params=_given(**filters))
 
+    def survey_objects(self, survey_id: str, **filters: Any) -> Document:
+        """Return one page of the things that a survey found changed; filters: `kind min_probability limit cursor`."""
+        return self._json("GET", f"/surveys/{_quoted(survey_id)}/objects", params=_given(**filters))
+
+    def objects(self, map_id: str, **filters: Any) -> Document:
+        """Return one page of the changed things of a map, each once over all surveys.
+
+        Filters are those of the API: `kind status last_known transient bbox datetime min_probability limit cursor`.
+        """
+        return self._json("GET", f"/maps/{_quoted(map_id)}/objects", params=_given(**filters))
+
+    def object(self, map_id: str, object_id: str) -> Document:
+        """Return one changed thing of a map with each sighting of it."""
+        return self._json("GET", f"/maps/{_quoted(map_id)}/objects/{_quoted(object_id)}")
+
     # jobs and models
 
     def jobs(self) -> list[Document]:

@@ -23,12 +23,19 @@ MAP_FRAME = "http://www.opengis.net/def/crs/OGC/0/Engineering3D"
 
 
 def tile_collection(features: Iterable[dict[str, Any]], *, matched: int | None = None) -> dict[str, Any]:
-    """Return a FeatureCollection without links; `matched` counts the features of every page, left out: these."""
+    """Return a FeatureCollection of tiles without links; `matched` counts those of every page, left out: these."""
+    return feature_collection(features, FEATURE_TYPE, matched=matched)
+
+
+def feature_collection(
+    features: Iterable[dict[str, Any]], feature_type: str, *, matched: int | None = None
+) -> dict[str, Any]:
+    """Return a FeatureCollection of one type in the map's frame, without links."""
     features = list(features)
     return {
         "type": "FeatureCollection",
         "conformsTo": list(CONFORMS_TO),
-        "featureType": FEATURE_TYPE,
+        "featureType": feature_type,
         "coordRefSys": MAP_FRAME,
         "numberMatched": len(features) if matched is None else matched,
         "numberReturned": len(features),
@@ -65,7 +72,7 @@ def tile_feature(
         "type": "Feature",
         "id": f"{survey['survey_id']}.{tile_id}",
         "geometry": geometry,
-        "place": _prism(lower, upper),
+        "place": prism(footprint(lower, upper), lower[2], upper[2]),
         "time": None if captured_at is None else {"timestamp": captured_at},
         "properties": {
             "tile_id": tile_id,
@@ -84,11 +91,10 @@ def tile_feature(
     }
 
 
-def _prism(lower: Corner, upper: Corner) -> dict[str, Any]:
-    """Return a box over its footprint (JSON-FG, Prism)."""
-    ring = [list(corner) for corner in footprint(lower, upper)]
-    base = {"type": "Polygon", "coordinates": [ring]}
-    return {"type": "Prism", "base": base, "lower": lower[2], "upper": upper[2]}
+def prism(ring: Ring, lower: float, upper: float) -> dict[str, Any]:
+    """Return an upright solid over its closed footprint (JSON-FG, Prism)."""
+    base = {"type": "Polygon", "coordinates": [[list(corner) for corner in ring]]}
+    return {"type": "Prism", "base": base, "lower": lower, "upper": upper}
 
 
 def footprint(lower: Corner, upper: Corner) -> Ring:

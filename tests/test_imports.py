@@ -27,6 +27,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "service.logs": (),
     "service.client": (),
     "service.tile_features": (),
+    "service.object_features": ("service.tile_features",),
     "service.catalog": ("service.errors", "service.settings"),
     "service.queue": ("service.catalog.steps", "service.errors"),
     "service.api.http": (
@@ -38,6 +39,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
         "service.api.http",
         "service.catalog",
         "service.tile_features",
+        "service.object_features",
         "service.queue",
         "service.errors",
         "service.settings",
@@ -161,6 +163,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
     ),
     "worker.cli": (
         "service.tile_features",
+        "service.object_features",
         "worker.demo",
         "worker.benchmarks",
         "worker.simulation",

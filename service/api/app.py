@@ -13,7 +13,7 @@ from fastapi.openapi.utils import get_openapi
 from pydantic import BaseModel
 from pydantic.json_schema import JsonSchemaMode, models_json_schema
 
-from service.api import changes, health, jobs, maps, models, scans, surveys, versions
+from service.api import changes, health, jobs, maps, models, objects, scans, surveys, versions
 from service.api.features import TileCollection
 from service.api.http import problems
 from service.api.http.bodies import INCOMING
@@ -27,8 +27,8 @@ from service.queue import JobQueue
 from service.settings import Settings
 
 DESCRIPTION = """\
-Upload LiDAR scans of a building, build a reference map of them, and ask, tile by tile, \
-what a later visit found changed.
+Upload LiDAR scans of a building, build a reference map of them, and ask, tile by tile and \
+object by object, what later visits found changed.
 
 Maps, their versions and surveys are built by jobs: the answer to the POST names the job, \
 and `GET /jobs/{id}` says how far it is.
@@ -46,7 +46,13 @@ UNSEEN: dict[JsonSchemaMode, tuple[type[BaseModel], ...]] = {
         surveys.SurveyRequest,
         models.TrainingRequest,
     ),
-    "serialization": (problems.ProblemDocument, TileCollection),
+    "serialization": (
+        problems.ProblemDocument,
+        TileCollection,
+        objects.SightingCollection,
+        objects.ObjectCollection,
+        objects.ObjectHistory,
+    ),
 }
 
 
@@ -87,7 +93,7 @@ def create_app(settings: Settings, *, queue: Queue | None = None) -> FastAPI:
     app.state.metrics = Metrics()
     app.add_middleware(MetricsMiddleware, metrics=app.state.metrics)
     problems.add_handlers(app)
-    for part in (scans, maps, versions, surveys, changes, jobs, models, health):
+    for part in (scans, maps, versions, surveys, changes, objects, jobs, models, health):
         app.include_router(part.router)
     return app
 

@@ -6,7 +6,8 @@ are written as they are built, 10,000 tiles at a time; a test holds them against
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from datetime import datetime
 from typing import Any, Literal
 
 from fastapi.responses import Response
@@ -72,8 +73,14 @@ class TileProperties(Document):
     tile_id: str = Field(examples=["tile_004_002_000"])
     tile_index: tuple[int, int, int] = Field(examples=[[4, 2, 0]])
     center: Vector3 = Field(description="metres, map frame", examples=[[6.75, 3.75, 0.5]])
-    state: TileState = Field(examples=["changed"])
-    score: float | None = Field(description="probability of change; null where unobserved", examples=[0.93])
+    state: TileState = Field(
+        description="`unobserved`: the visit could not judge enough of it; `inconsistent`: no change is proved, but the "
+        "registration there is in doubt",
+        examples=["changed"],
+    )
+    score: float | None = Field(
+        description="probability of change; null where nothing could be compared", examples=[0.93]
+    )
     probabilities: Vector3 | None = Field(
         description="unchanged, changed, different place", examples=[[0.05, 0.93, 0.02]]
     )
@@ -145,14 +152,7 @@ def feature_response(
 def feature(change: ChangeRecord, convert: ToWgs84 | None) -> dict[str, Any]:
     """Return one tile of a survey; `convert` takes points of the map frame to the Earth."""
     tile, (lower, upper) = change.tile, (change.tile.bounds.min, change.tile.bounds.max)
-    survey = change.model_dump(exclude={"tile"}) | {
-        name: None if instant is None else rfc3339(instant)
-        for name, instant in (
-            ("captured_at", change.captured_at),
-            ("first_seen", change.first_seen),
-            ("last_seen", change.last_seen),
-        )
-    }
+    survey = plain(change.model_dump(exclude={"tile"}))
     geometry = None if convert is None else on_earth(footprint(lower, upper), lower[2], convert)
     return tile_feature(
         **tile.model_dump(exclude={"bounds"}), lower=lower, upper=upper, survey=survey, geometry=geometry
@@ -166,7 +166,13 @@ def on_earth(ring: Ring, lower: float, convert: ToWgs84) -> dict[str, Any]:
     return {"type": "Polygon", "coordinates": [coordinates]}
 
 
-def documented() -> dict[int | str, dict[str, Any]]:
+def plain(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the same values with instants written out (RFC 3339)."""
+    return {name: rfc3339(value) if isinstance(value, datetime) else value for name, value in values.items()}
+
+
+def documented(answer: type[Document] = TileCollection) -> dict[int | str, dict[str, Any]]:
     """Return the 200 of a route that answers with features, for the generated API description."""
-    schema = {"$ref": f"#/components/schemas/{TileCollection.__name__}"}
-    return {200: {"description": "A JSON-FG FeatureCollection", "content": {MEDIA_TYPE: {"schema": schema}}}}
+    schema = {"$ref": f"#/components/schemas/{answer.__name__}"}
+    description = "A JSON-FG FeatureCollection" if "features" in answer.model_fields else "A JSON-FG Feature"
+    return {200: {"description": description, "content": {MEDIA_TYPE: {"schema": schema}}}}

@@ -227,6 +227,7 @@ def map_document(record: MapRecord, request: HttpRequest) -> MapDocument:
         links += [
             *file_links(request, here),
             link(request, f"{here}/changes", "changes", "application/geo+json"),
+            link(request, f"{here}/objects", "objects", "application/geo+json"),
         ]
     return MapDocument(**dict(record), links=links)
 

@@ -104,7 +104,7 @@ def list_surveys(
 
 @router.get("/surveys/{survey_id}", summary="Look at a survey", responses=NAMED)
 def get_survey(request: HttpRequest, services: Provided, survey_id: SurveyId) -> SurveyDocument:
-    """Its state, what became of each scan, and the tiles in each state once it is ready."""
+    """Its state, what became of each scan, and once it is ready the tiles in each state and the objects of each kind."""
     return survey_document(services.catalog.surveys.get(survey_id), request)
 
 
@@ -200,4 +200,6 @@ def survey_document(record: SurveyRecord, request: HttpRequest) -> SurveyDocumen
             link(request, f"{here}/cloud.ply", "cloud", bodies.RAW),
             link(request, f"{here}/picture.png", "preview", "image/png"),
         ]
+    if record.status == "ready" and record.objects is not None:
+        links.append(link(request, f"{here}/objects", "objects", features.MEDIA_TYPE))
     return SurveyDocument(**dict(record), links=links)

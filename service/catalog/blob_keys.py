@@ -53,6 +53,7 @@ map_cloud = _within(map_folder, "cloud.ply")  #: the fused reference map
 map_reference = _within(
     map_folder, "reference.npz"
 )  #: points, normals and grid, which surveys are compared with
+map_seen = _within(map_folder, "seen.npz")  #: what the map's scans saw; release 0.1 kept no such file
 map_tiles = _within(map_folder, "tiles.npz")  #: where release 0.1 kept the grid; later ones have no such file
 map_manifest = _within(map_folder, "manifest.json")  #: the tile manifest (paper, Table A1)
 map_work = _within(map_folder, "work/")  #: what the building of a map remembers of itself while it lasts
@@ -66,6 +67,12 @@ def map_embedding(job_id: str, model: str, fingerprint: str) -> str:
     """
     made_by = f"{model.replace('/', '-')}-{fingerprint[:12]}"
     return f"{map_folder(job_id)}description-{safe_name(made_by)}.npz"
+
+
+def map_alarms(job_id: str, model: str, fingerprint: str) -> str:
+    """Name what one model found on the map's own scans, where nothing had changed; named as an embedding is."""
+    made_by = f"{model.replace('/', '-')}-{fingerprint[:12]}"
+    return f"{map_folder(job_id)}alarms-{safe_name(made_by)}.npz"
 
 
 def map_scan(job_id: str, scan_id: str) -> str:
@@ -100,6 +107,7 @@ def survey_folder(survey_id: str) -> str:
 
 
 survey_current = _within(survey_folder, "current.npz")  #: the survey's scans fused in the map frame
+survey_seen = _within(survey_folder, "seen.npz")  #: what the survey's scans saw
 survey_scores = _within(
     survey_folder, "scores.npz"
 )  #: probabilities of tiles, and of voxels where there are such

@@ -11,6 +11,7 @@ from service.catalog.database import Database
 from service.catalog.jobs import Jobs
 from service.catalog.maps import Maps
 from service.catalog.models import Models
+from service.catalog.objects import Objects
 from service.catalog.scans import Scans
 from service.catalog.surveys import Surveys
 from service.catalog.versions import Versions
@@ -29,6 +30,7 @@ class Catalog:
     surveys: Surveys
     models: Models
     changes: Changes
+    objects: Objects
     jobs: Jobs
 
     def close(self) -> None:
@@ -55,5 +57,6 @@ def open_catalog(settings: Settings, *, migrate: bool = True) -> Catalog:
         surveys=Surveys(database, blobs),
         models=Models(database),
         changes=Changes(database),
+        objects=Objects(database),
         jobs=Jobs(database),
     )

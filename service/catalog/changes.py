@@ -97,9 +97,7 @@ def _instant(wanted: ChangeFilter) -> InstrumentedAttribute[datetime]:
 
 
 def _matching(wanted: ChangeFilter) -> Select[tables.SurveyTile, tables.Survey, tables.TileChange]:
-    query: Select[Any] = _TILES.where(
-        _SURVEY.map_id == wanted.map_id, _SURVEY.status == "ready", _TILE.state == "changed"
-    )
+    query = _TILES.where(_SURVEY.map_id == wanted.map_id, _SURVEY.status == "ready", _TILE.state == "changed")
     if wanted.once:
         query = query.where(_TILE.survey_id == _TILE.told_by)
     instant, score = _instant(wanted), _TOLD.max_score if wanted.once else _TILE.score

@@ -10,12 +10,12 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any, get_args
 
-from sqlalchemy import ColumnElement, Select, and_, delete, exists, select, tuple_, update
+from sqlalchemy import ColumnElement, Row, Select, and_, delete, exists, select, tuple_, update
 from sqlalchemy.orm import Session
 
 from service.catalog import tables
 from service.catalog.database import Database
-from service.catalog.records import ObjectRecord, ObjectStatus, Place
+from service.catalog.records import ObjectStatus, Place
 from service.catalog.stays import Look, Stay, stays
 from service.catalog.tables import (
     Acceptance,
@@ -72,15 +72,28 @@ def _ready(map_id: str) -> ColumnElement[bool]:
 def _accept(session: Session, version: tables.MapVersion, survey_id: str) -> None:
     """Keep what a version took over of a survey, for either may be deleted later."""
     tiles = select(SurveyTile.tile_id).where(SurveyTile.survey_id == survey_id, SurveyTile.state == "changed")
-    objects = select(SurveyObject).where(SurveyObject.survey_id == survey_id).order_by(SurveyObject.number)
+    replaced = list(session.scalars(tiles.order_by(SurveyTile.tile_id)))
+    objects = select(SurveyObject.now, SurveyObject.before).where(SurveyObject.survey_id == survey_id)
+    objects = objects.order_by(SurveyObject.number)
     session.add(
         Acceptance(
             map_id=version.map_id,
             version=version.version,
-            tiles=list(session.scalars(tiles.order_by(SurveyTile.tile_id))),
-            objects=[ObjectRecord.of_row(row).model_dump(mode="json") for row in session.scalars(objects)],
+            tiles=replaced,
+            objects=[
+                _taken_over(now_at, before_at, set(replaced))
+                for now_at, before_at in session.execute(objects)
+            ],
         )
     )
+
+
+def _taken_over(
+    now_at: dict[str, Any] | None, before_at: dict[str, Any] | None, replaced: set[str]
+) -> dict[str, Any]:
+    """Return the places of an object that the map follows: what is new joins it; what is gone leaves replaced tiles."""
+    left = before_at is not None and not replaced.isdisjoint(before_at["tiles"])
+    return {"now": now_at, "before": before_at if left else None}
 
 
 # tiles
@@ -123,28 +136,23 @@ def _changes_of(map_id: str) -> Select[TileChange]:
 
 def _looks(session: Session, map_id: str) -> tuple[dict[str, list[Look]], dict[tuple[str, str], str | None]]:
     """Return the looks at each tile that ever changed, and by (survey, tile) what each changed one is told by now."""
-    ever = select(SurveyTile.tile_id).join(Survey, Survey.survey_id == SurveyTile.survey_id)
-    ever = ever.where(_ready(map_id), SurveyTile.state == "changed")
-    query = select(
-        SurveyTile.tile_id,
-        SurveyTile.survey_id,
-        Survey.captured_at,
-        Survey.map_version,
-        SurveyTile.state,
-        SurveyTile.score,
-        SurveyTile.told_by,
-    ).join(Survey, Survey.survey_id == SurveyTile.survey_id)
-    query = query.where(
-        _ready(map_id), SurveyTile.state.in_(("changed", "unchanged")), SurveyTile.tile_id.in_(ever)
-    )
+    surveys = select(Survey.survey_id, Survey.captured_at, Survey.map_version).where(_ready(map_id))
+    about = {
+        survey_id: (captured_at, version) for survey_id, captured_at, version in session.execute(surveys)
+    }
+    tile, of_survey = SurveyTile, Survey.survey_id == SurveyTile.survey_id
+    ever = select(tile.tile_id).join(Survey, of_survey).where(_ready(map_id), tile.state == "changed")
+    query = select(tile.tile_id, tile.survey_id, tile.state, tile.score, tile.told_by).join(Survey, of_survey)
+    query = query.where(_ready(map_id), tile.state.in_(("changed", "unchanged")), tile.tile_id.in_(ever))
     looks: dict[str, list[Look]] = {}
     told: dict[tuple[str, str], str | None] = {}
-    for tile_id, survey_id, captured_at, map_version, state, score, told_by in session.execute(query):
+    for tile_id, survey_id, state, score, told_by in session.execute(query):
+        captured_at, version = about[survey_id]
         changed = state == "changed"
         look = Look(
             survey_id=survey_id,
             captured_at=captured_at,
-            map_version=map_version,
+            map_version=version,
             score=score if changed else None,
         )
         looks.setdefault(tile_id, []).append(look)
@@ -213,13 +221,17 @@ def _rewrite_objects(session: Session, map_id: str, accepted: Sequence[Acceptanc
     return tracks
 
 
-def _sightings(session: Session, map_id: str) -> dict[tuple[str, int], SurveyObject]:
-    query = select(SurveyObject).join(Survey, Survey.survey_id == SurveyObject.survey_id)
-    query = query.where(_ready(map_id)).order_by(SurveyObject.survey_id, SurveyObject.number)
-    return {(row.survey_id, row.number): row for row in session.scalars(query)}
+def _sightings(session: Session, map_id: str) -> dict[tuple[str, int], Row[Any]]:
+    """Return the columns of every sighting by survey and number; whole objects would cost ten times as much."""
+    row = SurveyObject
+    query = select(
+        row.survey_id, row.number, row.object_id, row.kind, row.probability, row.now, row.before
+    ).join(Survey, Survey.survey_id == row.survey_id)
+    query = query.where(_ready(map_id)).order_by(row.survey_id, row.number)
+    return {(found.survey_id, found.number): found for found in session.execute(query)}
 
 
-def _visits(session: Session, map_id: str, sightings: Mapping[tuple[str, int], SurveyObject]) -> list[Visit]:
+def _visits(session: Session, map_id: str, sightings: Mapping[tuple[str, int], Row[Any]]) -> list[Visit]:
     """Return the surveys that tell objects, with what they could judge of the tiles that any object touches."""
     found: dict[str, list[Sighting]] = {}
     for (survey_id, number), row in sightings.items():
@@ -283,7 +295,7 @@ def _latest(seen: tuple[Visit, Sighting]) -> tuple[Any, ...]:
     return visit.captured_at, visit.survey_id, "now" in one.parts, one.number
 
 
-def _write_track(row: MapObject, track: Track, sightings: Mapping[tuple[str, int], SurveyObject]) -> None:
+def _write_track(row: MapObject, track: Track, sightings: Mapping[tuple[str, int], Row[Any]]) -> None:
     visit, one = max(track.sightings, key=_latest)
     latest = sightings[visit.survey_id, one.number]
     place = Place.model_validate(latest.now or latest.before)

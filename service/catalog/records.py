@@ -143,9 +143,12 @@ class TileRecord(Record):
 
     @model_validator(mode="after")
     def _scored_where_observed(self) -> Self:
+        """Check that a tile has a score where it was observed; one that was judged in part may have one, too."""
         unscored = self.score is None or self.probabilities is None
-        if unscored != (self.state == "unobserved"):
-            raise ValueError(f"{self.tile_id}: a tile has a score exactly where it was observed")
+        if unscored and self.state != "unobserved":
+            raise ValueError(f"{self.tile_id}: a tile that was observed has a score")
+        if not unscored and self.state == "unobserved" and self.observed_share is None:
+            raise ValueError(f"{self.tile_id}: of tiles alone, one that was not observed has no score")
         return self
 
 
@@ -168,7 +171,7 @@ class Place(Record):
     footprint: Annotated[tuple[Vector2, ...], AfterValidator(_open_counter_clockwise)]
     #: x, y of the outline from above; taken closed or not and either way round, kept open and counter-clockwise
     height_over_floor: float | None  #: of the lower side; None: no floor was seen
-    volume: float = Field(ge=0)  #: cubic metres, of the voxels
+    volume: float = Field(ge=0)  #: cubic metres, of the convex hull of what was seen
     voxels: int = Field(ge=0)
     points: int = Field(ge=0)
     tiles: tuple[str, ...]  #: ids of the tiles that it touches
@@ -185,7 +188,7 @@ class Motion(Record):
     """How a thing was moved, now_from_before: turned about its upright axis, then shifted."""
 
     translation: Vector3  #: metres, from the earlier center to the later one
-    yaw: float  #: radians, counter-clockwise
+    yaw: float | None  #: radians, counter-clockwise; None: the shape is round
 
 
 class ObjectRecord(Record):
@@ -340,3 +343,31 @@ class ChangeRecord(Record):
     )
     last_seen: Utc | None = None  #: when one last saw it, before it was gone
     max_score: float | None = None  #: over the surveys that saw it
+
+
+class SightingRecord(Record):
+    """An object of a survey with what a client needs beside it."""
+
+    thing: ObjectRecord
+    object_id: str | None  #: of the object that it is a sighting of; None before the survey is ready
+    map_id: str
+    map_version: int
+    survey_id: str
+    model: str
+    captured_at: Utc
+    first_seen: Utc | None  #: of the object, by any survey
+
+
+class MapObjectRecord(Record):
+    """A changed thing of a map, over all surveys that tell objects."""
+
+    object_id: str
+    status: ObjectStatus
+    last_known: ObjectStatus  #: as the latest survey that looked there told it
+    transient: bool  #: it comes and goes
+    first_seen: Utc
+    last_seen: Utc
+    last_looked: Utc
+    accepted_in_version: int | None  #: the version of the map that has taken it over
+    sightings: int  #: surveys that saw it
+    latest: SightingRecord

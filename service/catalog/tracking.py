@@ -9,12 +9,12 @@ has a thing that is gone; of what moved it has both. Sightings are one object wh
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
-from itertools import pairwise
 from typing import Literal
 
 from service.catalog.records import ObjectStatus, Vector3
@@ -26,6 +26,7 @@ MIN_REACH = 0.3  #: metres; how far apart the centers of two sightings of a smal
 MAX_SIZE_RATIO = 2.0  #: of each side of the box; what is seen from one side only looks smaller
 SIZE_SLACK = 0.1  #: metres, added to each side before the ratio: two voxels
 MIN_LOOK = 0.5  #: mean share observed of the tiles that a part touches; less is no look
+CELL = 1.0  #: metres; only how fast it goes depends on it
 SETTLED = 3  #: looks in a row that see a thing which came back; then it stays
 
 
@@ -110,8 +111,6 @@ def difference(a: Part, b: Part) -> float | None:
     """
     small, large = sorted((a, b), key=lambda part: (part.size[0] * part.size[1], part.center))
     east, north, up = (there - here for here, there in zip(small.center, large.center, strict=True))
-    if max(abs(east), abs(north)) > max(MIN_REACH, math.hypot(small.size[0], small.size[1])):
-        return None  # most pairs end here
     cos, sin = math.cos(small.yaw), math.sin(small.yaw)
     offset = (cos * east + sin * north, cos * north - sin * east, up)
     if any(abs(along) > max(MIN_REACH, side / 2) for along, side in zip(offset, small.size, strict=True)):
@@ -147,12 +146,47 @@ class _Trail:
             key=lambda seen: (seen[0].captured_at, seen[0].survey_id, seen[1].number),
         )
         self.parts |= other.parts
-        other.sightings = []
+        other.sightings, other.parts = [], {}
 
     @property
     def version(self) -> int:
         """Of the map, that its latest sighting was compared with."""
         return self.sightings[-1][0].map_version
+
+
+@dataclass(kw_only=True, slots=True)
+class _Trails:
+    """The trails so far, and which of them were ever near a place: most pairs of parts are never compared."""
+
+    trails: list[_Trail] = field(default_factory=list)
+    cells: dict[tuple[int, int], set[int]] = field(default_factory=dict)  #: of the ground, CELL metres wide
+
+    def add(self, number: int | None, visit: Visit, sighting: Sighting) -> None:
+        """Go on from a trail, or begin one."""
+        if number is None:
+            number = len(self.trails)
+            self.trails.append(_Trail())
+        self.trails[number].add(visit, sighting)
+        for part in sighting.parts.values():
+            self.cells.setdefault(_cell(part.center), set()).add(number)
+
+    def take_over(self, older: int, newer: int) -> None:
+        """Make two trails one."""
+        for part in self.trails[newer].parts.values():
+            self.cells.setdefault(_cell(part.center), set()).add(older)
+        self.trails[older].take_over(self.trails[newer])
+
+    def near(self, part: Part) -> list[int]:
+        """Return the trails that may be alike to a part: no farther than the largest box that is."""
+        reach = math.sqrt(2) * max(MIN_REACH, max(part.size[:2]) + SIZE_SLACK)
+        x, y, z = part.center
+        (i0, j0), (i1, j1) = _cell((x - reach, y - reach, z)), _cell((x + reach, y + reach, z))
+        cells = itertools.product(range(i0, i1 + 1), range(j0, j1 + 1))
+        return sorted(set().union(*(self.cells.get(cell, ()) for cell in cells)))
+
+
+def _cell(center: Vector3) -> tuple[int, int]:
+    return math.floor(center[0] / CELL), math.floor(center[1] / CELL)
 
 
 @dataclass(frozen=True, order=True, slots=True)
@@ -166,30 +200,31 @@ class _Match:
 
 
 def _trails(visits: Sequence[Visit], accepted: Sequence[Accepted]) -> list[_Trail]:
-    trails: list[_Trail] = []
+    known = _Trails()
     for visit in visits:
-        matched = _matched(_matches(trails, visit, accepted))
+        matched = _matched(_matches(known, visit, accepted))
         going_on: set[int] = set()
-        new = []
         # one that has no choice goes first
         for n in sorted(range(len(visit.sightings)), key=lambda n: (len(matched.get(n, {})), n)):
-            number = _joined(trails, matched.get(n, {}), going_on)
-            if number is None:
-                new.append(_Trail())
-            else:
+            number = _joined(known, matched.get(n, {}), going_on)
+            known.add(number, visit, visit.sightings[n])
+            if number is not None:
                 going_on.add(number)
-            trail = new[-1] if number is None else trails[number]
-            trail.add(visit, visit.sightings[n])
-        trails = [trail for trail in [*trails, *new] if trail.sightings]
-    return trails
+    return sorted((trail for trail in known.trails if trail.sightings), key=_begin)
 
 
-def _matches(trails: Sequence[_Trail], visit: Visit, accepted: Sequence[Accepted]) -> list[_Match]:
+def _begin(trail: _Trail) -> tuple[datetime, str, int]:
+    visit, sighting = trail.sightings[0]
+    return visit.captured_at, visit.survey_id, sighting.number
+
+
+def _matches(known: _Trails, visit: Visit, accepted: Sequence[Accepted]) -> list[_Match]:
     """Return every pair of parts that are alike, best first; a version that took the thing over stands between none."""
     found = []
-    for t, trail in enumerate(trails):
-        for n, sighting in enumerate(visit.sightings):
-            for side, part in sighting.parts.items():
+    for n, sighting in enumerate(visit.sightings):
+        for side, part in sighting.parts.items():
+            for t in known.near(part):
+                trail = known.trails[t]
                 if side not in trail.parts:
                     continue
                 off = difference(trail.parts[side], part)
@@ -226,16 +261,16 @@ def _matched(matches: Iterable[_Match]) -> dict[int, dict[Side, int]]:
     return matched
 
 
-def _joined(trails: Sequence[_Trail], matched: Mapping[Side, int], going_on: Collection[int]) -> int | None:
+def _joined(known: _Trails, matched: Mapping[Side, int], going_on: Collection[int]) -> int | None:
     """Return the trail that a sighting goes on from, None for a new one; `matched` holds the better match first.
 
     What was told as one thing that came and another that went, and is told as one that moved, becomes one trail.
     Where the sides lead to two things that both have moved, it is one that no sighting of this visit went on from.
     """
     found = list(dict.fromkeys(matched.values()))
-    if len(found) == 2 and not trails[found[0]].parts.keys() & trails[found[1]].parts.keys():
+    if len(found) == 2 and not known.trails[found[0]].parts.keys() & known.trails[found[1]].parts.keys():
         older, newer = sorted(found)
-        trails[older].take_over(trails[newer])
+        known.take_over(older, newer)
         return older
     return next((number for number in found if number not in going_on), found[0] if found else None)
 
@@ -283,11 +318,11 @@ def _verdicts(trail: _Trail, visits: Sequence[Visit], accepted_in: int | None) -
         seen.setdefault(visit.survey_id, []).append(sighting)
     parts: dict[Side, Part] = {}
     verdicts: list[tuple[Visit, Verdict]] = []
-    for visit in visits:
+    for visit in visits[visits.index(trail.sightings[0][0]) :]:
         for sighting in seen.get(visit.survey_id, ()):
             parts |= sighting.parts
-        if not parts or (accepted_in is not None and visit.map_version >= accepted_in):
-            continue
+        if accepted_in is not None and visit.map_version >= accepted_in:
+            continue  # asked a map that has the thing
         if visit.survey_id in seen:
             verdicts.append((visit, "seen"))
         else:
@@ -315,7 +350,7 @@ def comes_and_goes(looks: Sequence[Verdict]) -> bool:
     that is a change which was undone.
     """
     came_back, run = False, 1
-    for earlier, later in pairwise(looks):
+    for earlier, later in itertools.pairwise(looks):
         run = run + 1 if later == earlier else 1
         if (earlier, later) == ("gone", "seen"):
             came_back = True

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from service.cli import jobs, maps, models, scans, surveys, up, versions
+from service.cli import jobs, maps, models, objects, scans, surveys, up, versions
 from service.cli.terminal import Terminal
 from service.client import DEFAULT_URL, ClientError
 from service.up.embedded_redis import LaunchFailed
@@ -33,7 +33,7 @@ def _commands() -> typer.Typer:
         no_args_is_help=True,
         add_completion=False,
         pretty_exceptions_enable=False,
-        help="Says what changed in a building: LiDAR scans in, changed tiles out.",
+        help="Says what changed in a building: LiDAR scans in, changed objects and tiles out.",
     )
     commands.callback()(_options)
     commands.command()(up.up)
@@ -44,6 +44,7 @@ def _commands() -> typer.Typer:
     of_surveys = (surveys.submit, surveys.list_, surveys.show)
     _add_group(commands, "surveys", "Later visits of a mapped space.", *of_surveys)
     commands.command()(surveys.changes)
+    commands.command()(objects.objects)
     commands.command()(jobs.jobs)
     of_models = _add_group(commands, "models", "Models that score tiles; alone, it lists them.", models.train)
     of_models.info.no_args_is_help = False

@@ -19,6 +19,10 @@ def create(
     map_id: Annotated[str | None, typer.Option("--id", help="Id of the map; left out: one is made.")] = None,
     name: Annotated[str | None, typer.Option(help="For people.")] = None,
     model: Model = None,
+    alarms_per_survey: Annotated[
+        float | None,
+        typer.Option("--alarms-per-survey", help="False objects that a visit without changes may have."),
+    ] = None,
     device_id: Device = None,
     captured_at: Captured = None,
     wait: Wait = False,
@@ -27,7 +31,8 @@ def create(
     terminal: Terminal = ctx.obj
     with terminal.client() as client:
         ids = terminal.scan_ids(client, scans, device_id=device_id, captured_at=captured_at)
-        accepted = client.create_map(ids, map_id=map_id, name=name, model=model)
+        settings = None if alarms_per_survey is None else {"alarms_per_survey": alarms_per_survey}
+        accepted = client.create_map(ids, map_id=map_id, name=name, model=model, settings=settings)
         map_id = accepted["map_id"]
         terminal.accepted(client, f"map {map_id}", accepted, wait, lambda: client.map(map_id), _whole)
 
@@ -62,7 +67,7 @@ def _whole(document: Document) -> Group:
     bounds = document.get("bounds")
     corners = bounds and f"{point(bounds['min'])} to {point(bounds['max'])}"
     about = {"map": document["map_id"]}
-    rows = {"counts": counts(document), "bounds (m)": corners}
+    rows = {"counts": counts(document), "objects": counts(document, "objects"), "bounds (m)": corners}
     return Group(
         facts(about | document, "map", "name", "version", "status", "model", **rows), scan_table(document)
     )

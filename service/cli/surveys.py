@@ -89,13 +89,19 @@ def _whole(url: str) -> Callable[[Document], Group]:
             "captured": survey.get("captured_at"),
         }
         here = f"{url}/surveys/{survey['survey_id']}"
-        rows = {"tiles": counts(survey)}
+        rows = {
+            "tiles": counts(survey),
+            "objects": counts(survey, "objects"),
+            "moving": survey.get("moving"),
+        }
         if survey["status"] == "ready":
             rows |= {
                 "cloud": f"{here}/cloud.ply",
                 "picture": f"{here}/picture.png",
                 "features": f"{here}/tiles",
             }
+            if survey.get("objects") is not None:
+                rows["things"] = f"{here}/objects"
         names = ("survey", "map", "status", "captured", "model", "threshold")
         return Group(facts(survey | about, *names, **rows), scan_table(survey))
 

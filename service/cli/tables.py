@@ -30,10 +30,10 @@ def facts(document: Document, *names: str, **more: Any) -> Table:
     return table
 
 
-def counts(document: Document) -> str:
-    """Write counts as `changed 3, unchanged 40`."""
+def counts(document: Document, member: str = "counts") -> str:
+    """Write counts as `changed 3, unchanged 40`; nothing where there are none."""
     return ", ".join(
-        f"{name.replace('_', ' ')} {number}" for name, number in document.get("counts", {}).items()
+        f"{name.replace('_', ' ')} {number}" for name, number in (document.get(member) or {}).items()
     )
 
 

@@ -151,8 +151,10 @@ def test_a_lower_threshold_asked_for_is_the_one_used_and_changes_are_the_changed
     assert page["numberMatched"] == len(page["features"]) == again["counts"]["changed"]
     scores = [feature["properties"]["score"] for feature in page["features"]]
     assert scores == sorted(scores, reverse=True)
-    everything = service.get("/maps/room/changes?limit=1000")
+    everything = service.get("/maps/room/changes?limit=1000&repeats=true")
     assert everything["numberMatched"] == again["counts"]["changed"] + survey["counts"]["changed"]
+    once = service.get("/maps/room/changes?limit=1000")
+    assert once["numberMatched"] == again["counts"]["changed"]  # the same visit: its tiles are among them
     half = service.get(
         f"/maps/room/changes?survey={again['survey_id']}&bbox={visits.seen_to + 0.2},-50,50,50"
     )

@@ -18,6 +18,11 @@ Figures = dict[str, Any]  #: JSON-ready
 COUNTS = ("true_positives", "false_positives", "false_negatives", "true_negatives")
 RATIOS = ("precision", "recall", "f1", "accuracy")
 AREAS = ("area_under_roc", "average_precision")
+#: Of the objects, where a method tells them.
+OBJECTS = (
+    "regions", "recall", "recall_interval", "objects", "precision", "precision_interval", "false_objects",
+    "false_objects_a_quiet_visit", "quiet_visits_with_an_object", "moved", "told_as_moved",
+)  # fmt: skip
 
 
 def record_figures(model_store: Path, model: str, files: Mapping[str, Path]) -> Path:
@@ -39,21 +44,23 @@ def outdated_sections(card: Card) -> list[str]:
     return [name for name, section in measured.items() if section.get("sha256") != card.sha256]
 
 
-def paper_figures(document: Figures, sha256: str) -> Figures:
+def paper_figures(document: Figures, card: Card) -> Figures:
     """Return the figures of `evaluate paper`, JSON-ready.
 
     They are at the threshold that was chosen on another corridor, unless the name says otherwise. Raises
     KeyError, and ValueError for other weights or a part of the experiments.
     """
-    if document["sha256"] != sha256:
-        raise ValueError(f"measured with weights {document['sha256']}, and not with the card's {sha256}")
+    if card.sha256 is None:
+        raise ValueError(f"model {card.model} has no weights that were measured")
+    if document["sha256"] != card.sha256:
+        raise ValueError(f"measured with weights {document['sha256']}, and not with the card's {card.sha256}")
     ours, *baselines = document["table_6"]
     *experiments, whole = document["table_5"]
     if whole["paper"] is None:
         raise ValueError("measured on a part of the experiments; leave out --quick")
     return {
         "command": document["command"],
-        "sha256": sha256,
+        "sha256": card.sha256,
         "tiles": document["map"]["tiles"],
         **_operating(ours),
         **_picked(ours, AREAS),
@@ -71,39 +78,50 @@ def paper_figures(document: Figures, sha256: str) -> Figures:
     }
 
 
-def revisit_figures(document: Figures, sha256: str) -> Figures:
-    """Return the figures of `evaluate revisit`, JSON-ready.
+def revisit_figures(document: Figures, card: Card) -> Figures:
+    """Return the figures of `evaluate revisit`, JSON-ready; a model without weights goes by its name.
 
     They are at the threshold that was chosen on other buildings, unless the name says otherwise. Raises KeyError,
-    and ValueError where no method had these weights.
+    and ValueError where no method was this model.
     """
-    measured = [row["sha256"] for row in document["methods"] if row["sha256"] is not None]
-    if sha256 not in measured:
-        raise ValueError(f"measured with weights {', '.join(measured)}, and not with the card's {sha256}")
-    ours = next(row for row in document["methods"] if row["sha256"] == sha256)
+    ours = [
+        row
+        for row in document["methods"]
+        if row["sha256"] == card.sha256 and (card.sha256 is not None or row["name"] == card.model)
+    ]
+    if not ours:
+        measured = [str(row["sha256"] or row["name"]) for row in document["methods"]]
+        raise ValueError(
+            f"measured with weights {', '.join(measured)}, and not with the card's {card.sha256}"
+        )
     test = document["test"]
     return {
         "command": document["command"],
-        "sha256": sha256,
+        "sha256": card.sha256,
         "visits": test["visits"],
-        "tiles": test["observed"],
-        "changed_tiles": test["changed"]["counted"],
-        **_visited(ours),
-        **_picked(ours["chosen"], COUNTS),
-        "at_test_threshold": _operating(ours["best"]),
-        "recall_by_kind": {kind: counts["recall"] for kind, counts in ours["groups"]["kind"].items()},
-        "baselines": {row["name"]: _visited(row) for row in document["methods"] if row["sha256"] is None},
+        "changed_tiles": test["changed"],
+        "unchanged_tiles": test["unchanged"],
+        **_visited(ours[0]),
+        **_picked(ours[0]["chosen"], COUNTS),
+        "at_test_threshold": _operating(ours[0]["best"]),
+        "recall_by_kind": {kind: counts["recall"] for kind, counts in ours[0]["groups"]["kind"].items()},
+        "recall_by_case": {case: counts["recall"] for case, counts in ours[0]["groups"]["case"].items()},
+        "calibration": ours[0]["calibration"],
+        "hard": _visited(ours[0]["hard"]) if "hard" in ours[0] else None,
+        "baselines": {
+            row["name"]: _visited(row)
+            for row in document["methods"]
+            if row["sha256"] is None and row is not ours[0]
+        },
     }
 
 
-SECTIONS: dict[str, Callable[[Figures, str], Figures]] = {"paper": paper_figures, "revisit": revisit_figures}
+SECTIONS: dict[str, Callable[[Figures, Card], Figures]] = {"paper": paper_figures, "revisit": revisit_figures}
 
 
 def _section(name: str, path: Path, card: Card) -> Figures:
-    if card.sha256 is None:
-        raise ValueError(f"model {card.name}/{card.version} has no weights that were measured")
     try:
-        return SECTIONS[name](json.loads(path.read_text(encoding="utf-8")), card.sha256)
+        return SECTIONS[name](json.loads(path.read_text(encoding="utf-8")), card)
     except (KeyError, IndexError, TypeError, AttributeError) as missing:
         raise ValueError(f"{path} is no result of `spicd-worker evaluate {name}`: {missing!r}") from missing
     except ValueError as other:
@@ -130,7 +148,10 @@ def _visited(row: Figures) -> Figures:
     """Return what stands side by side for every method of the revisits."""
     return {
         **_picked(row["chosen"], ("threshold", *RATIOS, "false_positive_rate", "f1_interval")),
-        **_picked(row, (*AREAS, "unchanged_visits", "unchanged_visits_with_false_alarm")),
+        **_picked(
+            row, (*AREAS, "quiet_visits", "quiet_visits_with_false_tile", "quiet_visits_with_false_alarm")
+        ),
+        "objects": None if row["objects"] is None else _picked(row["objects"], OBJECTS),
     }
 
 

@@ -16,14 +16,15 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from worker.benchmarks.baselines import installed_baselines
+from worker.benchmarks.baselines import installed_baselines, m3c2_is_installed
 from worker.benchmarks.plots import Log, read_log
-from worker.cloud.tiling import TilePairs, Tiles
+from worker.cloud.tiling import TileChoice, TilePairs, Tiles
 from worker.cloud.types import Arrays
 from worker.detectors.comparison import Comparison, side_of
 from worker.detectors.detector import Detection, Detector
 from worker.detectors.store import detector_class, open_card, open_detector, resolve_device, sha256_of
 from worker.errors import DetectorUnavailable
+from worker.pipeline.settings import PipelineSettings
 from worker.progress import Progress, no_progress
 from worker.training.log import LOG
 from worker.training.settings import detector_settings
@@ -64,6 +65,100 @@ def detector_methods(model_store: Path, model: str, weights: tuple[Path, ...]) -
             )
         )
     return tuple(methods)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class RevisitMethod:
+    """A way of comparing two visits, which may look at more than tiles."""
+
+    name: str
+    detect: Callable[[Comparison], Detection]
+    tiles: TileChoice = "dense"  #: that it scores
+    min_points: int = 512  #: of the map in a dense tile
+    stated: float | None = None  #: the threshold it comes with; None where it has none
+    sha256: str | None = None  #: of its weights; None where it has none
+    detector: Detector | None = None  #: what is calibrated on a map's own scans; None for baselines
+
+    @property
+    def tells_voxels(self) -> bool:
+        """Whether it says what of a tile changed."""
+        return self.tiles == "touched"
+
+
+def revisit_methods(
+    model_store: Path,
+    model: str,
+    weights: tuple[Path, ...],
+    pipeline: PipelineSettings,
+    *,
+    others: bool = True,
+) -> tuple[tuple[RevisitMethod, ...], list[str]]:
+    """Return the model, or the checkpoints in its place, then with `others` all else; and what is left out, and why.
+
+    All else is the other models of the store that open, and the baselines that this machine can run. Raises
+    DetectorUnavailable for the model itself, and where it needs other voxels or tiles than the pipeline makes.
+    """
+    methods = [
+        _of_detector(
+            open_model(model_store, model, path),
+            model if path is None else "/".join(path.parts[-2:]),
+            pipeline,
+            stated=path is None,
+        )
+        for path in weights or (None,)
+    ]
+    left_out = []
+    for name in stored_models(model_store) if others else ():
+        if name != model or weights:
+            try:
+                methods.append(_of_detector(open_model(model_store, name), name, pipeline))
+            except DetectorUnavailable as closed:
+                left_out.append(str(closed))
+    if others:
+        methods += [
+            RevisitMethod(name=baseline.name, detect=_of_scores(baseline.score))
+            for baseline in installed_baselines()
+        ]
+        if not m3c2_is_installed():
+            left_out.append("M3C2: py4dgeo is not installed")
+    return tuple(methods), left_out
+
+
+def stored_models(model_store: Path) -> tuple[str, ...]:
+    """List the models of a store, as in `spicd-net/1`."""
+    cards = sorted(model_store.glob("*/*/card.json"))
+    return tuple("/".join(card.parts[-3:-1]) for card in cards)
+
+
+def _of_detector(
+    detector: Detector, name: str, pipeline: PipelineSettings, *, stated: bool = True
+) -> RevisitMethod:
+    card, needs = detector.card, detector.card.preprocessing
+    made = pipeline.registration.voxel_size, pipeline.tiling.tile_size
+    if (needs.voxel_size, needs.tile_size) != made:
+        raise DetectorUnavailable(
+            f"model {name} needs voxels of {needs.voxel_size} m and tiles of {needs.tile_size}, "
+            f"and the visits have {made[0]} and {made[1]}"
+        )
+    touched = needs.tiles == "touched"
+    return RevisitMethod(
+        name=name,
+        detect=detector.detect if touched else _of_scores(CachedDetector(detector=detector).score),
+        tiles=needs.tiles,
+        min_points=needs.min_points,
+        stated=card.threshold if stated else None,
+        sha256=card.sha256,
+        detector=detector,
+    )
+
+
+def _of_scores(score: Callable[[TilePairs], TileScore]) -> Callable[[Comparison], Detection]:
+    """Make a detection of one score a tile."""
+
+    def detect(comparison: Comparison) -> Detection:
+        return Detection.of_scores(score(comparison.tile_pairs))
+
+    return detect
 
 
 def open_model(model_store: Path, model: str, weights: Path | None = None) -> Detector:

@@ -134,10 +134,10 @@ def _survey(
     scores = tile_scores(detector, survey.comparison.tile_pairs, embedding)
     clock("decide and export", 0.0)
     changes = decide(survey.comparison.tile_pairs, scores, threshold=detector.card.threshold)
-    write_coloured_cloud(folder / "cloud.ply", survey.current, changes)
+    write_coloured_cloud(folder / "cloud.ply", reference.points, survey.current.points, changes)
     tile_results(changes)
     clock("picture", 0.0)
-    draw_picture(folder / "picture.png", reference.points, survey.current, changes, title="bench")
+    draw_picture(folder / "picture.png", reference.points, survey.current.points, changes, title="bench")
     return {"observed_tiles": int(survey.comparison.observed.sum()), **clock.seconds()}
 
 

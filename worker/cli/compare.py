@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from service.object_features import object_collection, sighting_feature
 from service.tile_features import tile_collection, tile_feature
 from worker.detectors.detector import Detector
 from worker.pipeline import (
@@ -50,46 +51,56 @@ def compare(
     )
     on_map, on_survey = _titled("map", progress), _titled("survey", progress)
     built = build_map(earlier, settings=settings, progress=on_map)
-    located = locate_survey(later, built.reference, settings=settings, progress=on_survey)
-    changes = detect(located.comparison, detector, threshold=threshold, progress=on_survey)
+    located = locate_survey(
+        later, built.reference, settings=settings, reference_seen=built.seen, progress=on_survey
+    )
+    changes = detect(located.comparison, detector, threshold=threshold, settings=settings, progress=on_survey)
     return TwoVisits(built=built, located=located, changes=changes)
 
 
 def write_results(
     visits: TwoVisits, out: Path, *, map_id: str, survey_id: str, model: str
 ) -> dict[str, Path]:
-    """Write `tiles.geojson`, `cloud.ply` and `picture.png` to the folder `out`, by what they are. Raises OSError."""
+    """Write `tiles.geojson`, `cloud.ply` and `picture.png` to the folder `out`, by what they are. Raises OSError.
+
+    A detector of voxels finds objects as well, which come as `objects.geojson`.
+    """
     out.mkdir(parents=True, exist_ok=True)
-    files = {"tiles": out / "tiles.geojson", "cloud": out / "cloud.ply", "picture": out / "picture.png"}
-    survey = {
-        "map_id": map_id,
-        "survey_id": survey_id,
-        "model": model,
-        "captured_at": None,
-        "threshold": visits.changes.threshold,
-    }
-    tiles = tile_collection(
-        tile_feature(**asdict(tile), survey=survey) for tile in tile_results(visits.changes)
-    )
-    files["tiles"].write_text(json.dumps(tiles, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-    write_coloured_cloud(files["cloud"], visits.located.current, visits.changes)
-    draw_picture(
-        files["picture"],
-        visits.built.reference.points,
-        visits.located.current,
-        visits.changes,
-        title=f"{survey_id} compared with {map_id}",
-    )
+    survey = {"map_id": map_id, "survey_id": survey_id, "model": model, "captured_at": None}
+    threshold = {"threshold": visits.changes.threshold}
+    tiles = [
+        tile_feature(**asdict(tile), survey={**survey, **threshold}) for tile in tile_results(visits.changes)
+    ]
+    files = {"tiles": _written(out / "tiles.geojson", tile_collection(tiles))}
+    if visits.changes.objects is not None:
+        things = [sighting_feature(asdict(thing), survey=survey) for thing in visits.changes.objects.objects]
+        files["objects"] = _written(out / "objects.geojson", object_collection(things))
+    files |= {"cloud": out / "cloud.ply", "picture": out / "picture.png"}
+    clouds = visits.built.reference.points, visits.located.current.points
+    write_coloured_cloud(files["cloud"], *clouds, visits.changes)
+    title = f"{survey_id} compared with {map_id}"
+    draw_picture(files["picture"], *clouds, visits.changes, title=title)
     return files
 
 
+def _written(path: Path, collection: dict[str, Any]) -> Path:
+    path.write_text(json.dumps(collection, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    return path
+
+
 def document(visits: TwoVisits, files: dict[str, Path], *, model: str) -> dict[str, Any]:
-    """Return the comparison, JSON-ready; changed tiles most certain first, metres, frame of the first reference."""
+    """Return the comparison, JSON-ready; changed tiles most certain first, metres, frame of the first reference.
+
+    `objects` is null where the detector scores tiles alone.
+    """
     changed = [tile for tile in tile_results(visits.changes) if tile.state == "changed"]
+    found = visits.changes.objects
     return {
         "model": model,
         "threshold": visits.changes.threshold,
         "counts": {"tiles": len(visits.changes.states), **visits.changes.counts()},
+        "objects": None if found is None else [asdict(thing) for thing in found.objects],
+        "moving": None if found is None else found.moving,
         "reference": [_registration(outcome) for outcome in visits.built.outcomes],
         "current": [_registration(outcome) for outcome in visits.located.outcomes],
         "changed": [asdict(tile) for tile in sorted(changed, key=lambda tile: -(tile.score or 0.0))],

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -13,7 +16,7 @@ from worker.cli import terminal
 from worker.cli.options import DEFAULT_MODEL, AsJson, Device, Model, ModelStore
 from worker.detectors.card import MODEL_STORE
 
-MOST_ROWS = 20  #: changed tiles in the table; the file has all
+MOST_ROWS = 20  #: objects, or changed tiles, in the table; the file has all
 
 
 def detect(
@@ -22,9 +25,9 @@ def detect(
     more: Annotated[
         list[Path] | None, typer.Option("--reference", help="One more file of the earlier visit; repeatable.")
     ] = None,
-    out: Annotated[Path, typer.Option(help="Folder for tiles.geojson, cloud.ply and picture.png.")] = Path(
-        "changes"
-    ),
+    out: Annotated[
+        Path, typer.Option(help="Folder for objects.geojson, tiles.geojson, cloud.ply and picture.png.")
+    ] = Path("changes"),
     model: Model = DEFAULT_MODEL,
     model_store: ModelStore = MODEL_STORE,
     threshold: Annotated[
@@ -49,16 +52,34 @@ def detect(
 
 
 def summary(result: dict[str, Any]) -> Group:
-    """Show the scans, the changed tiles most certain first, and the files."""
+    """Show the scans, the objects or else the changed tiles, largest or most certain first, and the files."""
     counts = ", ".join(f"{count} {state}" for state, count in result["counts"].items())
-    changed = result["changed"]
     return Group(
         _scan_table(result),
-        *([_tile_table(changed[:MOST_ROWS])] if changed else []),
-        *([f"... and {len(changed) - MOST_ROWS} more changed tiles"] if len(changed) > MOST_ROWS else []),
+        *(_tiles(result["changed"]) if result["objects"] is None else _objects(result)),
         f"{counts}; changed is a score above {result['threshold']:.2f} ({result['model']})",
         *(f"{what:<8} {path}" for what, path in result["files"].items()),
     )
+
+
+def _objects(result: dict[str, Any]) -> list[Table | str]:
+    objects, moving = result["objects"], result["moving"]
+    counts = Counter(thing["kind"] for thing in objects)
+    told = ", ".join(f"{count} {kind}" for kind, count in counts.items()) or "no object changed"
+    meanwhile = f"; {moving} more moved during a visit" if moving else ""
+    return [*_shortened(objects, _object_table, "objects"), f"{told}{meanwhile}"]
+
+
+def _tiles(changed: list[dict[str, Any]]) -> list[Table | str]:
+    return _shortened(changed, _tile_table, "changed tiles")
+
+
+def _shortened(
+    rows: list[dict[str, Any]], table: Callable[[list[dict[str, Any]]], Table], noun: str
+) -> list[Table | str]:
+    """Return a table of the first rows, and how many more there are."""
+    shown: list[Table | str] = [table(rows[:MOST_ROWS])] if rows else []
+    return [*shown, f"... and {len(rows) - MOST_ROWS} more {noun}"] if len(rows) > MOST_ROWS else shown
 
 
 def _scan_table(result: dict[str, Any]) -> Table:
@@ -75,6 +96,31 @@ def _scan_table(result: dict[str, Any]) -> Table:
                 scan["reason"] or "",
             )
     return table
+
+
+def _object_table(objects: list[dict[str, Any]]) -> Table:
+    table = Table("object", "kind", "center (m)", "size (m)", "over the floor (m)", "moved by", "probability")
+    for thing in objects:
+        place = thing["now"] or thing["before"]
+        center, size = (", ".join(f"{value:.2f}" for value in place[name]) for name in ("center", "size"))
+        height = place["height_over_floor"]
+        table.add_row(
+            str(thing["number"]),
+            thing["kind"],
+            center,
+            size,
+            "" if height is None else f"{height:.2f}",
+            _moved_by(thing["motion"]),
+            f"{thing['probability']:.2f}",
+        )
+    return table
+
+
+def _moved_by(motion: dict[str, Any] | None) -> str:
+    if motion is None:
+        return ""
+    shift = f"{math.hypot(*motion['translation']):.2f} m"
+    return shift if motion["yaw"] is None else f"{shift}, {math.degrees(motion['yaw']):.0f}°"
 
 
 def _tile_table(tiles: list[dict[str, Any]]) -> Table:

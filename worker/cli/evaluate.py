@@ -139,31 +139,39 @@ def paper(
 def revisit(
     context: typer.Context,
     visits: Annotated[
-        int, typer.Option(min=1, help="Second visits; every three go to a building of their own.")
-    ] = 24,
+        int, typer.Option(min=1, help="Second visits; every eight go to a building of their own.")
+    ] = 48,
     validation: Annotated[
         int, typer.Option(min=1, help="Visits to other buildings, on which thresholds are chosen.")
-    ] = 12,
+    ] = 48,
+    hard: Annotated[bool, typer.Option(help="Also the hard part, counted by itself.")] = True,
     model: Model = DEFAULT_MODEL,
     model_store: ModelStore = MODEL_STORE,
     weights: Annotated[
         list[Path] | None,
         typer.Option(help="Checkpoint of `train`, instead of the model's weights; may be given again."),
     ] = None,
+    others: Annotated[
+        bool, typer.Option(help="Also the other models of the store, and what needs no training.")
+    ] = True,
     buildings: Annotated[
         str, typer.Option(help="Of room, office, corridor, loop, with commas; taken in turn.")
     ] = "room,office,corridor,loop",
+    only_make: Annotated[
+        bool, typer.Option("--only-make", help="Make the visits that are not there yet, and stop.")
+    ] = False,
     out: Annotated[
         Path, typer.Option(help="Folder for revisit.json, pictures, and the visits, which are kept.")
     ] = Path("bench/revisit"),
     as_json: AsJson = False,
 ) -> None:
-    """Compare two independent visits, whole objects added, removed, moved between them, by the model and baselines.
+    """Compare two independent visits, whole objects added, removed, moved between them, by all models and baselines.
 
-    Simulating and registering the visits takes minutes and is done once: another model on the same visits takes one.
+    Simulating and registering the visits takes most of the time and is done once; what was begun goes on where it
+    ended. All changed tiles count that both visits could decide by the simulator's own hits.
     """
     from worker.benchmarks.documents import write_json  # noqa: PLC0415
-    from worker.benchmarks.revisit.benchmark import RevisitBenchmarkSettings, evaluate  # noqa: PLC0415
+    from worker.benchmarks.revisit.benchmark import RevisitBenchmarkSettings, evaluate, visited  # noqa: PLC0415
     from worker.benchmarks.revisit.plan import RevisitSettings, kinds_named  # noqa: PLC0415
     from worker.benchmarks.revisit.report import tables  # noqa: PLC0415
 
@@ -171,13 +179,21 @@ def revisit(
         out=out,
         visits=visits,
         validation=validation,
+        hard=hard,
         model=model,
         model_store=model_store,
         weights=tuple(weights or ()),
+        others=others,
         made=RevisitSettings(kinds=kinds_named(buildings)),
     )
     with terminal.progress_bar() as progress:
-        result = {"command": command_line(context), **evaluate(settings, progress)}
+        if only_make:
+            made = sum(part.made for part in visited(settings, progress).values())
+        else:
+            result = {"command": command_line(context), **evaluate(settings, progress)}
+    if only_make:
+        terminal.output().print(f"{made} visits made, kept in {out}", highlight=False)
+        return
     write_json(out / "revisit.json", result)
     terminal.show(result, tables, f"saved in {out}", as_json=as_json)
 

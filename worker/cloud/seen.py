@@ -55,11 +55,22 @@ class Seen:
                     sights.append(Sights.of([(scan.points, scan.sensor_origin)]))
 
         nothing = Voxels.of(np.empty((0, 3), np.float32), size=voxel_size)
-        return cls._of_sums(fused(voxels()) or nothing, sights)
+        return cls.of_voxels(fused(voxels()) or nothing, sights)
+
+    @classmethod
+    def of_voxels(cls, voxels: Voxels, sights: Iterable[Sights | None]) -> Self:
+        """Put the fused returns of a visit and its scans' range images together."""
+        return cls(
+            voxel_size=voxels.size,
+            keys=voxels.keys,
+            points=voxels.points,
+            hits=voxels.counts.astype(np.int32),
+            sights=Sights.joined(sights),
+        )
 
     def merged(self, other: Self) -> Self:
         """Return what both visits saw together."""
-        return self._of_sums(self._sums().merged(other._sums()), [self.sights, other.sights])
+        return self.of_voxels(self._sums().merged(other._sums()), [self.sights, other.sights])
 
     def without(self, gone: Bools) -> Self:
         """Return the same less some voxels: gone (V,). The range images stay."""
@@ -74,16 +85,6 @@ class Seen:
     def verdicts(self, points: Points) -> Verdicts:
         """Say what the visit's scans tell of places (N, 3), metres, map frame; nothing where it has no sights."""
         return Verdicts.none(len(points)) if self.sights is None else self.sights.verdicts(points)
-
-    @classmethod
-    def _of_sums(cls, sums: Voxels, sights: Iterable[Sights | None]) -> Self:
-        return cls(
-            voxel_size=sums.size,
-            keys=sums.keys,
-            points=sums.points,
-            hits=sums.counts.astype(np.int32),
-            sights=Sights.joined(sights),
-        )
 
     def _sums(self) -> Voxels:
         counts = self.hits.astype(np.int64)

@@ -33,7 +33,7 @@ TOLERANCE = (
 )  #: metres, and times the depth, that a return may lie off and still be the same surface
 FARTHEST_RESIDUAL = 0.6  #: metres; a residual is no larger
 _MILLIMETRE = 0.001  # ranges are kept in these, as uint16: up to 65 m
-_FARTHEST = np.iinfo(np.uint16).max  # in these
+_FARTHEST = np.uint16(np.iinfo(np.uint16).max)  # in these
 
 Counts = NDArray[np.int16]
 
@@ -61,7 +61,7 @@ class Verdicts:
         return (self.through > 0) | (self.confirmed > 0)
 
 
-@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Sights:
     """The range images of S scans, map frame; 0 where a scan had no return."""
 
@@ -93,7 +93,7 @@ class Sights:
     def _of_one(cls, points: NDArray[Any], origin: Floats) -> Self:
         rays = (points - origin).astype(np.float32)
         cells = _cells_of(rays)
-        ranges = np.minimum(np.sqrt(np.einsum("ij,ij->i", rays, rays)) / _MILLIMETRE, _FARTHEST)
+        ranges = np.minimum(np.sqrt(np.einsum("ij,ij->i", rays, rays)) / _MILLIMETRE, float(_FARTHEST))
         nearest = np.full(6 * CELLS**2, np.inf, np.float32)
         farthest = np.zeros(6 * CELLS**2, np.float32)
         np.minimum.at(nearest, cells, ranges)
@@ -114,6 +114,19 @@ class Sights:
             origins=self.origins[chosen], nearest=self.nearest[chosen], farthest=self.farthest[chosen]
         )
 
+    def blinded(self, low: Floats, high: Floats) -> Sights:
+        """Return the images without the rays that meet a box: lowest and highest corners (B, 3), metres, map frame.
+
+        So that scans say no more of places that are known not to be as they were. What those rays saw elsewhere is
+        forgotten as well.
+        """
+        nearest, farthest = self.nearest.copy(), self.farthest.copy()
+        for scan, origin in enumerate(self.origins):
+            reach = self.farthest[scan].astype(np.float64) * _MILLIMETRE
+            gone = _met(origin, reach, low - TOLERANCE[0], high + TOLERANCE[0])
+            nearest[scan, gone] = farthest[scan, gone] = 0
+        return Sights(origins=self.origins, nearest=nearest, farthest=farthest)
+
     def verdicts(self, points: NDArray[Any]) -> Verdicts:
         """Hold points (N, 3), metres, map frame, against every scan; each costs only the points within its reach.
 
@@ -122,6 +135,7 @@ class Sights:
         answer = Verdicts.none(len(points))
         order = np.argsort(points[:, 0], kind="stable")
         ordered = np.ascontiguousarray(points[order], np.float32)
+        _ = self._around  # made once, before several threads ask for it
         with ThreadPoolExecutor(max(1, query_threads())) as pool:
             for rows, told in pool.map(functools.partial(self._verdicts_of_one, ordered), range(len(self))):
                 there = order[rows]
@@ -142,7 +156,10 @@ class Sights:
             rays = rays[rows]
         cells = _cells_of(rays)
         depth = np.sqrt(np.einsum("ij,ij->i", rays, rays))
-        nearest, farthest, around = (image[cells] for image in self._images(scan))
+        nearest, farthest, around = (
+            image[scan][cells] * np.float32(_MILLIMETRE)
+            for image in (self.nearest, self.farthest, self._around)
+        )
         tolerance = TOLERANCE[0] + TOLERANCE[1] * depth
         known = farthest > 0
         through = known & (nearest > depth + tolerance)
@@ -156,15 +173,14 @@ class Sights:
             residual=np.minimum(gap, FARTHEST_RESIDUAL).astype(np.float32),
         )
 
-    def _images(self, scan: int) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-        """Return nearest, farthest, and the nearest with the eight neighbours, of one scan, in metres."""
-        nearest = self.nearest[scan].astype(np.float32) * np.float32(_MILLIMETRE)
-        farthest = self.farthest[scan].astype(np.float32) * np.float32(_MILLIMETRE)
-        known = np.where(nearest > 0, nearest, np.float32(np.inf))
+    @functools.cached_property
+    def _around(self) -> NDArray[np.uint16]:
+        """(S, 6 CELLS^2) millimetres: the nearest return in a direction and in the eight around it, where any is."""
+        known = np.where(self.nearest > 0, self.nearest, _FARTHEST)
         around = known.copy()
         for neighbour in _neighbours():
-            np.minimum(around, known[neighbour], out=around)
-        return nearest, farthest, around
+            np.minimum(around, known[:, neighbour], out=around)
+        return around
 
 
 def _cells_of(rays: NDArray[np.float32]) -> NDArray[np.int32]:
@@ -181,6 +197,30 @@ def _cells_of(rays: NDArray[np.float32]) -> NDArray[np.int32]:
     v = np.minimum((second * half + np.float32(CELLS / 2)).astype(np.int32), CELLS - 1)
     cells: NDArray[np.int32] = (face * CELLS + u) * CELLS + v
     return cells
+
+
+def _met(origin: Floats, reach: Floats, low: Floats, high: Floats) -> NDArray[np.bool_]:
+    """Tell (6 CELLS^2,) in which directions a ray of `reach` (6 CELLS^2,) metres meets a box (slab method)."""
+    met = np.zeros(len(reach), bool)
+    rays = _middles()
+    for corners in zip(low - origin, high - origin, strict=True):
+        sides = np.stack(corners)[:, None] / rays
+        first, last = sides.min(axis=0).max(axis=1), sides.max(axis=0).min(axis=1)
+        met |= (first <= last) & (last >= 0) & (first <= reach)
+    return met
+
+
+@functools.cache
+def _middles() -> NDArray[np.float64]:
+    """Return (6 CELLS^2, 3) the unit vector through the middle of each cell; none lies along an axis."""
+    faces, u, v = np.unravel_index(np.arange(6 * CELLS**2), (6, CELLS, CELLS))
+    axis, rows = faces // 2, np.arange(6 * CELLS**2)
+    rays = np.empty((len(rows), 3))
+    rays[rows, axis] = np.where(faces % 2, 1.0, -1.0)
+    rays[rows, np.where(axis == 0, 1, 0)] = 2 * (u + 0.5) / CELLS - 1
+    rays[rows, np.where(axis == 2, 1, 2)] = 2 * (v + 0.5) / CELLS - 1
+    unit: NDArray[np.float64] = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    return unit
 
 
 @functools.cache

@@ -116,6 +116,18 @@ def rows_of(keys: Keys, among: Keys) -> NDArray[np.int64]:
     return rows
 
 
+def union(keys: Keys, others: Keys) -> tuple[Keys, NDArray[np.intp], NDArray[np.intp]]:
+    """Return the keys of both (N,) and (M,), each ascending and once, and the rows of the first and of the others."""
+    both = np.concatenate([keys, others])
+    order = np.argsort(both, kind="stable")  # merges two runs in one go
+    both = both[order]
+    first = np.ones(len(both), bool)
+    first[1:] = both[1:] != both[:-1]
+    rows = np.empty(len(both), np.intp)
+    rows[order] = np.cumsum(first) - 1
+    return both[first], rows[: len(keys)], rows[len(keys) :]
+
+
 def dilated(keys: Keys, reach: int) -> Keys:
     """Return all keys within `reach` voxels of these, ascending, each once."""
     if not len(keys):

@@ -14,7 +14,7 @@ from worker.detectors.comparison import Side
 from worker.detectors.detector import Detector
 from worker.jobs.models import card_of, kept_detector, pipeline_settings
 from worker.jobs.step import Context, put, step
-from worker.jobs.versions import kept_reference, make_version
+from worker.jobs.versions import kept_alarms, kept_reference, make_version
 from worker.pipeline.flow import BuiltMap
 from worker.pipeline.results.manifest import manifest
 
@@ -43,9 +43,13 @@ def register_map(context: Context) -> None:
 
 @step
 def encode_map(context: Context) -> None:
-    """Keep what the model can know of the reference alone; then the map is ready."""
+    """Keep what the model can know of the reference alone, and what it finds where nothing changed."""
     version = context.catalog.versions.of_job(context.job.job_id)
-    encode_reference(context, version, kept_detector(context, version.model), version.model)
+    detector = kept_detector(context, version.model)
+    encode_reference(context, version, detector, version.model)
+    if detector.card.preprocessing.tiles == "touched":
+        settings = pipeline_settings(context, version, detector.card)
+        kept_alarms(context, version, detector, version.model, settings)
     context.catalog.jobs.succeed(context.job.job_id)
 
 
@@ -62,9 +66,10 @@ def encode_reference(context: Context, version: VersionRecord, detector: Detecto
 
 
 def _put_map(context: Context, built: BuiltMap, card: Card) -> None:
-    """Keep the map's files: cloud, reference, manifest."""
+    """Keep the map's files: cloud, reference, what its scans saw, manifest."""
     job_id, reference, needs = context.job.job_id, built.reference, card.preprocessing
     put(context, blob_keys.map_reference(job_id), lambda path: npz.save(path, reference))
+    put(context, blob_keys.map_seen(job_id), lambda path: npz.save(path, built.seen))
     put(
         context,
         blob_keys.map_cloud(job_id),

@@ -32,10 +32,13 @@ def card_of(context: Context, model: str) -> Card:
 
 
 def card_that_fits(context: Context, model: str, map_model: str) -> Card:
-    """Return the model's card; to score a map it must cut the world as the map was cut. Raises DetectorUnavailable."""
+    """Return the model's card; to score a map it must cut the world as the map was cut. Raises DetectorUnavailable.
+
+    Which tiles are scored, and how dense they have to be, is the model's own affair.
+    """
     card, built_with = (card_of(context, name) for name in (model, map_model))
     ours, theirs = card.preprocessing, built_with.preprocessing
-    if ours != theirs:
+    if (ours.voxel_size, ours.tile_size) != (theirs.voxel_size, theirs.tile_size):
         raise DetectorUnavailable(
             f"model {model} needs voxels of {ours.voxel_size:g} m and tiles of {ours.tile_size}, the map was "
             f"built for {map_model} with {theirs.voxel_size:g} m and {theirs.tile_size}; build a map for it"

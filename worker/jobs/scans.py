@@ -10,6 +10,7 @@ import numpy as np
 
 from service.catalog.records import ScanOutcome
 from worker.cloud import npz
+from worker.cloud.seen import Seen
 from worker.jobs.step import Context, load, put
 from worker.pipeline import archive
 from worker.pipeline.registration.results import (
@@ -66,6 +67,20 @@ def kept_scans(
 ) -> list[Callable[[], RegisteredScan]]:
     """Return what loads each accepted scan."""
     return [functools.partial(kept_scan, context, key_of(scan.scan_id)) for scan in scans if scan.accepted]
+
+
+def seen_by(
+    context: Context, key: str, scans: Sequence[Callable[[], RegisteredScan]], *, voxel_size: float
+) -> Seen:
+    """Return what accepted scans saw; where an earlier release kept nothing of it, it is made of the scans and kept.
+
+    Two steps that do so at once write the same. Raises FileNotFoundError where a scan is gone.
+    """
+    if context.catalog.blobs.exists(key):
+        return load(context, key, functools.partial(npz.load, kind=Seen))
+    seen = Seen.of((load_one() for load_one in scans), voxel_size=voxel_size)
+    put(context, key, functools.partial(npz.save, value=seen))
+    return seen
 
 
 def _recorded(scan_id: str, outcome: ScanResult, ids: Sequence[str]) -> ScanOutcome:

@@ -30,14 +30,16 @@ MAP_STAGES = {
     "fusing": (0.75, 0.85),
     "tiling": (0.85, 0.88),
     "saving": (0.88, 0.9),
-    "encoding": (0.9, 1.0),
+    "encoding": (0.9, 0.95),
+    "calibrating": (0.95, 1.0),
 }
 SURVEY_STAGES = {
     "registering": (0.0, 0.45),
     "refining": (0.45, 0.5),
     "tiling": (0.5, 0.52),
     "saving": (0.52, 0.55),
-    "scoring": (0.55, 0.8),
+    "scoring": (0.55, 0.75),
+    "calibrating": (0.75, 0.8),
     "exporting": (0.8, 1.0),
 }
 MODEL_STAGES = {

@@ -7,17 +7,30 @@ from contextlib import ExitStack
 from dataclasses import asdict
 
 from service.catalog import blob_keys
-from service.catalog.records import Bounds, SurveyRecord, TileRecord, VersionRecord
+from service.catalog.records import (
+    Bounds,
+    Motion,
+    ObjectRecord,
+    Place,
+    SurveyRecord,
+    TileRecord,
+    VersionRecord,
+)
 from worker.cloud import npz
+from worker.detectors.card import Card
+from worker.detectors.comparison import Comparison
 from worker.detectors.detector import Detection
+from worker.detectors.voxels.scores import tile_threshold
 from worker.jobs.models import card_of, card_that_fits, kept_detector, pipeline_settings
-from worker.jobs.scans import kept_scans, save_scans, scan_files, scan_outcomes
+from worker.jobs.scans import kept_scans, save_scans, scan_files, scan_outcomes, seen_by
 from worker.jobs.step import Context, load, put, step
-from worker.jobs.versions import kept_reference
-from worker.pipeline.flow import NoScanAccepted, compare, locate_survey
+from worker.jobs.versions import kept_alarms, kept_reference, kept_seen
+from worker.pipeline.alarms import AlarmCalibration
+from worker.pipeline.flow import NoScanAccepted, compare, concluded, locate_survey
 from worker.pipeline.mapping.fusion import CurrentMap
-from worker.pipeline.results.changes import decide
+from worker.pipeline.results.changes import ChangeSet
 from worker.pipeline.results.export import TileResult, tile_results, write_coloured_cloud
+from worker.pipeline.results.objects import ChangeObject
 from worker.pipeline.results.picture import draw_picture
 from worker.pipeline.settings import PipelineSettings
 from worker.progress import Progress
@@ -41,6 +54,7 @@ def register_survey(context: Context) -> None:
         save_scans(context, survey.scans, files, located.outcomes, key_of)
     context.catalog.surveys.save_outcomes(survey.survey_id, scan_outcomes(survey.scans, located.outcomes))
     put(context, blob_keys.survey_current(survey.survey_id), lambda path: npz.save(path, located.current))
+    put(context, blob_keys.survey_seen(survey.survey_id), lambda path: npz.save(path, located.seen))
 
 
 @step
@@ -52,44 +66,64 @@ def score_survey(context: Context) -> None:
     key = blob_keys.map_embedding(version.job_id, survey.model, detector.card.fingerprint)
     if context.catalog.blobs.exists(key):
         embedding = load(context, key, npz.load_arrays)
-    map_key = functools.partial(blob_keys.map_scan, version.job_id)
-    survey_key = functools.partial(blob_keys.survey_scan, survey.survey_id)
-    comparison = compare(
-        kept_reference(context, version),
-        _kept_current(context, survey),
-        settings=settings,
-        reference_scans=kept_scans(context, version.scans, map_key),
-        current_scans=kept_scans(context, survey.scans, survey_key),
-    )
+    comparison = _compared(context, survey, version, settings)
     progress = scoring(context.report, encoded=embedding is not None)
     detection = detector.detect(comparison, embedding=embedding, progress=progress)
+    if detection.voxels is not None:  # kept with the map, for the next step, which opens no network
+        kept_alarms(context, version, detector, survey.model, settings)
     put(context, blob_keys.survey_scores(survey.survey_id), lambda path: npz.save(path, detection))
 
 
 @step
 def export_survey(context: Context) -> None:
-    """Make of the scores tile states, the coloured cloud and the picture; then the survey is ready."""
+    """Make of the scores tile states, objects, the coloured cloud and the picture; then the survey is ready."""
     survey, version, settings = _asked(context)
     survey_id = survey.survey_id
     context.report("exporting", 0.0)
-    reference, current = kept_reference(context, version), _kept_current(context, survey)
+    comparison = _compared(context, survey, version, settings)
     detection = load(context, blob_keys.survey_scores(survey_id), functools.partial(npz.load, kind=Detection))
     card = card_of(context, survey.model)
-    threshold = card.threshold if survey.threshold is None else survey.threshold
-    pairs = compare(reference, current, settings=settings).tile_pairs
-    changes = decide(pairs, detection, threshold=threshold)
-    put(context, blob_keys.survey_cloud(survey_id), lambda path: write_coloured_cloud(path, current, changes))
-    context.report("exporting", 0.4)
+    limit = _least_score(context, version, card, survey.model) if detection.voxels is not None else 0.0
+    threshold = tile_threshold(card, limit) if survey.threshold is None else survey.threshold
+    objects = settings.objects.with_values(min_score=max(limit, settings.objects.min_score))
+    changes = concluded(
+        comparison, detection, threshold=threshold, settings=settings.with_values(objects=objects)
+    )
+    context.report("exporting", 0.3)
+    _put_cloud_and_picture(context, survey, comparison, changes)
+    context.report("exporting", 0.9)
+    context.catalog.surveys.save_result(
+        survey_id,
+        tiles=[_tile_record(result) for result in tile_results(changes)],
+        threshold=threshold,
+        objects=None if changes.objects is None else map(_object_record, changes.objects.objects),
+        moving=None if changes.objects is None else changes.objects.moving,
+    )
+    context.catalog.jobs.succeed(context.job.job_id)
+
+
+def _least_score(context: Context, version: VersionRecord, card: Card, model: str) -> float:
+    """Return the limit on a region's score that the step before has kept with the map."""
+    key = blob_keys.map_alarms(version.job_id, model, card.fingerprint)
+    return load(context, key, functools.partial(npz.load, kind=AlarmCalibration)).min_score
+
+
+def _put_cloud_and_picture(
+    context: Context, survey: SurveyRecord, comparison: Comparison, changes: ChangeSet
+) -> None:
+    reference, current = comparison.reference.points, comparison.current.points
     title = f"Map {survey.map_id}: survey of {survey.captured_at:%Y-%m-%d %H:%M} UTC"
     put(
         context,
-        blob_keys.survey_picture(survey_id),
-        lambda path: draw_picture(path, reference.points, current, changes, title=title),
+        blob_keys.survey_cloud(survey.survey_id),
+        lambda path: write_coloured_cloud(path, reference, current, changes),
     )
-    context.report("exporting", 0.9)
-    tiles = [_tile_record(result) for result in tile_results(changes)]
-    context.catalog.surveys.save_result(survey_id, tiles=tiles, threshold=threshold)
-    context.catalog.jobs.succeed(context.job.job_id)
+    context.report("exporting", 0.6)
+    put(
+        context,
+        blob_keys.survey_picture(survey.survey_id),
+        lambda path: draw_picture(path, reference, current, changes, title=title),
+    )
 
 
 def scoring(report: Progress, *, encoded: bool) -> Progress:
@@ -115,9 +149,48 @@ def _asked(context: Context) -> tuple[SurveyRecord, VersionRecord, PipelineSetti
     )
 
 
+def _compared(
+    context: Context, survey: SurveyRecord, version: VersionRecord, settings: PipelineSettings
+) -> Comparison:
+    """Set map and survey side by side, for detectors of all touched tiles with what both visits saw."""
+    map_key = functools.partial(blob_keys.map_scan, version.job_id)
+    survey_key = functools.partial(blob_keys.survey_scan, survey.survey_id)
+    scans = kept_scans(context, survey.scans, survey_key)
+    size = settings.registration.voxel_size
+    before = now = None
+    if settings.tiling.tiles == "touched":
+        before = kept_seen(context, version, voxel_size=size)
+        now = seen_by(context, blob_keys.survey_seen(survey.survey_id), scans, voxel_size=size)
+    return compare(
+        kept_reference(context, version),
+        _kept_current(context, survey),
+        settings=settings,
+        reference_scans=kept_scans(context, version.scans, map_key),
+        current_scans=scans,
+        reference_seen=before,
+        current_seen=now,
+    )
+
+
 def _kept_current(context: Context, survey: SurveyRecord) -> CurrentMap:
     key = blob_keys.survey_current(survey.survey_id)
     return load(context, key, functools.partial(npz.load, kind=CurrentMap))
+
+
+def _object_record(thing: ChangeObject) -> ObjectRecord:
+    """Return an object as it is recorded; its score and the motion's overlap are the worker's own affair."""
+    now, before = (None if place is None else Place(**asdict(place)) for place in (thing.now, thing.before))
+    motion = thing.motion and Motion(translation=thing.motion.translation, yaw=thing.motion.yaw)
+    return ObjectRecord(
+        number=thing.number,
+        kind=thing.kind,
+        now=now,
+        before=before,
+        motion=motion,
+        probability=thing.probability,
+        observed_share=thing.observed_share,
+        scans_seen_through=thing.scans_seen_through,
+    )
 
 
 def _tile_record(result: TileResult) -> TileRecord:

@@ -13,12 +13,15 @@ import numpy as np
 from service.catalog import blob_keys
 from service.catalog.records import ScanOutcome, VersionRecord
 from worker.cloud import npz
+from worker.cloud.seen import Seen
 from worker.cloud.types import Indices
+from worker.detectors.detector import Detector
 from worker.errors import MapFailed
 from worker.jobs.pair_cache import StoredPairCache
-from worker.jobs.scans import kept_scans, save_scans, scan_files, scan_outcomes
-from worker.jobs.step import Context, put
+from worker.jobs.scans import kept_scans, save_scans, scan_files, scan_outcomes, seen_by
+from worker.jobs.step import Context, load, put
 from worker.pipeline import archive
+from worker.pipeline.alarms import AlarmCalibration, calibrated, visits_of
 from worker.pipeline.flow import BuiltMap, NoScanAccepted, NothingToTile, build_map
 from worker.pipeline.map_update import KeptMap, extend_map, renew_map, without
 from worker.pipeline.mapping.fusion import ReferenceMap
@@ -56,6 +59,45 @@ def kept_reference(context: Context, version: VersionRecord) -> ReferenceMap:
             ) from unknown
 
 
+def kept_seen(context: Context, version: VersionRecord, *, voxel_size: float) -> Seen:
+    """Return what the scans of a version saw; of a map of release 0.1, whose scans are kept, it is made now and kept.
+
+    Raises MapFailed where the scans are gone.
+    """
+    key_of = functools.partial(blob_keys.map_scan, version.job_id)
+    try:
+        return seen_by(
+            context,
+            blob_keys.map_seen(version.job_id),
+            kept_scans(context, version.scans, key_of),
+            voxel_size=voxel_size,
+        )
+    except FileNotFoundError as missing:
+        raise MapFailed(
+            f"version {version.version} of map {version.map_id} comes from a release that did not keep what its scans "
+            "saw, and not all of the scans are there; build the map anew from its scans, or ask for a model that "
+            "compares tiles by their points"
+        ) from missing
+
+
+def kept_alarms(
+    context: Context, version: VersionRecord, detector: Detector, model: str, settings: PipelineSettings
+) -> AlarmCalibration:
+    """Return how strong a region has to be on this map for this model; made of the map's own scans on first use."""
+    key = blob_keys.map_alarms(version.job_id, model, detector.card.fingerprint)
+    if context.catalog.blobs.exists(key):
+        return load(context, key, functools.partial(npz.load, kind=AlarmCalibration))
+    key_of = functools.partial(blob_keys.map_scan, version.job_id)
+    visits = visits_of(
+        kept_scans(context, version.scans, key_of), voxel_size=settings.registration.voxel_size
+    )
+    calibration = calibrated(
+        visits, detector, alarms_per_survey=settings.alarms_per_survey, progress=context.report
+    )
+    put(context, key, functools.partial(npz.save, value=calibration))
+    return calibration
+
+
 def make_version(context: Context, version: VersionRecord, settings: PipelineSettings) -> Made:
     """Build a version. What became of its scans is recorded also where that fails."""
     if version.base_version is None:
@@ -83,7 +125,8 @@ def _extended(
     with ExitStack() as stack:
         files = scan_files(context, further, stack, settings)
         with _recorded_anyway(context, further):
-            built = extend_map(_kept_map(context, base), files, settings=settings, progress=context.report)
+            kept = _kept_map(context, base, settings)
+            built = extend_map(kept, files, settings=settings, progress=context.report)
         for scan in older:
             context.catalog.blobs.copy(
                 blob_keys.map_scan(base.job_id, scan.scan_id), _key_of(context)(scan.scan_id)
@@ -96,22 +139,26 @@ def _renewed(
     context: Context, version: VersionRecord, base: VersionRecord, survey_id: str, settings: PipelineSettings
 ) -> Made:
     older, seen = _kept(base), _further(version, base)
-    kept, replaced = _kept_map(context, base), _changed(context, survey_id)
+    kept, replaced = _kept_map(context, base, settings), _changed(context, survey_id)
     survey_key = functools.partial(blob_keys.survey_scan, survey_id)
     loads = kept_scans(context, seen, survey_key)
     built = renew_map(kept, loads, replaced=replaced, settings=settings, progress=context.report)
-    for done, (scan, load) in enumerate(zip(older, kept.scans, strict=True)):
+    for done, (scan, load_kept) in enumerate(zip(older, kept.scans, strict=True)):
         context.report("saving", done / len(older))
-        rest = without(load(), kept.reference.grid, replaced)
+        rest = without(load_kept(), kept.reference.grid, replaced)
         put(context, _key_of(context)(scan.scan_id), functools.partial(npz.save, value=rest))
     for scan in seen:
         context.catalog.blobs.copy(survey_key(scan.scan_id), _key_of(context)(scan.scan_id))
     return Made(built=built, outcomes=(*older, *seen))
 
 
-def _kept_map(context: Context, base: VersionRecord) -> KeptMap:
+def _kept_map(context: Context, base: VersionRecord, settings: PipelineSettings) -> KeptMap:
     key_of = functools.partial(blob_keys.map_scan, base.job_id)
-    return KeptMap(reference=kept_reference(context, base), scans=kept_scans(context, base.scans, key_of))
+    return KeptMap(
+        reference=kept_reference(context, base),
+        scans=kept_scans(context, base.scans, key_of),
+        seen=kept_seen(context, base, voxel_size=settings.registration.voxel_size),
+    )
 
 
 def _kept(base: VersionRecord) -> list[ScanOutcome]:

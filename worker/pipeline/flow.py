@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from worker.cloud.seen import Seen
+from worker.cloud.sight import Sights
 from worker.cloud.tiling import TileGrid, Tiles, grid_over, grown, pair_tiles, touched_tiles
 from worker.cloud.types import Arrays
 from worker.cloud.voxels import Voxels
 from worker.detectors.comparison import Comparison, SeenScan, Side
-from worker.detectors.detector import Detector
+from worker.detectors.detector import Detection, Detector
 from worker.errors import MapFailed, RegistrationFailed
 from worker.pipeline.mapping.fusion import CurrentMap, ReferenceMap, current_map, fuse, reference_map
 from worker.pipeline.mapping.map_registration import MapReport, register_map_scans
@@ -25,6 +26,7 @@ from worker.pipeline.registration.results import (
 )
 from worker.pipeline.registration.scan_to_scan import PairResult
 from worker.pipeline.results.changes import ChangeSet, decide
+from worker.pipeline.results.objects import change_objects
 from worker.pipeline.settings import PipelineSettings
 from worker.progress import Progress, no_progress
 
@@ -39,6 +41,7 @@ class BuiltMap:
     tiles: Tiles
     outcomes: tuple[ScanResult, ...]  #: of the files, in their order
     report: MapReport | None  #: None where nothing was registered anew
+    seen: Seen  #: what its scans saw, to compare surveys with
     kept: tuple[PairResult, ...] = ()  #: the registrations that the map rests on
     rejected: tuple[PairResult, ...] = ()  #: accepted ones that loops do not close over
 
@@ -50,6 +53,7 @@ class LocatedSurvey:
     current: CurrentMap
     comparison: Comparison
     outcomes: tuple[ScanResult, ...]
+    seen: Seen  #: what its scans saw
 
 
 class NoScanAccepted(RegistrationFailed):
@@ -88,13 +92,16 @@ def build_map(
     registered = register_map_scans(
         files, settings=settings.joint_registration, pair_cache=pairs, processes=processes, progress=progress
     )
-    fused = fused_scans(accepted_scans(files, registered.outcomes, settings), len(files), settings, progress)
+    sights: list[Sights | None] = []
+    scans = watched(accepted_scans(files, registered.outcomes, settings), sights)
+    fused = fused_scans(scans, len(files), settings, progress)
     reference, tiles = tiled_map(fused, None, registered.outcomes, settings, progress)
     return BuiltMap(
         reference=reference,
         tiles=tiles,
         outcomes=registered.outcomes,
         report=registered.report,
+        seen=Seen.of_voxels(fused, sights),
         kept=registered.kept,
         rejected=registered.rejected,
     )
@@ -105,11 +112,12 @@ def locate_survey(
     reference: ReferenceMap,
     *,
     settings: PipelineSettings,
+    reference_seen: Seen | None = None,
     progress: Progress = no_progress,
 ) -> LocatedSurvey:
     """Register the scans to the map, fuse those accepted, set both side by side (stage 3, first half).
 
-    Raises ScanError where no file can be read, NoScanAccepted where none is left to compare.
+    `reference_seen` is what the map's scans saw; detectors by voxels need it. Raises ScanError where no file can be read, NoScanAccepted where none is left to compare.
     """
     files = with_carrier(files, settings.carrier, max_points=settings.max_scan_points)
     outcomes = register_survey_scans(
@@ -118,11 +126,15 @@ def locate_survey(
     if not any(outcome.registration for outcome in outcomes):
         raise NoScanAccepted(outcomes)
     progress("tiling", 0.0)
-    accepted = accepted_scans(files, outcomes, settings)
-    current = current_map(accepted, voxel_size=reference.voxel_size)
-    comparison = compare(reference, current, settings=settings)
+    sights: list[Sights | None] = []
+    accepted = watched(accepted_scans(files, outcomes, settings), sights)
+    fused = fuse(accepted, voxel_size=reference.voxel_size)
+    current, seen = current_map(fused), Seen.of_voxels(fused, sights)
+    comparison = compare(
+        reference, current, settings=settings, reference_seen=reference_seen, current_seen=seen
+    )
     progress("tiling", 1.0)
-    return LocatedSurvey(current=current, comparison=comparison, outcomes=outcomes)
+    return LocatedSurvey(current=current, comparison=comparison, outcomes=outcomes, seen=seen)
 
 
 def compare(
@@ -155,12 +167,26 @@ def detect(
     *,
     embedding: Arrays | None = None,
     threshold: float | None = None,
+    settings: PipelineSettings | None = None,
     progress: Progress = no_progress,
 ) -> ChangeSet:
-    """Score the tiles, then decide (stage 3, second half); the threshold is the card's if None is given."""
+    """Score the survey, then decide (stage 3, second half); the threshold is the card's if None is given."""
+    settings = settings or PipelineSettings()
     detection = detector.detect(comparison, embedding=embedding, progress=progress)
     threshold = detector.card.threshold if threshold is None else threshold
-    return decide(comparison.tile_pairs, detection, threshold=threshold)
+    return concluded(comparison, detection, threshold=threshold, settings=settings)
+
+
+def concluded(
+    comparison: Comparison, detection: Detection, *, threshold: float, settings: PipelineSettings
+) -> ChangeSet:
+    """Make of a detector's scores the states of tiles and, where it scored voxels, objects."""
+    least = settings.tiling.min_observed_share
+    changes = decide(comparison.tile_pairs, detection, threshold=threshold, min_observed_share=least)
+    if detection.voxels is None:
+        return changes
+    objects = change_objects(comparison, detection.voxels, settings.objects)
+    return replace(changes, voxels=detection.voxels, objects=objects)
 
 
 def accepted_scans(
@@ -170,6 +196,14 @@ def accepted_scans(
     for file, outcome in zip(files, outcomes, strict=True):
         if outcome.registration is not None:
             yield read_registered(file, outcome.registration, max_points=settings.max_scan_points)
+
+
+def watched(scans: Iterable[RegisteredScan], sights: list[Sights | None]) -> Iterator[RegisteredScan]:
+    """Yield the scans, and put the range image of each into `sights`; None where its sensor's place is not known."""
+    for scan in scans:
+        origin = scan.sensor_origin
+        sights.append(None if origin is None else Sights.of([(scan.points, origin)]))
+        yield scan
 
 
 def fused_scans(

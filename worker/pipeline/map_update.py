@@ -6,9 +6,17 @@ import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
+from worker.cloud.seen import Seen
 from worker.cloud.tiling import TileGrid
 from worker.cloud.types import Indices
-from worker.pipeline.flow import BuiltMap, NoScanAccepted, accepted_scans, fused_scans, tiled_map
+from worker.pipeline.flow import (
+    BuiltMap,
+    NoScanAccepted,
+    accepted_scans,
+    fused_scans,
+    tiled_map,
+    watched,
+)
 from worker.pipeline.mapping.fusion import ReferenceMap
 from worker.pipeline.mapping.map_registration import MapReport
 from worker.pipeline.mapping.survey_registration import register_survey_scans
@@ -23,6 +31,7 @@ class KeptMap:
 
     reference: ReferenceMap
     scans: Sequence[Callable[[], RegisteredScan]]
+    seen: Seen  #: what its scans saw
 
 
 def extend_map(
@@ -39,10 +48,18 @@ def extend_map(
     )
     if not any(outcome.registration for outcome in outcomes):
         raise NoScanAccepted(outcomes)
-    scans = itertools.chain((load() for load in base.scans), accepted_scans(files, outcomes, settings))
+    sights = [base.seen.sights]
+    further = watched(accepted_scans(files, outcomes, settings), sights)
+    scans = itertools.chain((load() for load in base.scans), further)
     fused = fused_scans(scans, len(base.scans) + len(files), settings, progress)
     reference, tiles = tiled_map(fused, base.reference.grid, outcomes, settings, progress)
-    return BuiltMap(reference=reference, tiles=tiles, outcomes=outcomes, report=MapReport.of(outcomes))
+    return BuiltMap(
+        reference=reference,
+        tiles=tiles,
+        outcomes=outcomes,
+        report=MapReport.of(outcomes),
+        seen=Seen.of_voxels(fused, sights),
+    )
 
 
 def renew_map(
@@ -56,13 +73,19 @@ def renew_map(
     """Renew a map by a survey that was accepted as the new state of things; tiles keep their ids.
 
     In the tiles `replaced` (T, 3) the survey's points take the place of the older ones, elsewhere they join them.
-    Raises NothingToTile.
+    There the older scans no longer count as having looked: what they saw through may stand full now. Raises
+    NothingToTile.
     """
-    older = (without(load(), base.reference.grid, replaced) for load in base.scans)
-    scans = itertools.chain(older, (load() for load in seen))
+    grid = base.reference.grid
+    lower = grid.lower(replaced)
+    sights = [base.seen.sights and base.seen.sights.blinded(lower, lower + grid.size)]
+    older = (without(load(), grid, replaced) for load in base.scans)
+    scans = itertools.chain(older, watched((load() for load in seen), sights))
     fused = fused_scans(scans, len(base.scans) + len(seen), settings, progress)
-    reference, tiles = tiled_map(fused, base.reference.grid, (), settings, progress)
-    return BuiltMap(reference=reference, tiles=tiles, outcomes=(), report=None)
+    reference, tiles = tiled_map(fused, grid, (), settings, progress)
+    return BuiltMap(
+        reference=reference, tiles=tiles, outcomes=(), report=None, seen=Seen.of_voxels(fused, sights)
+    )
 
 
 def without(scan: RegisteredScan, grid: TileGrid, tiles: Indices) -> RegisteredScan:

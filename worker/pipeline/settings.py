@@ -10,6 +10,7 @@ from worker.cloud.tiling import TilingSettings
 from worker.detectors.card import Preprocessing
 from worker.pipeline.mapping.settings import JointRegistrationSettings, MappingSettings
 from worker.pipeline.registration.settings import RegistrationSettings
+from worker.pipeline.results.objects import ObjectSettings
 
 
 class PipelineSettings(StrictModel):
@@ -19,6 +20,7 @@ class PipelineSettings(StrictModel):
     registration: RegistrationSettings = Field(default_factory=RegistrationSettings)
     mapping: MappingSettings = Field(default_factory=MappingSettings)
     tiling: TilingSettings = Field(default_factory=TilingSettings)
+    objects: ObjectSettings = Field(default_factory=ObjectSettings)
     max_scan_points: int = Field(50_000_000, gt=0)
     alarms_per_survey: float = Field(
         0.1, gt=0, description="false objects in a survey of a place without any change, in the mean"

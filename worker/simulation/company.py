@@ -109,13 +109,13 @@ def _body_caster() -> Caster:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Carrier:
+class CarrierBody:
     """The parts of a robot that its own sensor sees: they stand at the same place in every scan."""
 
     mesh: Mesh  #: sensor frame
 
     @classmethod
-    def random(cls, seed: int) -> Carrier:
+    def random(cls, seed: int) -> CarrierBody:
         """Draw a robot with a deck ahead of the sensor and a mast beside it, all 20 to 70 cm from the sensor."""
         rng = np.random.default_rng([seed, 8])
         wide, first, low = (

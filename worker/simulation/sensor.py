@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from worker.cloud.types import Floats, Matrix4, Points
-from worker.simulation.company import Carrier, Walker
+from worker.simulation.company import CarrierBody, Walker
 from worker.simulation.scenes.caster import Hits, chosen, nearest
 from worker.simulation.scenes.scene import Scene
 
@@ -89,7 +89,7 @@ def scan(
     sensor: SensorModel,
     rng: np.random.Generator,
     walkers: Sequence[Walker] = (),
-    carrier: Carrier | None = None,
+    carrier: CarrierBody | None = None,
 ) -> SimulatedScan:
     """Stand for `duration_s` seconds at a pose and measure. One cast of all rays; the same rng state, the same scan.
 
@@ -144,7 +144,7 @@ def _first_hits(
     rays: Floats,
     duration_s: float,
     walkers: Sequence[Walker],
-    carrier: Carrier | None,
+    carrier: CarrierBody | None,
 ) -> Hits:
     """Cast rays (2N, 3), sensor frame, the second half fired at the same times as the first; glass is air."""
     origin = world_from_sensor[:3, 3]

@@ -10,7 +10,7 @@ import numpy as np
 
 from worker.cloud.formats.pcd import write_pcd
 from worker.cloud.types import Floats, Matrix4, Points
-from worker.simulation.company import Carrier, Walker, walkers
+from worker.simulation.company import CarrierBody, Walker, walkers
 from worker.simulation.scenes import Scene, edit_kinds, random_edits, rigid
 from worker.simulation.sensor import SensorModel, SimulatedScan, scan
 
@@ -83,7 +83,7 @@ def visit(
     folder: Path | None = None,
     name: str = "scan-{:02d}",
     people: int = 0,
-    carrier: Carrier | None = None,
+    carrier: CarrierBody | None = None,
 ) -> tuple[SimulatedScan, ...]:
     """Simulate one scan a stop; `poses` are the stops (world_from_sensor) or how many to make along the route.
 
@@ -129,14 +129,22 @@ def edited(scene: Scene, edits: int, *, seed: int, count: int) -> tuple[Scene, t
 
     Edits that leave a robot no way are drawn again. Raises ValueError where no draw leaves one.
     """
-    blocked = ValueError(scene.name)
+    return edited_by(lambda draw: random_edits(scene, seed=draw, kinds=edit_kinds(edits))[0], seed, count)
+
+
+def edited_by(edit: Callable[[int], Scene], seed: int, count: int) -> tuple[Scene, tuple[Matrix4, ...]]:
+    """Return the scene that `edit` makes of a seed, and `count` stops in it; with other seeds where it leaves no way.
+
+    Raises ValueError where no draw leaves one.
+    """
+    blocked: ValueError | None = None
     for draw in range(DRAWS):
-        after, _ = random_edits(scene, seed=seed + draw * NEXT_DRAW, kinds=edit_kinds(edits))
+        after = edit(seed + draw * NEXT_DRAW)
         try:
             return after, stops(after, count, seed=seed)
         except ValueError as error:
             blocked = error
-    raise blocked
+    raise blocked or ValueError("no draw was made")
 
 
 def merged(scans: tuple[SimulatedScan, ...]) -> Points:

@@ -20,6 +20,8 @@ LOOKED = [tile(i, j, "unchanged", 0.1, observed_share=0.9) for i in range(6) for
 BOX, CHAIR, DESK = place(1, 1), place(4, 1), place(7, 1, size=(1.6, 0.8, 0.75))
 DESK_BEFORE = place(7, 3.4, size=(1.6, 0.8, 0.75))
 
+CHAIR_TILE = (2, 0)
+
 Told = list[tuple[str, str, int]]  #: kind, status and number of sightings
 
 
@@ -220,6 +222,18 @@ def test_an_accepted_survey_closes_its_objects_and_they_are_not_gone_again(catal
     assert (box.accepted_in_version, chair.accepted_in_version) == (2, None)
     visit(catalog, 3)
     assert told(catalog) == [("appeared", "accepted", 2), ("disappeared", "gone_again", 1)]
+
+
+def test_what_disappeared_from_a_tile_that_was_not_replaced_goes_on(catalog: Catalog) -> None:
+    """Its older points stay in the map, and later surveys miss it still."""
+    add_map(catalog)
+    taken = tile(*CHAIR_TILE, observed_share=0.9)
+    tiles = [taken, *(each for each in LOOKED if each.tile_id != taken.tile_id)]
+    objects = [thing(1, before=CHAIR), thing(2, before=DESK_BEFORE)]
+    accepted, _ = add_survey(catalog, tiles, objects=objects, moving=0)
+    add_version(catalog, survey_id=accepted)
+    visit(catalog, 1, thing(1, before=DESK_BEFORE))
+    assert sorted(told(catalog)) == [("disappeared", "accepted", 1), ("disappeared", "still_there", 2)]
 
 
 def test_that_is_known_when_survey_and_version_are_deleted(catalog: Catalog) -> None:

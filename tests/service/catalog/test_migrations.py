@@ -1,9 +1,10 @@
-"""A database of the last 0.1 build is up to date as it is; one of an earlier or a later build is refused."""
+"""A database of the last 0.1 build is brought up to date; one of an earlier or a later build is refused."""
 
 from __future__ import annotations
 
 import sqlite3
 from collections.abc import Iterator
+from datetime import timedelta
 from pathlib import Path
 
 import pytest
@@ -11,11 +12,12 @@ from sqlalchemy import inspect
 
 from service.catalog import blob_keys
 from service.catalog.catalog import Catalog, open_catalog
+from service.catalog.changes import ChangeFilter
 from service.catalog.database import Database, WrongRevision
 from service.settings import Settings
 from service.up.embedded_redis import LaunchFailed
 from service.up.launcher import _migrate
-from tests.support.samples import BOUNDS, IDENTITY, add_survey, tile
+from tests.support.samples import BOUNDS, IDENTITY, add_survey, place, thing, tile
 
 WRITTEN = Path(__file__).with_name("release_0_1_0.sql")
 
@@ -60,6 +62,39 @@ def test_the_survey_of_the_last_build_keeps_its_tiles(opened: Catalog) -> None:
     assert (survey.map_version, survey.threshold, survey.counts["changed"]) == (1, 0.5, 1)
     tiles = [change.tile for change in opened.changes.of_survey("survey-1")]
     assert tiles == [tile(0, 0), tile(1, 0, "unobserved")]
+
+
+def test_the_survey_of_the_last_build_tells_no_objects_and_its_change_once(opened: Catalog) -> None:
+    survey = opened.surveys.ready("survey-1")
+    assert (survey.objects, survey.moving, opened.maps.get("lobby").objects) == (None, None, {})
+    (change,) = opened.changes.page(ChangeFilter(map_id="lobby")).items
+    assert change.tile == tile(0, 0)
+    assert (change.tile.observed_share, change.tile.appeared, change.tile.disappeared) == (None, None, None)
+    assert change.first_seen == change.last_seen == survey.captured_at
+    later, _ = add_survey(
+        opened,
+        [tile(0, 0)],
+        captured_at=survey.captured_at + timedelta(days=1),
+        objects=[thing(1, now=place(1, 1))],
+    )
+    (change,) = opened.changes.page(ChangeFilter(map_id="lobby")).items
+    assert (change.survey_id, change.last_seen) == ("survey-1", survey.captured_at + timedelta(days=1))
+    assert opened.surveys.get(later).objects == {"appeared": 1, "disappeared": 0, "moved": 0}
+
+
+def test_what_a_version_of_the_last_build_took_over_is_known(old: Settings) -> None:
+    run(
+        old,
+        "UPDATE map_versions SET status = 'ready', survey_id = 'survey-1', bounds = NULL WHERE number = 2",
+    )
+    catalog = open_catalog(old)
+    when = catalog.surveys.get("survey-1").captured_at + timedelta(days=1)
+    survey_id, _ = add_survey(
+        catalog, [tile(0, 0)], captured_at=when
+    )  # against version 2, which has what was there
+    told = catalog.changes.page(ChangeFilter(map_id="lobby")).items
+    catalog.close()
+    assert [change.survey_id for change in told] == [survey_id, "survey-1"]
 
 
 def test_the_model_and_the_jobs_of_the_last_build_are_there(opened: Catalog) -> None:

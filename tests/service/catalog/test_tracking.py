@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import itertools
 import math
+import random
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from datetime import timedelta
 
 import pytest
@@ -401,6 +403,53 @@ def test_a_visit_of_before_the_acceptance_compared_with_the_new_map_is_no_look()
     taken = [Accepted(version=2, parts=(BOX_BROUGHT,))]
     (box,) = track_objects([visit(1, BOX_BROUGHT), visit(2, version=2), visit(3, BOX_BROUGHT)], taken)
     assert (days(box), box.status, box.transient) == ([1, 3], "accepted", False)
+
+
+# whatever comes
+
+
+def random_visits(seed: int) -> list[Visit]:
+    """Twelve visits of a hall with nine places for chairs, some of which come, go, move or are not looked at."""
+    drawn = random.Random(seed)
+    visits = []
+    for day in range(12):
+        places = [
+            (2.0 * i + drawn.gauss(0, 0.05), 2.0 * j + drawn.gauss(0, 0.05))
+            for i in range(3)
+            for j in range(3)
+        ]
+        taken = drawn.sample(places, 6)
+        seen = [moved(went(*taken[0]), came(*taken[1])), went(*taken[2]), *(came(*at) for at in taken[3:])]
+        shown = drawn.sample(seen, drawn.randint(0, 4))
+        observed = {"hall": drawn.choice([0.2, 0.9])}
+        visits.append(visit(day, *shown, version=1 + day // 5, observed=observed))
+    return visits
+
+
+def gathered(tracks: Sequence[Track]) -> list[list[tuple[str, int]]]:
+    return [[(seen.survey_id, one.number) for seen, one in track.sightings] for track in tracks]
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_every_sighting_is_of_one_object_and_every_object_has_one_id(seed: int) -> None:
+    visits, drawn = random_visits(seed), random.Random(seed)
+    accepted = [Accepted(version=2, parts=tuple(one.parts for one in visits[4].sightings))]
+    expected = track_objects(visits, accepted)
+    sightings = [(seen.survey_id, one.number) for seen in visits for one in seen.sightings]
+    assert sorted(itertools.chain(*gathered(expected))) == sorted(sightings)
+    known: list[Visit] = []
+    ids: list[str] = []
+    for arriving in drawn.sample(visits, len(visits)):  # in any order, named as the database would
+        tracks = track_objects([*known, arriving], accepted, ids=ids)
+        given = [track.object_id or f"{arriving.survey_id}-{n}" for n, track in enumerate(tracks)]
+        assert len(set(given)) == len(given)
+        named = [replace(track, object_id=one) for track, one in zip(tracks, given, strict=True)]
+        known, _ = with_ids([*known, arriving], named)
+        ids += [one for one in given if one not in ids]
+    again = track_objects(known, accepted, ids=ids)
+    assert told(again) == told(expected)
+    assert gathered(again) == gathered(expected)
+    assert all(track.object_id for track in again)
 
 
 def test_no_visits_have_no_objects() -> None:

@@ -332,6 +332,110 @@ def test_changes_passes_its_filters_on_and_lists_the_tiles(
     assert "1 of 7" in shown
 
 
+def test_changes_may_be_told_again_for_each_visit(service: Service) -> None:
+    service.on("GET /maps/lobby/changes", CHANGES)
+    assert spicd("changes", "lobby", "--repeats") == 0
+    assert dict(service.requests[0].url.params) == {"repeats": "true", "limit": "100"}
+
+
+BOX = {"center": [1.0, 2.0, 0.45], "size": [0.5, 0.6, 0.9]}
+THING: dict[str, Any] = {
+    "object_id": "object-1",
+    "number": 4,
+    "kind": "moved",
+    "status": "still_there",
+    "transient": True,
+    "now": BOX,
+    "before": {**BOX, "center": [5.0, 2.0, 0.45]},
+    "probability": 0.934,
+    "survey_id": "survey-1",
+    "captured_at": "2026-03-02T12:00:00Z",
+    "first_seen": "2026-03-01T12:00:00Z",
+    "last_seen": "2026-03-02T12:00:00Z",
+    "last_looked": "2026-03-02T12:00:00Z",
+    "accepted_in_version": None,
+}
+OBJECTS = {"type": "FeatureCollection", "numberMatched": 7, "features": [{"properties": THING}]}
+
+
+def test_objects_passes_its_filters_on_and_lists_the_things(
+    service: Service, capsys: pytest.CaptureFixture[str]
+) -> None:
+    service.on("GET /maps/lobby/objects", OBJECTS)
+    words = ("--status", "still_there", "--transient", "--min-probability", "0.5", "--bbox", "0,0,3,3")
+    assert spicd("objects", "lobby", *words) == 0
+    assert dict(service.requests[0].url.params) == {
+        "status": "still_there",
+        "transient": "true",
+        "min_probability": "0.5",
+        "bbox": "0,0,3,3",
+        "limit": "100",
+    }
+    shown = " ".join(capsys.readouterr().out.split())
+    for part in (
+        "object-1",
+        "still there,",
+        "transient",
+        "5.00, 2.00, 0.45 to",
+        "0.50 x 0.60 x 0.90",
+        "0.93",
+        "1 of 7",
+    ):
+        assert part in shown
+
+
+def test_objects_of_a_survey_are_those_that_it_saw(
+    service: Service, capsys: pytest.CaptureFixture[str]
+) -> None:
+    service.on("GET /surveys/survey-1", SURVEY)
+    service.on("GET /surveys/survey-1/objects", OBJECTS)
+    assert spicd("objects", "lobby", "--survey", "survey-1", "--kind", "moved") == 0
+    assert dict(service.requests[1].url.params) == {"kind": "moved", "limit": "100"}
+    assert "object-1" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("hall", "--survey", "survey-1"), "survey survey-1 is of map lobby, not of hall"),
+        (("lobby", "--survey", "survey-1", "--status", "new"), "leave --status out"),
+        (("lobby", "object-1", "--min-probability", "0.5"), "leave --min-probability out"),
+    ],
+)
+def test_objects_refuses_what_has_no_meaning(
+    service: Service, capsys: pytest.CaptureFixture[str], words: tuple[str, ...], said: str
+) -> None:
+    service.on("GET /surveys/survey-1", SURVEY)
+    assert spicd("objects", *words) == 1
+    assert said in capsys.readouterr().err
+
+
+def test_one_object_is_shown_with_its_sightings(service: Service, capsys: pytest.CaptureFixture[str]) -> None:
+    feature = {"type": "Feature", "properties": THING, "sightings": [{"properties": THING}]}
+    service.on("GET /maps/lobby/objects/object-1", feature)
+    assert spicd("objects", "lobby", "object-1") == 0
+    shown = capsys.readouterr().out
+    for part in ("still_there", "last looked", "survey-1", "moved"):
+        assert part in shown
+
+
+def test_maps_create_passes_the_alarms_on(service: Service) -> None:
+    service.on("POST /maps", {"map_id": "lobby", "job_id": "job-1"}, status=202)
+    assert spicd("maps", "create", "scan-0", "--alarms-per-survey", "0.02") == 0
+    assert service.body() == {"scan_ids": ["scan-0"], "settings": {"alarms_per_survey": 0.02}}
+
+
+def test_map_and_survey_show_their_objects(service: Service, capsys: pytest.CaptureFixture[str]) -> None:
+    service.on("GET /maps/lobby", {**MAP, "objects": {"new": 2, "still_there": 5}})
+    service.on("GET /surveys/survey-1", {**SURVEY, "objects": {"appeared": 3}, "moving": 4})
+    assert spicd("maps", "show", "lobby") == 0
+    assert "new 2, still there 5" in capsys.readouterr().out
+    assert spicd("surveys", "show", "survey-1") == 0
+    shown = capsys.readouterr().out
+    assert "appeared 3" in shown
+    assert "/surveys/survey-1/objects" in shown
+
+
 @pytest.mark.parametrize("place", ["before", "after"])
 def test_json_is_the_document_and_nothing_else_wherever_the_option_stands(
     service: Service, capsys: pytest.CaptureFixture[str], place: str

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from worker.benchmarks.card_figures import outdated_sections, paper_figures, revisit_figures
+from worker.benchmarks.card_figures import OBJECTS, outdated_sections, paper_figures, revisit_figures
 from worker.cli import main
 from worker.detectors.card import MODEL_STORE, Card, Preprocessing
 from worker.detectors.store import open_card, read_card, write_card
@@ -50,9 +50,9 @@ def paper_told() -> dict[str, Any]:
 
 
 def revisit_told() -> dict[str, Any]:
-    """As `evaluate revisit` writes it, two checkpoints and a baseline in it."""
+    """As `evaluate revisit` writes it, two checkpoints, a model without weights and a baseline in it."""
 
-    def method(name: str, f1: float, sha256: str | None) -> dict[str, Any]:
+    def method(name: str, f1: float, sha256: str | None, objects: Any = None) -> dict[str, Any]:
         return {
             "name": name,
             "sha256": sha256,
@@ -60,15 +60,28 @@ def revisit_told() -> dict[str, Any]:
             "best": figures(f1 + 0.01, threshold=0.3),
             "area_under_roc": 0.9,
             "average_precision": 0.8,
-            "unchanged_visits": 8,
-            "unchanged_visits_with_false_alarm": 5,
-            "groups": {"kind": {"add": figures(0.0), "move": figures(0.0)}},
+            "quiet_visits": 8,
+            "quiet_visits_with_false_tile": 4,
+            "quiet_visits_with_false_alarm": 5,
+            "groups": {
+                "kind": {"add": figures(0.0), "move": figures(0.0)},
+                "case": {"single": figures(0.0)},
+            },
+            "objects": objects,
+            "calibration": {"tiles": {"expected_calibration_error": 0.02}, "voxels": None},
         }
 
+    told: dict[str, Any] = {**dict.fromkeys(OBJECTS, 0.9), "groups": {}}
+    ours = method("b", 0.6, OURS, told)
     return {
         "command": "spicd-worker evaluate revisit --weights a.pt --weights b.pt",
-        "test": {"visits": 24, "observed": 900, "changed": {"counted": 110}},
-        "methods": [method("a", 0.3, OTHERS), method("b", 0.6, OURS), method("C2C (mean)", 0.4, None)],
+        "test": {"visits": 48, "changed": 300, "unchanged": 4000},
+        "methods": [
+            method("a", 0.3, OTHERS),
+            ours | {"hard": method("b", 0.2, OURS, told)},
+            method("rule/1", 0.5, None),
+            method("C2C (mean)", 0.4, None),
+        ],
     }
 
 
@@ -116,8 +129,8 @@ def test_both_benchmarks_come_on_the_card_and_the_rest_of_it_stays(store: Path) 
     assert outdated_sections(after) == []
 
 
-def test_the_paper_section_has_both_thresholds_the_kinds_and_the_baselines() -> None:
-    section = paper_figures(paper_told(), OURS)
+def test_the_paper_section_has_both_thresholds_the_kinds_and_the_baselines(store: Path) -> None:
+    section = paper_figures(paper_told(), open_card(store, "spicd-net/7"))
     assert (section["command"], section["sha256"]) == ("spicd-worker evaluate paper", OURS)
     assert (section["threshold"], section["f1"], section["true_positives"]) == (0.3, 0.85, 7)
     assert section["at_test_threshold"]["threshold"] == 0.4
@@ -128,16 +141,28 @@ def test_the_paper_section_has_both_thresholds_the_kinds_and_the_baselines() -> 
     assert {name: row["f1"] for name, row in section["baselines"].items()} == {"C2C (mean)": 0.5, "M3C2": 0.6}
 
 
-def test_the_revisit_section_is_of_the_method_with_the_cards_weights() -> None:
-    section = revisit_figures(revisit_told(), OURS)
+def test_the_revisit_section_is_of_the_method_with_the_cards_weights(store: Path) -> None:
+    section = revisit_figures(revisit_told(), open_card(store, "spicd-net/7"))
     assert section["command"] == "spicd-worker evaluate revisit --weights a.pt --weights b.pt"
-    assert (section["visits"], section["tiles"], section["changed_tiles"]) == (24, 900, 110)
+    assert (section["visits"], section["changed_tiles"], section["unchanged_tiles"]) == (48, 300, 4000)
     assert (section["f1"], section["f1_interval"]) == (0.6, [0.5, 0.7])
     assert section["at_test_threshold"]["threshold"] == 0.3
-    assert (section["unchanged_visits"], section["unchanged_visits_with_false_alarm"]) == (8, 5)
+    assert (section["quiet_visits"], section["quiet_visits_with_false_alarm"]) == (8, 5)
     assert section["recall_by_kind"] == {"add": 0.7, "move": 0.7}
-    assert list(section["baselines"]) == ["C2C (mean)"]
+    assert section["recall_by_case"] == {"single": 0.7}
+    assert (section["objects"]["recall"], section["hard"]["f1"]) == (0.9, 0.2)
+    assert section["calibration"]["tiles"]["expected_calibration_error"] == 0.02
+    assert list(section["baselines"]) == ["rule/1", "C2C (mean)"]
     assert section["baselines"]["C2C (mean)"]["area_under_roc"] == 0.9
+
+
+def test_a_model_without_weights_goes_by_its_name(store: Path) -> None:
+    card = open_card(store, "spicd-net/7").model_copy(update={"name": "rule", "version": "1", "sha256": None})
+    section = revisit_figures(revisit_told(), card)
+    assert (section["f1"], section["sha256"]) == (0.5, None)
+    assert list(section["baselines"]) == ["C2C (mean)"]
+    with pytest.raises(ValueError, match="no weights"):
+        paper_figures(paper_told(), card)
 
 
 @pytest.mark.parametrize(
@@ -145,7 +170,7 @@ def test_the_revisit_section_is_of_the_method_with_the_cards_weights() -> None:
     [
         ({"paper": {**paper_told(), "sha256": OTHERS}}, f"weights {OTHERS}"),
         ({"paper": {**paper_told(), "table_5": [{"name": "aggregated", "paper": None}]}}, "--quick"),
-        ({"revisit": {**revisit_told(), "methods": revisit_told()["methods"][::2]}}, f"weights {OTHERS}"),
+        ({"revisit": {**revisit_told(), "methods": revisit_told()["methods"][:1]}}, f"weights {OTHERS}"),
         ({"revisit": paper_told()}, "no result of `spicd-worker evaluate revisit`"),
         ({"paper": [1, 2]}, "no result of `spicd-worker evaluate paper`"),
         ({"paper": "no JSON"}, "paper.json"),

@@ -14,13 +14,17 @@ import pytest
 
 from tests.support import toy
 from tests.support.models import make_untrained
+from tests.support.two_visits import free_place
 from worker.benchmarks.plots import draw_curves
 from worker.cli import detect, main, terminal
 from worker.cloud.formats.pcd import write_pcd
 from worker.cloud.formats.scan import read_scan
+from worker.cloud.poses import inverse, transformed
 from worker.detectors.card import MODEL_STORE
 from worker.progress import Progress
-from worker.simulation.scenes import rigid
+from worker.simulation.scenes import random_room, rigid
+from worker.simulation.scenes.furniture import crate
+from worker.simulation.visits import visit
 from worker.training.dataset import TileSet, load_tiles, save_tiles
 from worker.training.settings import PAPER, TrainSettings
 
@@ -187,11 +191,75 @@ def test_the_summary_prints_names_that_look_like_markup_as_they_are(
         "reference": [{**scan, "name": "[old]/hall.pcd"}],
         "current": [{**scan, "name": "a[/]b.pcd"}],
         "changed": [],
+        "objects": None,
+        "moving": None,
         "files": {"tiles": "[new]/tiles.geojson"},
     }
     terminal.show(result, detect.summary)
     shown = capsys.readouterr().out
     assert all(name in shown for name in ("[old]/hall.pcd", "a[/]b.pcd", "[new]/tiles.geojson"))
+
+
+@pytest.mark.slow
+def test_detect_tells_objects_where_the_model_scores_voxels(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A room before and after a crate is put there, seen from one place; the frame is the first scan's."""
+    room = random_room(5)
+    (before,) = visit(room, 1, seed=1)
+    x, y, _ = before.world_from_sensor[:3, 3]
+    later, change = room.with_added("crate", crate(0.7, 0.5, 0.6).at(*free_place(room, around=(x, y))))
+    (after,) = visit(later, (before.world_from_sensor,), seed=2)
+    for name, scan in (("a", before), ("b", after)):
+        write_pcd(tmp_path / f"{name}.pcd", scan.points)
+    words = ["--out", str(tmp_path), "--model", "voxel-rule/1", "--json"]
+    assert run("detect", str(tmp_path / "a.pcd"), str(tmp_path / "b.pcd"), *words) == 0
+    told = json.loads(capsys.readouterr().out)
+    largest = told["objects"][0]
+    assert largest["kind"] == "appeared"
+    assert change.after is not None
+    there = transformed(change.after.mean(axis=0)[None], inverse(before.world_from_sensor))[0]
+    assert largest["now"]["center"][:2] == pytest.approx(there[:2], abs=0.35)
+    features = json.loads((tmp_path / "objects.geojson").read_text())["features"]
+    assert [feature["properties"]["number"] for feature in features] == [
+        thing["number"] for thing in told["objects"]
+    ]
+    tile = json.loads((tmp_path / "tiles.geojson").read_text())["features"][0]["properties"]
+    assert 0 <= tile["observed_share"] <= 1
+    terminal.show(told, detect.summary)
+    assert "appeared" in capsys.readouterr().out
+
+
+def test_the_summary_lists_objects_with_how_they_moved(capsys: pytest.CaptureFixture[str]) -> None:
+    place = {"center": [1.0, 2.0, 0.5], "size": [0.5, 0.4, 0.9], "height_over_floor": None}
+    moved = {
+        "number": 1,
+        "kind": "moved",
+        "now": place,
+        "before": place,
+        "motion": {"translation": [0.3, 0.4, 0.0], "yaw": 1.5707963},
+        "probability": 0.91,
+    }
+    round_ = {**moved, "number": 2, "motion": {**moved["motion"], "yaw": None}}
+    result = {
+        "model": "voxel-rule/1",
+        "threshold": 0.5,
+        "counts": {"tiles": 0},
+        "reference": [],
+        "current": [],
+        "changed": [],
+        "objects": [moved, round_, {**moved, "number": 3, "kind": "appeared", "motion": None}] * 8,
+        "moving": 2,
+        "files": {},
+    }
+    terminal.show(result, detect.summary)
+    shown = capsys.readouterr().out
+    for said in (
+        "0.50 m, 90°",
+        "... and 4 more objects",
+        "16 moved, 8 appeared; 2 more moved during a visit",
+    ):
+        assert said in shown
 
 
 def test_a_model_that_is_not_there_is_named(

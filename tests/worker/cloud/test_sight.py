@@ -98,3 +98,31 @@ def test_one_of_several_scans_can_be_left_out() -> None:
 
 def test_beyond_its_farthest_return_a_scan_says_nothing() -> None:
     assert counts(told(Sights.of([(wall(2.0), ORIGIN)]), (3.0, 0.0, 0.0))) == (0, 0, 0, 0)
+
+
+def _box(near: float, far: float, half: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the corners (1, 3), each, of a box around the axis ahead of the origin."""
+    return ORIGIN[None] + np.array((near, -half, -half)), ORIGIN[None] + np.array((far, half, half))
+
+
+def test_a_scan_says_no_more_of_boxes_that_it_is_blinded_for_nor_of_what_lies_behind() -> None:
+    sights = Sights.of([(wall(), ORIGIN), (wall(6.0, half=3.0), ORIGIN)])
+    assert sights is not None
+    low, high = _box(2.0, 2.4, 0.2)
+    blinded = sights.blinded(low, high)
+    places = ((2.2, 0.0, 0.0), (4.0, 0.0, 0.0), (2.2, 0.6, 0.0), (4.0, 1.0, 0.0))
+    before, after = (told(each, *places) for each in (sights, blinded))
+    assert [counts(before, row)[0] for row in range(4)] == [2, 1, 2, 1]
+    assert [counts(after, row) for row in range(2)] == [(0, 0, 0, 0)] * 2
+    assert [counts(after, row) for row in range(2, 4)] == [counts(before, row) for row in range(2, 4)]
+    assert sights.nearest.sum() > blinded.nearest.sum()  # what was given stays as it was
+
+
+def test_a_box_behind_the_wall_or_behind_the_sensor_blinds_no_scan() -> None:
+    sights = Sights.of([(wall(), ORIGIN)])
+    assert sights is not None
+    for ahead in (5.0, -3.0):
+        low, high = _box(ahead, ahead + 1, 0.5)
+        assert np.array_equal(sights.blinded(low, high).farthest, sights.farthest)
+    nothing = np.empty((0, 3))
+    assert np.array_equal(sights.blinded(nothing, nothing).farthest, sights.farthest)

@@ -15,6 +15,7 @@ from worker.cloud.voxel_keys import (
     packed,
     regions,
     rows_of,
+    union,
     unpacked,
 )
 from worker.cloud.voxels import Voxels
@@ -78,6 +79,17 @@ def test_a_block_holds_two_to_the_power_of_levels_voxels_along_each_axis(levels:
     expected = np.unique(cells >> levels, axis=0, return_inverse=True)[1]
     told = np.unique(blocks(keys, levels), return_inverse=True)[1]
     assert np.array_equal(told, expected.ravel())
+
+
+def test_a_union_says_where_both_went() -> None:
+    one, other = packed(some_cells(80, seed=4)), packed(some_cells(90, seed=5))
+    both, ours, theirs = union(one, other)
+    assert np.array_equal(both, np.union1d(one, other))
+    assert np.array_equal(both[ours], one)
+    assert np.array_equal(both[theirs], other)
+    nothing = np.empty(0, np.int64)
+    assert len(union(nothing, nothing)[0]) == 0
+    assert np.array_equal(union(one, nothing)[1], np.arange(len(one)))
 
 
 def test_dilation_adds_every_cell_within_reach_once() -> None:

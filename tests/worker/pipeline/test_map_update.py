@@ -12,6 +12,7 @@ import pytest
 from tests.support.rooms import Room
 from tests.support.walks import MANY, QUICK, registered, written
 from worker.cloud.poses import difference
+from worker.cloud.seen import Seen
 from worker.cloud.tiling import TileGrid
 from worker.cloud.types import Floats, Points
 from worker.pipeline.flow import BuiltMap, NoScanAccepted, build_map
@@ -52,6 +53,9 @@ def test_a_map_that_is_extended_holds_both_and_its_tiles_keep_their_ids(
     assert after.grid.lowest[0] < 0
     assert after.indices[:, 0].min() < 0
     assert {tuple(index) for index in before.indices} < {tuple(index) for index in after.indices}
+    assert np.array_equal(grown.seen.points, grown.reference.points)
+    assert grown.seen.hits.sum() > built.seen.hits.sum()
+    assert [len(version.seen.sights or ()) for version in (built, grown)] == [1, 2]
     assert built.reference.points[:, 0].min() > 1.8
     assert grown.reference.points[:, 0].min() < 0.2
     assert grown.report is not None
@@ -74,7 +78,7 @@ def _kept(built: BuiltMap, files: Sequence[ScanFile]) -> KeptMap:
         return lambda: read_registered(file, registered(outcome), max_points=MANY)
 
     scans = [loader(*each) for each in zip(files, built.outcomes, strict=True)]
-    return KeptMap(reference=built.reference, scans=scans)
+    return KeptMap(reference=built.reference, scans=scans, seen=built.seen)
 
 
 def _scan_of(*parts: Floats | Points) -> RegisteredScan:
@@ -99,7 +103,7 @@ def test_a_renewed_map_has_the_surveys_points_where_they_replace_and_both_elsewh
     older, seen = (_scan_of(*(part(tile, corner) for tile in (0, 1))) for corner in (lower, upper))
     grid = TileGrid(origin=np.zeros(3), size=np.array([1.5, 1.5, 1.0]), shape=(2, 1, 1))
     reference = reference_map(fuse([older], voxel_size=0.05), grid=grid, settings=SETTINGS.registration)
-    base = KeptMap(reference=reference, scans=[lambda: older])
+    base = KeptMap(reference=reference, scans=[lambda: older], seen=Seen.of([older], voxel_size=0.05))
     stages: list[str] = []
     renewed = renew_map(
         base,
@@ -130,3 +134,29 @@ def test_a_scan_loses_the_points_of_the_tiles_that_are_replaced_with_their_colou
     assert left.colors is not None
     assert left.colors.tolist() == [[1, 1, 1]]
     assert len(without(scan, grid, np.empty((0, 3), np.int32)).points) == 3
+
+
+def _across(x: float) -> Points:
+    """A wall of 2 x 2 m across the x axis, a point every 2 cm."""
+    y, z = np.meshgrid(np.arange(-0.99, 1, 0.02), np.arange(-0.99, 1, 0.02))
+    return np.column_stack([np.full(y.size, x), y.ravel(), z.ravel()]).astype(np.float32)
+
+
+def _standing(points: Points) -> RegisteredScan:
+    return replace(_scan_of(points), sensor_origin=np.zeros(3))
+
+
+def test_where_a_survey_replaces_a_map_its_older_scans_no_longer_count_as_having_looked() -> None:
+    """A wall at x = 5 m was seen through the place of a second one, which the survey found at 2 m."""
+    older, newer = _standing(_across(5.0) * np.array([1, 3, 1], np.float32)), _standing(_across(2.0))
+    grid = TileGrid(origin=np.array([1.5, -0.5, -0.5]), size=np.ones(3), shape=(4, 1, 1))
+    reference = reference_map(fuse([older], voxel_size=0.05), grid=grid, settings=SETTINGS.registration)
+    base = KeptMap(reference=reference, scans=[lambda: older], seen=Seen.of([older], voxel_size=0.05))
+    there = np.array([[2.0, 0.0, 0.0], [5.0, 2.5, 0.5]], np.float32)
+    assert base.seen.verdicts(there).surely.tolist() == [1, 0]
+    settings = SETTINGS.with_values(tiling=SETTINGS.tiling.with_values(min_points=1))
+    renewed = renew_map(base, [lambda: newer], replaced=np.array([[0, 0, 0]], np.int32), settings=settings)
+    verdicts = renewed.seen.verdicts(there)
+    assert verdicts.through.tolist() == [0, 0]  # the older scan saw through it, but no longer says so
+    assert verdicts.confirmed.tolist() == [1, 1]  # by the survey; beside the tile the older scan still counts
+    assert np.array_equal(renewed.seen.points, renewed.reference.points)

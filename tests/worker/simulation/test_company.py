@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from worker.simulation.company import CARRIER_ID, FIRST_PERSON_ID, Carrier, Walker, walkers
+from worker.simulation.company import CARRIER_ID, FIRST_PERSON_ID, CarrierBody, Walker, walkers
 from worker.simulation.scenes import Scene, rigid
 from worker.simulation.sensor import PERFECT, SensorModel, scan
 from worker.simulation.visits import visit
@@ -43,7 +43,7 @@ def test_a_person_turns_round_at_the_end_of_the_way():
 
 def test_noise_and_losses_are_as_without_company(bare_room):
     alone = measured(bare_room, SensorModel())
-    seen = measured(bare_room, SensorModel(), walkers=[passing(1.0)], carrier=Carrier.random(1))
+    seen = measured(bare_room, SensorModel(), walkers=[passing(1.0)], carrier=CarrierBody.random(1))
     building = seen.points[seen.object_ids > 0]
     same = {tuple(point) for point in alone.points.tolist()}
     kept = [tuple(point) in same for point in building.tolist()]
@@ -51,7 +51,7 @@ def test_noise_and_losses_are_as_without_company(bare_room):
 
 
 def test_the_carrier_is_met_at_the_same_place_in_every_scan(bare_room):
-    carrier = Carrier.random(3)
+    carrier = CarrierBody.random(3)
     scans = visit(bare_room, 3, seed=4, sensor=PERFECT, duration_s=1.0, carrier=carrier)
     low, high = carrier.mesh.bounds
     for seen in scans:
@@ -62,7 +62,7 @@ def test_the_carrier_is_met_at_the_same_place_in_every_scan(bare_room):
 
 @pytest.mark.parametrize("seed", range(5))
 def test_a_carrier_stands_between_20_and_70_cm_from_the_sensor(seed, bare_room):
-    seen = measured(bare_room, carrier=Carrier.random(seed))
+    seen = measured(bare_room, carrier=CarrierBody.random(seed))
     ranges = np.linalg.norm(seen.points[seen.object_ids == CARRIER_ID], axis=1)
     assert ranges.min() >= 0.2 and ranges.max() <= 0.7
 

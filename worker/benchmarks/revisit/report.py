@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from rich.console import Group
@@ -13,82 +12,146 @@ from rich.table import Table
 
 from worker.benchmarks import plots
 from worker.benchmarks.documents import Document, shown, titled_table
-from worker.benchmarks.methods import TileScore
-from worker.benchmarks.plots import FOUND, MISSED, QUIET, WRONG, ScoredTiles, TileStyle
-from worker.benchmarks.revisit.measures import Measured, TileTable
-from worker.benchmarks.revisit.visits import Revisit
+from worker.benchmarks.plots import QUIET, ScoredTiles
+from worker.benchmarks.revisit.calibration import Reliability
+from worker.benchmarks.revisit.measures import Measured
+from worker.benchmarks.revisit.tiles import TileTable
 from worker.simulation.truth import KINDS
 
 TITLES = {
     "kind": "recall by kind of change",
     "case": "second visit",
     "building": "building",
+    "tile": "tile",
+    "coverage": "points of the survey a point of the map",
     "misfit": "survey off the map, by its true poses",
-    "sigma": "by the sigmas stored with the survey",
 }
-#: How tiles are drawn, by what a method said of them.
-STYLES = {
-    "hit": TileStyle(color=FOUND),
-    "missed": TileStyle(color=MISSED),
-    "false alarm": TileStyle(color=WRONG),
-    "changed, nobody looked": TileStyle(color=MISSED, hatched=True),
-    "rightly quiet": TileStyle(color="#90a4ae", alpha=0.2),
-    "not observed": TileStyle(color="#eceff1", hatched=True),
+OBJECT_TITLES = {
+    "kind": "kind of change",
+    "voxels": "decidable voxels",
+    "case": "second visit",
+    "building": "building",
 }
 
 
 def tables(result: Document) -> Group:
-    """Show what there was to find, the methods in one table, and their recall and false alarms by groups of tiles."""
-    return Group(_methods(result), _groups(result), *_notes(result["test"]))
+    """Show what there was to find, the methods in one table, objects, groups of tiles, and the hard part by itself."""
+    rows = result["methods"]
+    parts = [
+        _methods(result),
+        _objects(rows, "objects"),
+        _groups(rows),
+        _object_groups(rows, "objects found"),
+    ]
+    hard = [row["hard"] | {"name": row["name"]} for row in rows if "hard" in row]
+    if hard:
+        title = _title(result["hard"], "the hard part")
+        parts += [
+            titled_table(title, COLUMNS, (_row(row) for row in hard)),
+            _objects(hard, "objects of the hard part"),
+            _object_groups(hard, "objects of the hard part found"),
+        ]
+    return Group(*(part for part in parts if part is not None), *_notes(result))
+
+
+COLUMNS = (
+    "method", "F1 (95%)", "precision", "recall", "no score", "quiet visits alarmed (tiles)", "threshold",
+    "test-optimal: F1", "threshold", "ROC area", "AP", "ECE", "seconds",
+)  # fmt: skip
 
 
 def _methods(result: Document) -> Table:
-    there = result["test"]
-    title = (
-        f"{there['visits']} visits, {there['without_change']} of them without a change: "
-        f"{there['observed']} of {there['tiles']} tiles observed, {there['changed']['counted']} of them changed"
-    )
-    columns = (
-        "method", "F1 (95%)", "precision", "recall", "false alarms", "quiet visits alarmed", "threshold",
-        "test-optimal: F1", "threshold", "ROC area", "AP", "seconds",
-    )  # fmt: skip
     chosen = result["validation"]
     caption = (
-        f"thresholds: best F1 on {chosen['visits']} visits to other buildings with {chosen['changed']['counted']} "
-        "changed tiles; test-optimal: best F1 on the test visits themselves"
+        f"thresholds: best F1 on {chosen['visits']} visits to other buildings with {chosen['changed']} changed "
+        "tiles; test-optimal: best F1 on the test visits themselves; no score: changed tiles that it has none for"
     )
-    return titled_table(title, columns, (_row(row) for row in result["methods"]), caption=caption)
+    rows = (_row(row) for row in result["methods"])
+    return titled_table(_title(result["test"], "the test"), COLUMNS, rows, caption=caption)
+
+
+def _title(there: Document, name: str) -> str:
+    return (
+        f"{name}: {there['visits']} visits, {there['without_change']} of them without a change; "
+        f"{there['changed']} changed tiles, {there['changed_and_thin_in_the_map']} of them thin in the map, "
+        f"{there['unchanged']} unchanged ones, {there['left_out']} left out"
+    )
 
 
 def _row(row: Document) -> tuple[str, ...]:
-    chosen, best = row["chosen"], row["best"]
+    chosen, best, calibration = row["chosen"], row["best"], row["calibration"]["tiles"]
     low, high = chosen["f1_interval"]
     return (
         row["name"],
-        f"{shown(chosen['f1'], '.2f')} ({low:.2f}-{high:.2f})",
-        shown(chosen["precision"], ".2f"),
-        shown(chosen["recall"], ".2f"),
-        shown(chosen["false_positive_rate"], ".1%"),
-        f"{row['unchanged_visits_with_false_alarm']} of {row['unchanged_visits']}",
+        f"{shown(chosen['f1'], '.3f')} ({low:.3f}-{high:.3f})",
+        shown(chosen["precision"], ".3f"),
+        shown(chosen["recall"], ".3f"),
+        str(row["changed_without_score"]),
+        f"{row['quiet_visits_with_false_alarm']} of {row['quiet_visits']} ({row['quiet_visits_with_false_tile']})",
         f"{chosen['threshold']:.3g}",
-        shown(best["f1"], ".2f"),
+        shown(best["f1"], ".3f"),
         f"{best['threshold']:.3g}",
         f"{row['area_under_roc']:.3f}",
         f"{row['average_precision']:.3f}",
+        "" if calibration is None else shown(calibration["expected_calibration_error"], ".3f"),
         f"{row['seconds']:.1f}",
     )
 
 
-def _groups(result: Document) -> Table:
-    methods = result["methods"]
-    table = titled_table("changes found; false alarms", ("tiles", *(row["name"] for row in methods)))
+def _objects(rows: Sequence[Document], title: str) -> Table | None:
+    told = [row for row in rows if row["objects"] is not None]
+    if not told:
+        return None
+    columns = (
+        "method", "recall (95%)", "precision (95%)", "false objects", "a quiet visit", "quiet visits with one",
+        "moved, told as moved", "ECE of voxels",
+    )  # fmt: skip
+    regions = told[0]["objects"]["regions"]
+    return titled_table(f"{title}: {regions} regions of 40 decidable voxels", columns, map(_object_row, told))
+
+
+def _object_row(row: Document) -> tuple[str, ...]:
+    figures, calibration = row["objects"], row["calibration"]["voxels"]
+    return (
+        row["name"],
+        _with_interval(figures["recall"], figures["recall_interval"]),
+        _with_interval(figures["precision"], figures["precision_interval"]),
+        f"{figures['false_objects']} of {figures['objects']}",
+        shown(figures["false_objects_a_quiet_visit"], ".2f"),
+        f"{figures['quiet_visits_with_an_object']} of {figures['quiet_visits']}",
+        f"{shown(figures['told_as_moved'], '.2f')} of {figures['moved']}",
+        "" if calibration is None else shown(calibration["expected_calibration_error"], ".4f"),
+    )
+
+
+def _with_interval(value: float | None, interval: Sequence[float] | None) -> str:
+    bounds = "" if interval is None else f" ({interval[0]:.3f}-{interval[1]:.3f})"
+    return shown(value, ".3f") + bounds
+
+
+def _groups(rows: Sequence[Document]) -> Table:
+    table = titled_table("changed tiles found; false alarms", ("tiles", *(row["name"] for row in rows)))
     for by, title in TITLES.items():
         table.add_section()
         table.add_row(title, style="bold")
-        for group in methods[0]["groups"][by]:
-            cells = [_cell(row["groups"][by][group]) for row in methods]
+        for group in rows[0]["groups"][by]:
+            cells = [_cell(row["groups"][by][group]) for row in rows]
             if any(cells):
                 table.add_row(f"  {group}", *cells)
+    return table
+
+
+def _object_groups(rows: Sequence[Document], title: str) -> Table | None:
+    told = [row for row in rows if row["objects"] is not None]
+    if not told:
+        return None
+    table = titled_table(title, ("regions", *(row["name"] for row in told)))
+    for by, heading in OBJECT_TITLES.items():
+        table.add_section()
+        table.add_row(heading, style="bold")
+        for group in told[0]["objects"]["groups"][by]:
+            cells = [row["objects"]["groups"][by][group] for row in told]
+            table.add_row(f"  {group}", *(f"{cell['found']} of {cell['regions']}" for cell in cells))
     return table
 
 
@@ -101,35 +164,25 @@ def _cell(counts: Document) -> str:
     return "; ".join(words)
 
 
-def _notes(there: Document) -> list[str]:
-    changed, scans = there["changed"], there["scans"]["second"]
-    off = there["misfit_centimetres"]
+def _notes(result: Document) -> list[str]:
+    scans, off = result["test"]["scans"]["second"], result["test"]["misfit_centimetres"]
     lines = [
-        f"changed tiles that no method is asked about: {changed['unobserved']} not observed by the survey, "
-        f"{changed['out_of_sight']} whose change was in no sensor's sight, {changed['outside_the_map']} where "
-        "the map has too few points for a tile",
         f"scans of the second visits: {scans['accepted']} of {scans['of']} placed, "
-        f"{scans['wrong']} of them over 10 cm off",
+        f"{scans['wrong']} of them over 10 cm off"
     ]
     if off is not None:
         lines.append(
             f"survey off the map by its poses: median {off['median']:.1f} cm, 95% {off['95%']:.1f} cm, "
             f"worst {off['worst']:.1f} cm"
         )
-    return lines
+    return [*lines, *(f"left out: {reason}" for reason in result["left_out"])]
 
 
-def draw(folder: Path, methods: Sequence[Measured], table: TileTable, visits: Sequence[Revisit]) -> None:
-    """Write `curves.png`, `recall.png`, and `tiles-VISIT.png` of the first method. Raises OSError."""
+def draw(folder: Path, methods: Sequence[Measured], table: TileTable) -> None:
+    """Write `curves.png`, `recall.png` and `reliability.png`. Raises OSError."""
     plots.save(_curves(methods, table), folder / "curves.png")
     plots.save(_recall(methods), folder / "recall.png")
-    number = int(np.argmax([int((visit.changed & visit.counted).sum()) for visit in visits]))
-    first, visit, threshold = methods[0], visits[number], methods[0].chosen.threshold
-    verdicts = verdicts_of(visit, first.scores[table.visit == number], threshold)
-    title = f"{first.name} on {visit.name}: threshold {threshold:.3g}"
-    plots.save(
-        plots.tile_map(visit.pairs.reference, verdicts, STYLES, title), folder / f"tiles-{visit.name}.png"
-    )
+    plots.save(_reliability(methods), folder / "reliability.png")
 
 
 def _curves(methods: Sequence[Measured], table: TileTable) -> Figure:
@@ -178,12 +231,25 @@ def _draw_recall(axes: Axes, methods: Sequence[Measured], by: str, names: Sequen
     axes.set_ylim(0, 1.02)
 
 
-def verdicts_of(visit: Revisit, scores: TileScore, threshold: float) -> list[str]:
-    """Name what a method said of each tile: (T,) keys of STYLES."""
-    flagged = scores > threshold
-    verdicts: list[str] = np.where(
-        visit.exists,
-        np.where(~visit.counted, "changed, nobody looked", np.where(flagged, "hit", "missed")),
-        np.where(~visit.counted, "not observed", np.where(flagged, "false alarm", "rightly quiet")),
-    ).tolist()
-    return verdicts
+def _reliability(methods: Sequence[Measured]) -> Figure:
+    """Draw the share that truly changed over the probability, of tiles and of voxels."""
+    figure = Figure(figsize=(10, 4.8), dpi=120, layout="constrained")
+    tiles, voxels = figure.subplots(1, 2)
+    plots.entitle(tiles, "reliability of tiles")
+    plots.entitle(voxels, "reliability of voxels")
+    for color, method in plots.coloured(list(methods)):
+        _draw_reliability(tiles, method.tile_reliability, color, method.name)
+        _draw_reliability(voxels, method.voxel_reliability, color, method.name)
+    for axes in (tiles, voxels):
+        axes.plot([0, 1], [0, 1], color=QUIET, linewidth=0.7, linestyle=":")
+        plots.label(axes, "probability", "share that truly changed")
+    return figure
+
+
+def _draw_reliability(axes: Axes, reliability: Reliability | None, color: str, name: str) -> None:
+    if reliability is None:
+        return
+    some = reliability.counts > 0
+    said, true = (part[some] / reliability.counts[some] for part in (reliability.sums, reliability.changed))
+    error = shown(reliability.expected_error(), ".3f")
+    axes.plot(said, true, "o-", color=color, markersize=3, label=f"{name}: error {error}")

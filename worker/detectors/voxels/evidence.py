@@ -17,7 +17,7 @@ from worker.cloud.seen import Seen
 from worker.cloud.settings import StrictModel
 from worker.cloud.sight import FARTHEST_RESIDUAL, Verdicts
 from worker.cloud.types import Bools, Points
-from worker.cloud.voxel_keys import Keys, blocks, dilated, near, regions, rows_of
+from worker.cloud.voxel_keys import Keys, blocks, dilated, near, regions, rows_of, union
 
 CHANNELS = 12  #: of `Evidence.channels`
 _BLOCK = 2  # levels: context is found by blocks of 4 voxels
@@ -102,15 +102,12 @@ def gathered(own: Seen, other: Seen, candidates: Keys, settings: EvidenceSetting
     """Gather the evidence at and around the candidates (C,), ascending."""
     around = dilated(blocks(candidates, _BLOCK), settings.context)
     own_rows, other_rows = _rows_in(own.keys, around), _rows_in(other.keys, around)
-    keys = np.union1d(own.keys[own_rows], other.keys[other_rows])
+    keys, *places = union(own.keys[own_rows], other.keys[other_rows])
     hits, sums = [], np.zeros((len(keys), 3))
-    for seen, rows in ((own, own_rows), (other, other_rows)):
-        place = np.searchsorted(keys, seen.keys[rows])
+    for seen, rows, place in ((own, own_rows, places[0]), (other, other_rows, places[1])):
         count = np.zeros(len(keys), np.int32)
         count[place] = seen.hits[rows]
-        weighted = np.zeros((len(keys), 3))
-        weighted[place] = seen.points[rows].astype(np.float64) * seen.hits[rows, None]
-        sums += weighted
+        sums[place] += seen.points[rows].astype(np.float64) * seen.hits[rows, None]
         hits.append(count)
     points: Points = (sums / np.maximum(hits[0] + hits[1], 1)[:, None]).astype(np.float32)
     return Evidence(

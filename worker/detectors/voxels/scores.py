@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +13,8 @@ from worker.cloud.seen import Seen
 from worker.cloud.settings import StrictModel
 from worker.cloud.tiling import TileGrid
 from worker.cloud.types import Bools, Floats, Indices
-from worker.cloud.voxel_keys import Keys, rows_of
+from worker.cloud.voxel_keys import Keys, rows_of, union
+from worker.detectors.card import Card
 from worker.detectors.comparison import Comparison
 from worker.detectors.detector import Detection, VoxelScores
 from worker.detectors.voxels.evidence import (
@@ -79,8 +81,10 @@ def detected(
     reference, current = comparison.reference.seen, comparison.current.seen
     if reference is None or current is None:
         raise ValueError("a detector by voxels needs what both visits saw")
-    gone = answered(reference, current, scorer, evidence)
-    new = answered(current, reference, scorer, evidence)
+    with ThreadPoolExecutor(2) as pool:  # NumPy and torch let each other run
+        pending = pool.submit(answered, reference, current, scorer, evidence)
+        new = answered(current, reference, scorer, evidence)
+        gone = pending.result()
     voxels = _voxel_scores(reference, current, gone, new)
     counts, sums = _per_tile(comparison, reference, current, gone, new)
     share = observed_share(comparison.grid, comparison.tiles, reference, current, gone.missing.judged)
@@ -99,6 +103,12 @@ def detected(
 def tile_score(sums: Floats, settings: TileScoreSettings) -> Floats:
     """Return the probability of change (T,) of tiles with so many changed voxels to be expected (T,)."""
     return np.asarray(1 / (1 + np.exp(-(settings.slope * np.log1p(sums) + settings.offset))))
+
+
+def tile_threshold(card: Card, least_score: float) -> float:
+    """Return the threshold of the card's tiles, or the score of one with so many expected changed voxels if higher."""
+    settings = TileScoreSettings.model_validate(card.detector_settings.get("tiles", {}))
+    return max(card.threshold, float(tile_score(np.array(least_score), settings)))
 
 
 def observed_share(
@@ -124,17 +134,16 @@ def observed_share(
 
 
 def _voxel_scores(reference: Seen, current: Seen, gone: Answer, new: Answer) -> VoxelScores:
-    keys = np.union1d(reference.keys, current.keys)
+    keys, *places = union(reference.keys, current.keys)
     judged, through = np.zeros(len(keys), bool), np.zeros(len(keys), np.int16)
     scores, moving = [], np.zeros(len(keys), bool)
-    for seen, answer in ((reference, gone), (current, new)):
-        rows = np.searchsorted(keys, seen.keys)
+    for rows, answer in zip(places, (gone, new), strict=True):
         judged[rows] |= answer.missing.judged
         through[rows] = np.maximum(through[rows], answer.missing.seen_through)
-        rows = np.searchsorted(keys, answer.keys)
+        there = np.searchsorted(keys, answer.keys)
         score = np.zeros(len(keys), np.float32)
-        score[rows] = answer.probabilities
-        moving[rows] |= answer.moving
+        score[there] = answer.probabilities
+        moving[there] |= answer.moving
         scores.append(score)
     return VoxelScores(
         keys=keys,

@@ -66,7 +66,6 @@ def reference_map(voxels: Voxels, *, grid: TileGrid, settings: RegistrationSetti
     )
 
 
-def current_map(scans: Iterable[RegisteredScan], *, voxel_size: float) -> CurrentMap:
-    """Fuse the survey's scans like the map was (paper, Section 3.9.1)."""
-    voxels = fuse(scans, voxel_size=voxel_size)
+def current_map(voxels: Voxels) -> CurrentMap:
+    """Return what a survey's scans were fused to, as those of the map are (paper, Section 3.9.1)."""
     return CurrentMap(points=voxels.points, colors=voxels.colors)

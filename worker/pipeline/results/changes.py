@@ -10,7 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from worker.cloud.tiling import TilePairs
-from worker.detectors.detector import Detection, change_score
+from worker.cloud.types import Bools
+from worker.detectors.detector import Detection, VoxelScores, change_score
+from worker.pipeline.results.objects import ChangeObjects
 
 
 class TileState(IntEnum):
@@ -19,7 +21,7 @@ class TileState(IntEnum):
     UNCHANGED = 0  #: looked at, and the same
     CHANGED = 1  #: looked at, and different
     INCONSISTENT = 2  #: below the threshold, but "different place" is the likeliest class
-    UNOBSERVED = 3  #: not seen densely enough to say
+    UNOBSERVED = 3  #: not seen well enough to say
 
     @property
     def label(self) -> str:
@@ -29,16 +31,22 @@ class TileState(IntEnum):
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class ChangeSet:
-    """One state and one score a tile."""
+    """What a survey found: one state and one score a tile, and objects where the detector scores voxels."""
 
     pairs: TilePairs
-    probabilities: NDArray[np.float32]  #: (T, 3), NaN where unobserved
+    probabilities: NDArray[np.float32]  #: (T, 3), NaN where nothing could be compared
     states: NDArray[np.uint8]  #: (T,) values of TileState
     threshold: float
+    #: (T,) of what the map knows of the tile, what the survey could judge; None: the detector scores tiles alone
+    observed_share: NDArray[np.float32] | None = None
+    appeared: NDArray[np.int32] | None = None  #: (T,) voxels; None as above
+    disappeared: NDArray[np.int32] | None = None  #: (T,) likewise
+    voxels: VoxelScores | None = None  #: as above
+    objects: ChangeObjects | None = None  #: as above
 
     @property
     def scores(self) -> NDArray[np.float32]:
-        """(T,) probability that the tile is not as it was, NaN where unobserved."""
+        """(T,) probability that the tile is not as it was, NaN where nothing could be compared."""
         return change_score(self.probabilities)
 
     def counts(self) -> dict[str, int]:
@@ -47,19 +55,48 @@ class ChangeSet:
         return {state.label: counts[state] for state in TileState}
 
 
-def decide(pairs: TilePairs, detection: Detection, *, threshold: float) -> ChangeSet:
-    """Call a tile changed where its score is above the threshold, and inconsistent where class 2 wins below it.
+def decide(
+    pairs: TilePairs, detection: Detection, *, threshold: float, min_observed_share: float = 0.5
+) -> ChangeSet:
+    """Call a tile changed where its score is above the threshold, and say where it was not seen well enough.
 
-    The paper only knows the first; a tile that looks like another place is no proof of "no change" either.
-    Raises ValueError where an observed tile has no score: that is a fault of the detector, and no state fits it.
+    A detector of voxels tells what of each tile could be judged: a tile that did not change is unobserved where that
+    is less than `min_observed_share`, and has its probabilities where it is more than nothing. Of any other detector
+    what it says of tiles with too few points is dropped, and where class 2 wins below the threshold the tile is
+    inconsistent: the paper knows no such state, but a tile that looks like another place is no proof of "no change".
+    Raises ValueError where a tile that could be judged has no score: a fault of the detector, and no state fits it.
     """
+    if detection.observed_share is None:
+        return _decided_by_points(pairs, detection, threshold)
+    share = detection.observed_share
+    _check_scored(detection.probabilities, share > 0)
+    scores = change_score(detection.probabilities)
+    states = np.full(len(scores), TileState.UNCHANGED, np.uint8)
+    states[(share < min_observed_share) | np.isnan(scores)] = TileState.UNOBSERVED
+    states[scores > threshold] = TileState.CHANGED
+    return ChangeSet(
+        pairs=pairs,
+        probabilities=detection.probabilities,
+        states=states,
+        threshold=threshold,
+        observed_share=share,
+        appeared=detection.appeared,
+        disappeared=detection.disappeared,
+    )
+
+
+def _decided_by_points(pairs: TilePairs, detection: Detection, threshold: float) -> ChangeSet:
     observed = pairs.observed
-    unscored = int(np.isnan(detection.probabilities[observed]).any(axis=1).sum())
-    if unscored:
-        raise ValueError(f"{unscored} of {int(observed.sum())} observed tiles were given NaN by the detector")
+    _check_scored(detection.probabilities, observed)
     probabilities = np.where(observed[:, None], detection.probabilities, np.float32(np.nan))
     states = np.full(len(probabilities), TileState.UNCHANGED, np.uint8)
     states[np.nan_to_num(probabilities).argmax(axis=1) == 2] = TileState.INCONSISTENT
     states[change_score(probabilities) > threshold] = TileState.CHANGED
     states[~observed] = TileState.UNOBSERVED
     return ChangeSet(pairs=pairs, probabilities=probabilities, states=states, threshold=threshold)
+
+
+def _check_scored(probabilities: NDArray[np.float32], observed: Bools) -> None:
+    unscored = int(np.isnan(probabilities[observed]).any(axis=1).sum())
+    if unscored:
+        raise ValueError(f"{unscored} of {int(observed.sum())} observed tiles were given NaN by the detector")

@@ -1,18 +1,24 @@
-"""Results for people and programs: the coloured cloud, and one row a tile."""
+"""Results for programs: one row a tile, and the coloured cloud."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from enum import IntEnum
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from worker.cloud.formats.ply import write_ply
 from worker.cloud.tiling import tile_id
-from worker.cloud.types import Colors
-from worker.pipeline.mapping.fusion import CurrentMap
+from worker.cloud.types import Bools, Colors, Points
+from worker.cloud.voxel_keys import rows_of
+from worker.cloud.voxels import Voxels
+from worker.detectors.detector import VoxelScores
 from worker.pipeline.results.changes import ChangeSet, TileState
+from worker.pipeline.results.objects import ChangeObjects
 
 #: Colour-blind-safe (Okabe and Ito, 2008): grey, vermilion, reddish purple, sky blue
 STATE_COLORS = {
@@ -25,6 +31,26 @@ NOT_IN_A_TILE = 255  #: value of `tile_state` for points outside every reference
 _NOT_IN_A_TILE_COLOR = (225, 225, 225)
 
 
+class PointKind(IntEnum):
+    """What is said of one point; the numbers stand in the coloured cloud."""
+
+    UNCHANGED = 0  #: the other visit has it too, or what is missing is too little to be an object
+    APPEARED = 1  #: of an object that came, or of the present place of one that was moved
+    DISAPPEARED = 2  #: of the map: of an object that went, or of the former place of one that was moved
+    NOT_JUDGED = 3  #: the map's scans could not see whether it was there
+    MOVING = 4  #: it moved while the visit lasted: people, doors
+
+
+#: Of the same palette, with the lightest grey where nothing can be said.
+KIND_COLORS = {
+    PointKind.UNCHANGED: (150, 150, 150),
+    PointKind.APPEARED: (213, 94, 0),
+    PointKind.DISAPPEARED: (0, 114, 178),
+    PointKind.NOT_JUDGED: (215, 215, 215),
+    PointKind.MOVING: (240, 228, 66),
+}
+
+
 @dataclass(frozen=True, kw_only=True, slots=True)
 class TileResult:
     """One tile's answer, in plain numbers; metres, map frame."""
@@ -34,10 +60,13 @@ class TileResult:
     lower: tuple[float, float, float]
     upper: tuple[float, float, float]
     state: str
-    score: float | None  #: probability of change; None where unobserved
-    probabilities: tuple[float, float, float] | None
+    score: float | None  #: probability of change; None where nothing could be compared
+    probabilities: tuple[float, float, float] | None  #: likewise
     n_reference: int
     n_current: int
+    observed_share: float | None  #: that the survey could judge; None: the detector scores tiles alone
+    appeared: int | None  #: voxels; None as above
+    disappeared: int | None  #: likewise
 
 
 def tile_results(changes: ChangeSet) -> list[TileResult]:
@@ -56,7 +85,7 @@ def _tile_result(
     index = changes.pairs.reference.indices[tile]
     state = TileState(int(changes.states[tile]))
     same, changed, other = (float(value) for value in changes.probabilities[tile])
-    scored = state is not TileState.UNOBSERVED
+    scored = not np.isnan(changes.scores[tile])
     return TileResult(
         tile_id=tile_id(index),
         tile_index=(int(index[0]), int(index[1]), int(index[2])),
@@ -67,6 +96,9 @@ def _tile_result(
         probabilities=(same, changed, other) if scored else None,
         n_reference=len(changes.pairs.reference.points[tile]),
         n_current=len(changes.pairs.current[tile]),
+        observed_share=None if changes.observed_share is None else float(changes.observed_share[tile]),
+        appeared=None if changes.appeared is None else int(changes.appeared[tile]),
+        disappeared=None if changes.disappeared is None else int(changes.disappeared[tile]),
     )
 
 
@@ -75,29 +107,83 @@ def _rounded(corner: NDArray[np.float64]) -> tuple[float, float, float]:
     return x, y, z
 
 
-def write_coloured_cloud(path: Path, current: CurrentMap, changes: ChangeSet) -> None:
-    """Write the survey's fused cloud as PLY, each point in the colour of its tile's state.
+def write_coloured_cloud(path: Path, reference: Points, current: Points, changes: ChangeSet) -> None:
+    """Write the survey's fused cloud (N, 3), map frame, as coloured PLY; with objects also what the map (M, 3) lost.
 
-    Scalar fields: `change_score` (float; NaN where not scored) and `tile_state` (uchar; TileState, or 255
-    outside every reference tile).
+    Scalar fields: `change_score` (float; NaN where not scored) and `tile_state` (uchar; TileState, or 255 outside
+    every tile). A detector of tiles alone colours each point by its tile's state. Where there are objects the score
+    is the point's own, each point is coloured by its `kind` (uchar; PointKind), and `object_id` (int) is the number
+    of its object, 0 where it is of none.
     """
+    if changes.voxels is None or changes.objects is None:
+        state, score = _of_tiles(current, changes)
+        colors = _colors(STATE_COLORS)[state]
+        write_ply(path, current, colors=colors, scalars={"change_score": score, "tile_state": state})
+        return
+    told = [
+        _survey_points(current, changes.voxels, changes.objects),
+        _lost_points(reference, changes.voxels, changes.objects),
+    ]
+    points = np.concatenate([points for points, _, _, _ in told])
+    kind = np.concatenate([kind for _, kind, _, _ in told])
+    score = np.concatenate([score for _, _, score, _ in told])
+    number = np.concatenate([number for _, _, _, number in told])
+    state, _ = _of_tiles(points, changes)
+    scalars: dict[str, NDArray[Any]] = {
+        "change_score": score,
+        "tile_state": state,
+        "kind": kind,
+        "object_id": number,
+    }
+    write_ply(path, points, colors=_colors(KIND_COLORS)[kind], scalars=scalars)
+
+
+def _of_tiles(points: Points, changes: ChangeSet) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+    """Return state and score of the tile that each point (N, 3) lies in, (N,) each."""
     tiles = changes.pairs.reference
-    tile = tiles.grid.locate_among(current.points, tiles.indices)
+    tile = tiles.grid.locate_among(points, tiles.indices)
     inside = tile >= 0
     state = np.full(len(tile), NOT_IN_A_TILE, np.uint8)
     state[inside] = changes.states[tile[inside]]
     score = np.full(len(tile), np.nan, np.float32)
     score[inside] = changes.scores[tile[inside]]
-    write_ply(
-        path,
-        current.points,
-        colors=_colors(state),
-        scalars={"change_score": score, "tile_state": state},
-    )
+    return state, score
 
 
-def _colors(states: NDArray[np.uint8]) -> Colors:
-    table = np.full((256, 3), _NOT_IN_A_TILE_COLOR, np.uint8)
-    for state, color in STATE_COLORS.items():
-        table[state] = color
-    return table[states]
+#: Points (N, 3), and of each its kind, its score and the number of its object, (N,) each.
+_Told = tuple[Points, NDArray[np.uint8], NDArray[np.float32], NDArray[np.int32]]
+
+
+def _survey_points(current: Points, voxels: VoxelScores, objects: ChangeObjects) -> _Told:
+    """Say of each point of the survey what it is."""
+    rows, known = _rows(current, voxels, objects)
+    number = np.where(known, objects.now[rows], 0).astype(np.int32)
+    judged = known & voxels.judged[rows]
+    kind = np.full(len(current), PointKind.UNCHANGED, np.uint8)
+    kind[~judged] = PointKind.NOT_JUDGED
+    kind[known & voxels.moving[rows]] = PointKind.MOVING
+    kind[number > 0] = PointKind.APPEARED
+    score = np.where(judged, voxels.appeared[rows], np.nan).astype(np.float32)
+    return current, kind, score, number
+
+
+def _lost_points(reference: Points, voxels: VoxelScores, objects: ChangeObjects) -> _Told:
+    """Return the points of the map that are of objects and no longer there."""
+    rows, known = _rows(reference, voxels, objects)
+    lost = np.flatnonzero(known & (objects.before[rows] > 0))
+    kind = np.full(len(lost), PointKind.DISAPPEARED, np.uint8)
+    return reference[lost], kind, voxels.disappeared[rows[lost]], objects.before[rows[lost]]
+
+
+def _rows(points: Points, voxels: VoxelScores, objects: ChangeObjects) -> tuple[NDArray[np.int64], Bools]:
+    """Return (N,) the row of the voxel that each point (N, 3) lies in, and whether there is one."""
+    rows = rows_of(Voxels.keys_of(points, size=objects.voxel_size), voxels.keys)
+    return np.maximum(rows, 0), rows >= 0
+
+
+def _colors(table: Mapping[Any, tuple[int, int, int]]) -> Colors:
+    """Return (256, 3) the colour of each number."""
+    colors = np.full((256, 3), _NOT_IN_A_TILE_COLOR, np.uint8)
+    for number, color in table.items():
+        colors[number] = color
+    return colors

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import permutations
 from typing import Literal, get_args
 
 import numpy as np
@@ -27,6 +28,11 @@ from worker.pipeline.results.shapes import Motion, Shape, ShapeSettings, Surroun
 ObjectKind = Literal["appeared", "disappeared", "moved"]
 
 AROUND = 0.2  #: metres around an object's box, of which `observed_share` is taken
+OVER = (
+    0.1,
+    0.3,
+)  #: metres, level and up, around a larger part's box, where a smaller one is of the same thing
+OVER_SHARE = 0.7  #: of the smaller part
 MOVING_SHARE = 0.5  #: a region of which more moved during a visit is no object
 SEEN_THROUGH = 90  #: percentile over an object's voxels, so that a few of them do not speak for all
 
@@ -95,6 +101,7 @@ class ChangeObjects:
 
     objects: tuple[ChangeObject, ...]  #: by number
     moving: int  #: things that moved while a visit lasted, such as people; they are no objects
+    voxel_size: float  #: metres
     keys: Keys  #: (V,) ascending
     now: NDArray[np.int32]  #: (V,) the number of the object that the survey's returns are of; 0: of none
     before: NDArray[np.int32]  #: (V,) likewise of the map's
@@ -120,6 +127,7 @@ def change_objects(
     return ChangeObjects(
         objects=tuple(thing.described(number) for number, thing in enumerate(things, start=1)),
         moving=moving_things(voxels, min_voxels=settings.min_voxels),
+        voxel_size=before.seen.voxel_size,
         keys=voxels.keys,
         before=_numbered(len(voxels.keys), [thing.gone for thing in things]),
         now=_numbered(len(voxels.keys), [thing.come for thing in things]),
@@ -212,27 +220,16 @@ class _Side:
     voxels: VoxelScores
 
     def parts(self, regions: Sequence[Region], *, max_gap: float) -> list[_Found]:
-        """Look regions up in what the visit saw, those that lie near each other as one.
+        """Look regions up in what the visit saw, those that lie near each other, or above, as one.
 
         Raises ValueError where it has not hit one of their voxels.
         """
-        if not regions:
-            return []
-        whole = Region.joined(regions)
-        points = self._points(whole)
-        owners = np.concatenate([np.full(len(region.rows), owner) for owner, region in enumerate(regions)])
-        owners = owners[np.argsort(np.concatenate([region.rows for region in regions]))]
-        links = KDTree(points).query_pairs(max_gap, output_type="ndarray")
-        links = owners[links]
-        count = len(regions)
-        graph = coo_matrix((np.ones(len(links), np.int8), (links[:, 0], links[:, 1])), shape=(count, count))
-        _, labels = connected_components(graph, directed=False)
-        return [
-            self.part(
-                Region.joined([region for region, its in zip(regions, labels, strict=True) if its == label])
-            )
-            for label in np.unique(labels)
-        ]
+        near = _joined_by(regions, _linked([self._points(region) for region in regions], max_gap))
+        parts = [self.part(region) for region in near]
+        above = _joined_by(
+            near, [(a, b) for a, b in permutations(range(len(parts)), 2) if _is_over(parts[a], parts[b])]
+        )
+        return parts if len(above) == len(near) else [self.part(region) for region in above]
 
     def part(self, region: Region) -> _Found:
         """Describe where a region lies."""
@@ -270,10 +267,42 @@ class _Side:
 
     def _observed_share(self, place: Place) -> float:
         """Return the share of what the visit hit in and around a place that the other could judge."""
-        around = self.seen.keys[within(place, self.seen.points, margin=AROUND)]
+        around = self.seen.keys[within(place, self.seen.points, margin=(AROUND,) * 3)]
         rows = rows_of(around, self.voxels.keys)
         judged = self.voxels.judged[rows[rows >= 0]]
         return float(judged.mean()) if len(judged) else 0.0
+
+
+def _linked(clouds: Sequence[Floats], max_gap: float) -> list[tuple[int, int]]:
+    """Return the pairs of clouds (n, 3) with points within so many metres of each other."""
+    if not clouds:
+        return []
+    owners = np.repeat(np.arange(len(clouds)), [len(cloud) for cloud in clouds])
+    links = owners[KDTree(np.concatenate(clouds)).query_pairs(max_gap, output_type="ndarray")]
+    return [(int(a), int(b)) for a, b in np.unique(links, axis=0) if a != b]
+
+
+def _joined_by(regions: Sequence[Region], links: Sequence[tuple[int, int]]) -> list[Region]:
+    """Return the regions, those that links connect as one."""
+    if not links:
+        return list(regions)
+    rows, columns = np.array(links).T
+    shape = (len(regions), len(regions))
+    _, labels = connected_components(
+        coo_matrix((np.ones(len(rows)), (rows, columns)), shape=shape), directed=False
+    )
+    return [
+        Region.joined([region for region, its in zip(regions, labels, strict=True) if its == label])
+        for label in np.unique(labels)
+    ]
+
+
+def _is_over(one: _Found, other: _Found) -> bool:
+    """Tell whether most of a smaller part lies right over, under or in the box of a larger one: leaves over their pot."""
+    if len(one.points) > len(other.points):
+        return False
+    inside = within(other.place, one.points, margin=(OVER[0], OVER[0], OVER[1]))
+    return bool(inside.mean() >= OVER_SHARE)
 
 
 def _sides(comparison: Comparison, voxels: VoxelScores) -> tuple[_Side, _Side]:

@@ -1,4 +1,7 @@
-"""The picture of a survey: the map from above, its tiles by state, title, scale bar and legend."""
+"""The picture of a survey: the map from above, objects and tiles, title, scale bar and legend.
+
+Where the detector found objects, these tell the story, and the tiles stand back.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +11,7 @@ import numpy as np
 from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import PatchCollection
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -16,15 +20,23 @@ from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
 from worker.cloud.types import Points
+from worker.cloud.voxel_keys import centers
 from worker.files import write_atomically
-from worker.pipeline.mapping.fusion import CurrentMap
 from worker.pipeline.results.changes import ChangeSet, TileState
 from worker.pipeline.results.export import STATE_COLORS
+from worker.pipeline.results.object_marks import (
+    INK,
+    LIST_WIDTH,
+    QUIET,
+    color_of_kind,
+    draw_objects,
+    legend_entries,
+    list_objects,
+)
+from worker.pipeline.results.objects import ChangeObjects
 
 Extent = tuple[float, float, float, float]  #: left, right, bottom, top; metres, map frame
 
-INK = "#1a1a1a"
-QUIET = "#666666"
 #: How strongly a tile is filled, and a second sign beside the colour, for eyes and printers without it. Of the tiles
 #: in one column of the grid the first in this order is shown; the rest would lie under it.
 STYLES = {
@@ -32,6 +44,12 @@ STYLES = {
     TileState.INCONSISTENT: (0.3, "xx"),
     TileState.UNOBSERVED: (0.1, "//"),
     TileState.UNCHANGED: (0.0, ""),
+}
+#: The same where objects are drawn; whoever has a colour there needs a tile to be told apart, no more.
+FAINT = {
+    TileState.CHANGED: (0.07, ""),
+    TileState.INCONSISTENT: (0.1, "xx"),
+    TileState.UNOBSERVED: (0.0, "//"),
 }
 PRECEDENCE = tuple(STYLES)
 HATCH_WIDTH = 0.5  # points
@@ -58,35 +76,55 @@ def dress(figure: Figure, axes: Axes, extent: Extent, changes: ChangeSet, title:
     axes.set_ylabel("y of the map (m)", fontsize=8, color=QUIET)
     for spine in axes.spines.values():
         spine.set_visible(False)
-    counts = changes.counts()
-    said = f"{counts['changed']} of {len(changes.states)} tiles changed, at a score above {changes.threshold:.2f}"
     above, left = figure.get_figheight(), SIDE / figure.get_figwidth()
     figure.text(left, 1 - 0.3 / above, title, fontsize=12, color=INK, va="center", weight="bold")
-    figure.text(left, 1 - 0.55 / above, said, fontsize=9, color=QUIET, va="center")
-    entries = [_legend_entry(state, counts[state.label]) for state in PRECEDENCE]
-    entries.append(Patch(facecolor=INK, label="seen in the survey only"))
+    figure.text(left, 1 - 0.55 / above, summary(changes), fontsize=9, color=QUIET, va="center")
+    entries = _legend(changes)
     figure.legend(
         handles=entries,
         loc="lower center",
         bbox_to_anchor=(0.5, 0.2 / above),
-        ncols=5,
+        ncols=len(entries),
         fontsize=8,
         frameon=False,
     )
+    dashed = "" if changes.objects is None else "dashed: where it was; "
     note = (
-        "seen from above, between 0.15 and 2 m over the floor; "
+        f"seen from above, between 0.15 and 2 m over the floor; {dashed}"
         "of tiles above each other the first in this list is drawn"
     )
     figure.text(0.5, 0.14 / above, note, fontsize=6.5, color=QUIET, ha="center", va="center")
 
 
-def _legend_entry(state: TileState, count: int) -> Patch:
-    color, (fill, hatch) = color_of(state), STYLES[state]
+def summary(changes: ChangeSet) -> str:
+    """Say in one line what a survey found."""
+    count, of = changes.counts()["changed"], len(changes.states)
+    if changes.objects is None:
+        return f"{count} of {of} tiles changed, at a score above {changes.threshold:.2f}"
+    things, moving = len(changes.objects.objects), changes.objects.moving
+    found = f"{things or 'no'} object{'' if things == 1 else 's'} changed"
+    walked = f"; {moving} more moved during the visit" if moving else ""
+    return f"{found}, in {count} of {of} tiles{walked}"
+
+
+def _legend(changes: ChangeSet) -> list[Patch]:
+    counts = changes.counts()
+    if changes.objects is None:
+        entries = [_legend_entry(state, counts[state.label]) for state in PRECEDENCE]
+        return [*entries, Patch(facecolor=INK, label="seen in the survey only")]
+    told = [
+        _legend_entry(state, counts[state.label], noun=" tiles") for state in FAINT if counts[state.label]
+    ]
+    return [*legend_entries(changes.objects), *told]
+
+
+def _legend_entry(state: TileState, count: int, *, noun: str = "") -> Patch:
+    color, (fill, hatch) = color_of(state), STYLES[state] if not noun else FAINT[state]
     return Patch(
         facecolor=(*color, max(fill, 0.05)),
         edgecolor=color,
         hatch=hatch,
-        label=f"{count} {state.label}",
+        label=f"{count} {state.label}{noun}",
     )
 
 
@@ -101,25 +139,35 @@ _MOST_PIXELS = 4000  # along a side
 _DARKEST_WALL = 0.5  # grey of the map, so that ink on it is seen at once
 _ROOM_FOR_ID = 0.75  # inches; a smaller tile shows its score alone
 _WIDEST, _HIGHEST, _NARROWEST = 11.0, 9.0, 6.5  # inches of the map's part of the picture
+_LOWEST = 2.5  # inches, where objects are listed beside it
+_STRAY = 20  # points; a tile with fewer does not widen the picture
 
 
-def draw_picture(
-    path: Path, reference: Points, current: CurrentMap, changes: ChangeSet, *, title: str
-) -> None:
-    """Write a PNG: the reference (M, 3) in grey, what only the survey saw in ink, the tiles by state.
+def draw_picture(path: Path, reference: Points, current: Points, changes: ChangeSet, *, title: str) -> None:
+    """Write a PNG of the map (M, 3) from above, in grey, with objects by kind and number, or else tiles by state.
 
-    Map frame, metres, x to the right and y up; ceilings are cut away. Raises OSError.
+    Without objects, what only the survey (N, 3) saw is drawn in ink. Map frame, metres, x to the right and y up;
+    ceilings are cut away. Raises OSError.
     """
     extent = _extent(changes)
     width, height = extent[1] - extent[0], extent[3] - extent[2]
     scale = min(_WIDEST / width, _HIGHEST / height)  # inches a metre
-    sheet = (max(width * scale, _NARROWEST) + 2 * SIDE, height * scale + HEAD + FOOT)
+    things = [] if changes.objects is None else changes.objects.objects
+    beside = LIST_WIDTH if things else 0.0
+    plan = max(
+        width * scale, _NARROWEST - beside
+    )  # inches that the plan and what is left and right of it take
+    sheet = (plan + 2 * SIDE + beside, max(height * scale, _LOWEST if things else 0.0) + HEAD + FOOT)
     figure = Figure(figsize=sheet, dpi=130, facecolor="white")
     FigureCanvasAgg(figure)
-    place = (0.5 - width * scale / sheet[0] / 2, FOOT / sheet[1])
+    place = ((SIDE + (plan - width * scale) / 2) / sheet[0], FOOT / sheet[1])
     axes = figure.add_axes((*place, width * scale / sheet[0], height * scale / sheet[1]))
-    _draw_walls(axes, reference, current.points, extent)
+    _draw_walls(axes, reference, current, extent, with_news=changes.objects is None)
     _draw_tiles(axes, changes, tile_inches=float(changes.pairs.reference.grid.size[0]) * scale)
+    if changes.objects is not None:
+        _draw_voxels(axes, changes.objects)
+        draw_objects(axes, changes.objects.objects, scale=scale)
+        list_objects(figure, things, left=SIDE + plan + 0.25, top=sheet[1] - HEAD, bottom=FOOT)
     draw_scale_bar(figure, extent, scale)
     dress(figure, axes, extent, changes, title)
     with rc_context({"hatch.linewidth": HATCH_WIDTH}):
@@ -127,23 +175,46 @@ def draw_picture(
 
 
 def _extent(changes: ChangeSet) -> Extent:
-    """Return left, right, bottom, top in metres: all tiles, and half a metre around."""
+    """Return left, right, bottom, top in metres: all tiles with more than stray points, and half a metre around."""
     tiles = changes.pairs.reference
     lower = tiles.grid.lower(tiles.indices)
+    counts = [len(a) + len(b) for a, b in zip(tiles.points, changes.pairs.current, strict=True)]
+    dense = np.array(counts) >= _STRAY
+    lower = lower[dense] if dense.any() else lower
     left, bottom = lower[:, :2].min(axis=0) - 0.5
     right, top = (lower + tiles.grid.size)[:, :2].max(axis=0) + 0.5
     return float(left), float(right), float(bottom), float(top)
 
 
-def _draw_walls(axes: Axes, reference: Points, current: Points, extent: Extent) -> None:
+def _draw_walls(axes: Axes, reference: Points, current: Points, extent: Extent, *, with_news: bool) -> None:
     """Draw how much stands above each spot between knee and head, so that furniture and walls show."""
     floor = float(np.percentile(reference[:, 2], 1))
     before, now = (_standing(points, floor, extent) for points in (reference, current))
     shade = np.clip(before / 12.0, 0, 1) * _DARKEST_WALL
     picture = np.repeat(1 - shade[:, :, None], 3, axis=2)
-    only_now = (now > 2) & ~_near(before > 0)
-    picture[only_now] = to_rgb(INK)
+    if with_news:
+        only_now = (now > 2) & ~_near(before > 0)
+        picture[only_now] = to_rgb(INK)
     axes.imshow(picture, origin="lower", extent=extent, interpolation="antialiased", zorder=0)
+
+
+def _draw_voxels(axes: Axes, objects: ChangeObjects) -> None:
+    """Draw the voxels of the objects in the colours of their kinds."""
+    for numbers in (objects.before, objects.now):
+        some = np.flatnonzero(numbers)
+        if not len(some):
+            continue
+        colors = np.array([color_of_kind(thing.kind) for thing in objects.objects])[numbers[some] - 1]
+        flat = centers(objects.keys[some], objects.voxel_size)[:, :2]
+        for color in np.unique(colors, axis=0):
+            own = flat[(colors == color).all(axis=1)]
+            cells = np.unique(np.round(own, 4), axis=0) - objects.voxel_size / 2
+            squares = [
+                Rectangle((float(x), float(y)), objects.voxel_size, objects.voxel_size) for x, y in cells
+            ]
+            axes.add_collection(
+                PatchCollection(squares, facecolor=(*color, 0.45), edgecolor="none", zorder=4)
+            )
 
 
 def _standing(points: Points, floor: float, extent: Extent) -> NDArray[np.float64]:
@@ -168,22 +239,27 @@ def _near(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
 def _draw_tiles(axes: Axes, changes: ChangeSet, *, tile_inches: float) -> None:
     tiles = changes.pairs.reference
     lower = tiles.grid.lower(tiles.indices)
+    faint = changes.objects is not None
     for row in _topmost(changes):
         state = TileState(int(changes.states[row]))
-        color, (fill, hatch) = color_of(state), STYLES[state]
+        changed = state is TileState.CHANGED
+        if faint and state not in FAINT:
+            continue
+        color, (fill, hatch) = color_of(state), (FAINT if faint else STYLES)[state]
+        edge = (0.6, 0.6, 0.6, 0.35) if state is TileState.UNCHANGED else (*color, 0.35 if faint else 1.0)
         axes.add_patch(
             Rectangle(
                 (lower[row, 0], lower[row, 1]),
                 float(tiles.grid.size[0]),
                 float(tiles.grid.size[1]),
                 facecolor=(*color, fill),
-                edgecolor=(0.6, 0.6, 0.6, 0.35) if state is TileState.UNCHANGED else color,
-                linewidth=2.0 if state is TileState.CHANGED else 0.6,
+                edgecolor=edge,
+                linewidth=2.0 if changed and not faint else 0.6,
                 hatch=hatch,
-                zorder=3 if state is TileState.CHANGED else 2,
+                zorder=3 if changed else 2,
             )
         )
-        if state is TileState.CHANGED:
+        if changed and not faint:
             _label(axes, changes, row, with_id=tile_inches >= _ROOM_FOR_ID)
 
 

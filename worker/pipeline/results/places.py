@@ -56,8 +56,8 @@ def place_of(points: Floats, *, hits: int, floor: float | None, grid: TileGrid, 
     )
 
 
-def within(place: Place, points: Points, *, margin: float) -> Bools:
-    """Tell (N,) which points (N, 3) lie in a place's box grown by `margin` metres to all sides."""
+def within(place: Place, points: Points | Floats, *, margin: tuple[float, float, float]) -> Bools:
+    """Tell (N,) which points (N, 3) lie in a place's box grown by so many metres along its axes, both ways."""
     reach = np.asarray(place.size) / 2 + margin
     answer = np.zeros(len(points), bool)
     rows = np.flatnonzero(np.abs(points[:, 0] - place.center[0]) <= np.hypot(reach[0], reach[1]))

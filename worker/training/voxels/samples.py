@@ -50,6 +50,13 @@ class VoxelSample:
         )
 
 
+@dataclass(frozen=True, kw_only=True, slots=True)
+class SampleSet:
+    """All samples of a site, in one file."""
+
+    samples: tuple[VoxelSample, ...]
+
+
 def save_samples(folder: Path, samples: list[VoxelSample], *, name: str) -> None:
     """Write them as `name-NNN.npz`. Raises OSError."""
     folder.mkdir(parents=True, exist_ok=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from functools import partial
 from pathlib import Path
@@ -42,6 +42,7 @@ class VoxelTrainSettings(StrictModel):
     learning_rate: float = Field(3e-3, gt=0, description="falls to a hundredth by a cosine")
     weight_decay: float = Field(1e-3, ge=0)
     dice: float = Field(0.3, ge=0, description="weight of the soft Dice loss beside cross-entropy")
+    minutes: float | None = Field(None, gt=0, description="at most; the rate falls by whichever ends first")
     held_out: int = Field(8, ge=2, description="every so many-th building is validated on")
     seed: int = 42
     detector: VoxelNetSettings = VoxelNetSettings.model_validate({})
@@ -113,10 +114,14 @@ def train_network(
     settings: VoxelTrainSettings,
     out: Path,
     progress: Progress = no_progress,
+    *,
+    start: Mapping[str, Tensor] | None = None,
+    on_epoch: Callable[[Path], None] | None = None,
 ) -> Path:
     """Train the network for free space or the one without, on those samples; returns the best checkpoint.
 
-    A folder with a checkpoint of the same settings is taken up where it stopped. Raises ValueError for a checkpoint
+    A folder with a checkpoint of the same settings is taken up where it stopped. `start` are the weights to begin
+    with; `on_epoch` is called with the folder once an epoch's files are complete. Raises ValueError for a checkpoint
     of others or where no sample is of the kind, FloatingPointError where the loss is no number.
     """
     fitting = [sample for sample in samples if sample.free_space == (name == SEEING)]
@@ -125,11 +130,13 @@ def train_network(
     if not training or not validation:
         raise ValueError(f"{len(training)} samples to train {name} on and {len(validation)} to validate on")
     out.mkdir(parents=True, exist_ok=True)
-    run = _Run(name, settings, out)
+    run = _Run(name, settings, out, start)
     run.resume()
     crops = _Crops(training, settings)
-    while run.epochs < settings.epochs:
+    while not run.finished:
         run.epoch(crops, validation, progress)
+        if on_epoch is not None:
+            on_epoch(out)
     progress(f"train {name}", 1.0)
     return out / BEST.format(name)
 
@@ -151,14 +158,27 @@ def train_networks(
 class _Run:
     """The state of one training."""
 
-    def __init__(self, name: str, settings: VoxelTrainSettings, out: Path) -> None:
+    def __init__(
+        self, name: str, settings: VoxelTrainSettings, out: Path, start: Mapping[str, Tensor] | None
+    ) -> None:
         torch.manual_seed(settings.seed)
         self._name, self._settings, self._out = name, settings, out
         self._network: VoxelNetwork = settings.detector.build()
+        if start is not None:
+            self._network.load_state_dict(start)
         self._optimizer = torch.optim.AdamW(
             self._network.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay
         )
         self.epochs, self._seconds, self._best = 0, 0.0, -1.0
+
+    @property
+    def finished(self) -> bool:
+        """The epochs or the time are spent."""
+        return self._done(self.epochs, self._seconds) >= 1
+
+    def _done(self, epochs: float, seconds: float) -> float:
+        minutes = self._settings.minutes
+        return max(epochs / self._settings.epochs, 0 if minutes is None else seconds / 60 / minutes)
 
     def resume(self) -> None:
         """Take up the last checkpoint, if the folder has one. Raises ValueError for one of other settings."""
@@ -179,7 +199,10 @@ class _Run:
         losses = []
         self._network.train()
         for step in range(settings.steps):
-            done = (self.epochs + step / settings.steps) / settings.epochs
+            seconds = self._seconds + time.monotonic() - began
+            done = self._done(self.epochs + step / settings.steps, seconds)
+            if done >= 1:
+                break
             progress(f"train {self._name}", done)
             losses.append(self._step(crops.batch(rng), rate=_cosine(settings.learning_rate, done)))
         if not np.isfinite(losses).all():
@@ -192,8 +215,8 @@ class _Run:
         row = VoxelEpoch(
             epoch=self.epochs,
             seconds=round(self._seconds, 1),
-            learning_rate=_cosine(settings.learning_rate, self.epochs / settings.epochs),
-            train_loss=float(np.mean(losses)),
+            learning_rate=_cosine(settings.learning_rate, self._done(self.epochs, self._seconds)),
+            train_loss=float(np.mean(losses)) if losses else 0.0,
             validation_loss=loss,
             average_precision=precision,
         )

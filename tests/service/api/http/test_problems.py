@@ -149,6 +149,7 @@ def test_a_body_that_does_not_match_ends_in_its_problem(
         ({"id": "x" * 65}, "body.id", "x" * 65),
         ({"settings": {"voxel_size": 0.1}}, "body.settings.voxel_size", 0.1),
         ({"settings": {"tile_size": [1, 1, 1]}}, "body.settings.tile_size", "[1, 1, 1]"),
+        ({"settings": {"alarms_per_survey": 0}}, "body.settings.alarms_per_survey", 0),
         (
             {"settings": {"registration": {"min_fitness": 1.5}}},
             "body.settings.registration.min_fitness",

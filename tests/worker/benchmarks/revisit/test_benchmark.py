@@ -9,20 +9,21 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from worker.benchmarks.methods import Method
-from worker.benchmarks.revisit import benchmark
-from worker.benchmarks.revisit.measures import tile_table
-from worker.benchmarks.revisit.plan import RevisitSettings, plan_visits
-from worker.benchmarks.revisit.report import tables, verdicts_of
+from tests.worker.benchmarks.revisit.conftest import SEED, TINY
+from tests.worker.benchmarks.revisit.test_answers import by_voxels
+from worker.benchmarks.methods import RevisitMethod
+from worker.benchmarks.revisit import benchmark, gallery
+from worker.benchmarks.revisit.plan import CASES, RevisitSettings, plan_visits
+from worker.benchmarks.revisit.report import tables
+from worker.benchmarks.revisit.tiles import tile_table
 from worker.cli import main
-from worker.cloud.tiling import TilePairs
+from worker.detectors.comparison import Comparison
+from worker.detectors.detector import Detection
 
-TINY = RevisitSettings(kinds=("room",), stops={"room": 3}, edits={"room": 3}, standing_s=2.0)
 
-
-def heights(pairs: TilePairs) -> np.ndarray:
+def heights(comparison: Comparison) -> Detection:
     """A method that knows nothing of change."""
-    return np.where(pairs.observed, pairs.reference.indices[:, 2].astype(float), np.nan)
+    return Detection.of_scores(np.where(comparison.observed, comparison.tiles[:, 2] / 10.0, np.nan))
 
 
 @pytest.fixture(scope="module")
@@ -37,68 +38,72 @@ def out(visits_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def result(out: Path) -> dict:
     with pytest.MonkeyPatch.context() as patch:
         for name in ("TEST_SEED", "VALIDATION_SEED"):
-            patch.setattr(benchmark, name, 51)
-        method = Method(name="heights", score=heights, stated=0.5, sha256="0123")
-        patch.setattr(benchmark, "detector_methods", lambda *_: (method,))
-        settings = benchmark.RevisitBenchmarkSettings(out=out, visits=3, validation=3, made=TINY)
+            patch.setattr(benchmark, name, SEED)
+        methods = (
+            RevisitMethod(name="voxels", detect=by_voxels, tiles="touched", stated=0.5, sha256="0123"),
+            RevisitMethod(name="heights", detect=heights),
+        )
+        patch.setattr(benchmark, "revisit_methods", lambda *_, **__: (methods, ["M3C2: not installed"]))
+        patch.setattr(gallery, "DRAWN", 3)
+        # the same few visits stand for the hard part
+        patch.setattr(benchmark, "plan_hard_visits", lambda made: plan_visits(3, made, first_seed=SEED))
+        settings = benchmark.RevisitBenchmarkSettings(
+            out=out, visits=len(CASES), validation=len(CASES), made=TINY
+        )
         return benchmark.evaluate(settings)
 
 
 def test_methods_stand_in_one_document_and_nothing_is_made_twice(result: dict):
     assert json.loads(json.dumps(result, allow_nan=False)) == result
     assert result["made"] == 0
-    assert [row["name"] for row in result["methods"]][:2] == ["heights", "C2C (mean)"]
+    assert [row["name"] for row in result["methods"]] == ["voxels", "heights"]
+    assert [row["sha256"] for row in result["methods"]] == ["0123", None]
     assert result["methods"][0]["stated"]["threshold"] == 0.5
-    assert [row["sha256"] for row in result["methods"]][:2] == ["0123", None]
-    assert (result["test"]["visits"], result["test"]["without_change"]) == (3, 1)
+    assert (result["test"]["visits"], result["test"]["without_change"]) == (8, 3)
+    assert result["left_out"] == ["M3C2: not installed"]
 
 
-def test_every_changed_tile_is_counted_or_told_as_not_looked_at(result: dict):
-    changed = result["test"]["changed"]
-    assert sum(changed.values()) == sum(visit["changed"] for visit in result["test"]["by_visit"])
+def test_every_method_is_counted_by_the_same_changed_tiles(result: dict):
+    assert result["test"]["changed"] > 0
     for row in result["methods"]:
-        found = row["chosen"]["true_positives"] + row["chosen"]["false_negatives"]
-        assert found == changed["counted"]
-        assert row["chosen"]["unobserved_changed"] == changed["unobserved"] + changed["out_of_sight"]
+        chosen = row["chosen"]
+        assert chosen["true_positives"] + chosen["false_negatives"] == result["test"]["changed"]
+        assert chosen["true_negatives"] + chosen["false_positives"] == result["test"]["unchanged"]
+        assert chosen["f1"] <= row["best"]["f1"]
 
 
-def test_every_method_gets_a_threshold_that_is_no_better_than_the_best_one(result: dict):
-    for row in result["methods"]:
-        assert row["chosen"]["f1"] <= row["best"]["f1"]
+def test_only_a_method_by_voxels_tells_objects(result: dict):
+    voxels, other = result["methods"]
+    assert other["objects"] is None
+    assert voxels["objects"]["regions"] == result["test"]["regions"] > 0
+    assert voxels["objects"]["recall"] > 0.5
+    assert voxels["objects"]["objects"] > 0
+    assert len(voxels["objects"]["least_scores"]) == 1
+
+
+def test_the_hard_part_is_counted_by_itself(result: dict):
+    hard = result["methods"][0]["hard"]
+    assert hard["quiet_visits"] == 1
+    assert hard["chosen"]["threshold"] == result["methods"][0]["chosen"]["threshold"]
 
 
 @pytest.mark.usefixtures("result")
-def test_pictures_are_drawn(out: Path):
+def test_pictures_are_drawn_and_those_of_mistakes_are_listed(out: Path, result: dict):
     names = sorted(path.name for path in out.glob("*.png"))
-    assert names[:2] == ["curves.png", "recall.png"]
-    assert names[2].startswith("tiles-room-51-")
-    assert all((out / name).read_bytes().startswith(b"\x89PNG") for name in names)
+    assert names == ["curves.png", "recall.png", "reliability.png"]
+    listed = result["methods"][0]["test_errors"]
+    assert "false object" in {row["what"] for row in listed}
+    drawn = [out / "test" / row["picture"] for row in listed if row["picture"]]
+    assert len(drawn) == 3 < len(listed)
+    assert all(path.read_bytes().startswith(b"\x89PNG") for path in drawn)
 
 
-def test_tables_name_every_method_and_what_nobody_looked_at(result: dict):
-    console = Console(width=160, record=True)
+def test_tables_name_every_method_and_what_was_left_out(result: dict):
+    console = Console(width=200, record=True)
     console.print(tables(result))
     shown = console.export_text()
-    assert "heights" in shown
-    assert "M3C2-approx" in shown
-    assert "not observed by the survey" in shown
-    assert "0.5 to 1 cm" in shown
-
-
-def test_a_verdict_for_every_tile(made_visit):
-    visit = made_visit(
-        cells=[[50, 0, 0], [50, 0, 0], [0, 0, 0], [0, 0, 0], [50, 0, 0], [0, 0, 0]],
-        observed=[True, True, True, True, False, False],
-    )
-    scores = np.array([0.9, 0.1, 0.9, 0.1, np.nan, np.nan])
-    assert verdicts_of(visit, scores, 0.5) == [
-        "hit",
-        "missed",
-        "false alarm",
-        "rightly quiet",
-        "changed, nobody looked",
-        "not observed",
-    ]
+    for words in ("heights", "voxels", "the hard part", "M3C2: not installed", "moved, told as moved"):
+        assert words in shown
 
 
 def test_an_unknown_building_is_told_in_a_sentence(
@@ -110,7 +115,9 @@ def test_an_unknown_building_is_told_in_a_sentence(
     assert "no building attic" in capsys.readouterr().err
 
 
-def test_visits_without_a_changed_tile_are_told_in_a_sentence(made_visit):
-    table = tile_table(plan_visits(1, TINY, first_seed=1), [made_visit(cells=[[0, 0, 0]])])
+def test_visits_without_a_changed_tile_are_told_in_a_sentence(made_visit, made_site):
+    (plan,) = plan_visits(1, RevisitSettings(kinds=("room",)), first_seed=1)
+    site = made_site(plan.site.name, tiles=1)
+    table = tile_table([plan], [made_visit(plan.name, tiles=1)], {site.name: site}, min_points=1)
     with pytest.raises(ValueError, match="ask for more with --visits"):
         benchmark._check(table, "--visits")

@@ -112,13 +112,13 @@ def test_the_current_map_is_fused_in_the_voxels_of_the_reference() -> None:
     reference = reference_map(
         fuse([scan_of(floor())], voxel_size=0.05), grid=grid_of(1, 1, 1), settings=SETTINGS
     )
-    current = current_map([scan_of(floor()[::-1])], voxel_size=reference.voxel_size)
+    current = current_map(fuse([scan_of(floor()[::-1])], voxel_size=reference.voxel_size))
     assert current.points == pytest.approx(reference.points)
     assert current.colors is None
 
 
 def test_colours_are_kept_only_where_every_scan_has_them() -> None:
     colors = np.full((len(floor()), 3), 7, np.uint8)
-    assert current_map([scan_of(floor(), colors=colors)], voxel_size=0.05).colors is not None
+    assert current_map(fuse([scan_of(floor(), colors=colors)], voxel_size=0.05)).colors is not None
     mixed = [scan_of(floor(), colors=colors), scan_of(floor())]
-    assert current_map(mixed, voxel_size=0.05).colors is None
+    assert current_map(fuse(mixed, voxel_size=0.05)).colors is None

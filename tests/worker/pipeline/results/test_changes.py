@@ -6,7 +6,7 @@ import pytest
 from tests.support.rooms import scores_of
 from tests.support.tilings import row_of
 from worker.detectors.detector import Detection
-from worker.pipeline.results.changes import TileState, decide
+from worker.pipeline.results.changes import ChangeSet, TileState, decide
 
 NAN = (float("nan"),) * 3
 
@@ -86,3 +86,62 @@ def test_a_map_of_no_tile_has_no_state() -> None:
     nothing = Detection(probabilities=np.empty((0, 3), np.float32))
     counts = decide(row_of([], [], observed=[]), nothing, threshold=0.5).counts()
     assert counts == {"unchanged": 0, "changed": 0, "inconsistent": 0, "unobserved": 0}
+
+
+def _by_voxels(
+    *rows: tuple[float, float, float], shares: list[float], threshold: float = 0.5, least: float = 0.5
+) -> ChangeSet:
+    """Decide on tiles of a detector of voxels, of which none has enough points."""
+    count = len(rows)
+    detection = Detection(
+        probabilities=np.array(rows, np.float32),
+        observed_share=np.array(shares, np.float32),
+        appeared=np.arange(count, dtype=np.int32),
+        disappeared=np.arange(count, dtype=np.int32) * 2,
+    )
+    pairs = row_of([3] * count, [3] * count, observed=[False] * count)
+    return decide(pairs, detection, threshold=threshold, min_observed_share=least)
+
+
+def test_with_voxels_a_tile_is_unobserved_by_the_share_that_could_be_judged() -> None:
+    quiet = (0.9, 0.1, 0.0)
+    changes = _by_voxels(quiet, quiet, quiet, shares=[0.49, 0.5, 1.0])
+    assert [TileState(state).label for state in changes.states] == ["unobserved", "unchanged", "unchanged"]
+    changes = _by_voxels(quiet, quiet, shares=[0.1, 0.3], least=0.2)
+    assert [TileState(state).label for state in changes.states] == ["unobserved", "unchanged"]
+
+
+def test_with_voxels_what_changed_has_changed_however_little_was_seen() -> None:
+    changes = _by_voxels((0.1, 0.9, 0.0), (0.5, 0.5, 0.0), shares=[0.0, 0.01])
+    assert [TileState(state).label for state in changes.states] == ["changed", "unobserved"]
+
+
+def test_with_voxels_probabilities_stay_where_anything_could_be_judged() -> None:
+    changes = _by_voxels((0.9, 0.1, 0.0), NAN, shares=[0.1, 0.0])
+    assert changes.scores[0] == pytest.approx(0.1)
+    assert np.isnan(changes.scores[1])
+    assert [TileState(state).label for state in changes.states] == ["unobserved"] * 2
+
+
+def test_with_voxels_a_tile_without_a_score_is_unobserved_even_if_no_share_is_asked_for() -> None:
+    assert TileState(_by_voxels(NAN, shares=[0.0], least=0.0).states[0]) is TileState.UNOBSERVED
+
+
+def test_with_voxels_no_tile_is_inconsistent() -> None:
+    states = _by_voxels((0.2, 0.2, 0.6), shares=[1.0], threshold=0.9).states
+    assert TileState(states[0]) is TileState.UNCHANGED
+
+
+def test_with_voxels_nan_for_a_tile_that_could_be_judged_is_never_taken_for_no_change() -> None:
+    with pytest.raises(ValueError, match="1 of 2 observed tiles"):
+        _by_voxels(NAN, (1.0, 0.0, 0.0), shares=[0.2, 0.2])
+
+
+def test_with_voxels_shares_and_counts_go_on() -> None:
+    changes = _by_voxels((0.9, 0.1, 0.0), (0.1, 0.9, 0.0), shares=[0.25, 0.75])
+    assert changes.observed_share is not None
+    assert changes.appeared is not None
+    assert changes.disappeared is not None
+    assert changes.observed_share.tolist() == [0.25, 0.75]
+    assert changes.appeared.tolist() == [0, 1]
+    assert changes.disappeared.tolist() == [0, 2]

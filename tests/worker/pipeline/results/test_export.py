@@ -9,9 +9,18 @@ import pytest
 
 from tests.support.tilings import ORIGIN, four_states, in_tile
 from worker.cloud.formats.scan import read_scan
-from worker.pipeline.mapping.fusion import CurrentMap
-from worker.pipeline.results.changes import TileState
-from worker.pipeline.results.export import NOT_IN_A_TILE, STATE_COLORS, tile_results, write_coloured_cloud
+from worker.cloud.voxels import Voxels
+from worker.detectors.detector import VoxelScores
+from worker.pipeline.results.changes import ChangeSet, TileState
+from worker.pipeline.results.export import (
+    KIND_COLORS,
+    NOT_IN_A_TILE,
+    STATE_COLORS,
+    PointKind,
+    tile_results,
+    write_coloured_cloud,
+)
+from worker.pipeline.results.objects import ChangeObjects
 
 OUTSIDE = np.add(ORIGIN, [(-0.1, 0.5, 0.5), (0.5, 0.5, 5.0)]).astype(np.float32)
 CLOUD = np.concatenate([*(in_tile(i, 0, 0, 1 + i) for i in range(4)), OUTSIDE])
@@ -21,7 +30,7 @@ ROW = np.array([0, 1, 1, 2, 2, 2, 3, 3, 3, 3, -1, -1])  # the tile that holds ea
 @pytest.fixture
 def written(tmp_path: Path) -> Path:
     path = tmp_path / "cloud.ply"
-    write_coloured_cloud(path, CurrentMap(points=CLOUD, colors=None), four_states())
+    write_coloured_cloud(path, CLOUD[:1], CLOUD, four_states())
     return path
 
 
@@ -54,7 +63,7 @@ def test_open3d_reads_state_and_score_of_each_point(written: Path) -> None:
 
 def test_a_point_on_a_border_has_the_colour_of_the_upper_tile(tmp_path: Path) -> None:
     border = np.add(ORIGIN, [(1.5, 0.5, 0.5)]).astype(np.float32)
-    write_coloured_cloud(tmp_path / "c.ply", CurrentMap(points=border, colors=None), four_states())
+    write_coloured_cloud(tmp_path / "c.ply", border, border, four_states())
     colors = read_scan(tmp_path / "c.ply").colors
     assert colors is not None
     assert tuple(colors[0].tolist()) == STATE_COLORS[TileState.CHANGED]
@@ -71,11 +80,104 @@ def test_in_a_map_that_grew_below_its_origin_points_have_the_colours_of_their_ow
         reference=replace(tiles, grid=grown, indices=tiles.indices - np.array([2, 0, 0], np.int32)),
     )
     cloud = np.concatenate([in_tile(i - 2, 0, 0, 1) for i in range(5)])  # the last one is of no tile
-    write_coloured_cloud(
-        tmp_path / "c.ply", CurrentMap(points=cloud, colors=None), replace(known, pairs=pairs)
-    )
+    write_coloured_cloud(tmp_path / "c.ply", cloud, cloud, replace(known, pairs=pairs))
     state = o3d.t.io.read_point_cloud(tmp_path / "c.ply").point["tile_state"].numpy().ravel()
     assert state.tolist() == [0, 1, 2, 3, NOT_IN_A_TILE]
+
+
+VOXEL = 0.05
+
+
+def _by_voxels() -> tuple[np.ndarray, np.ndarray, ChangeSet]:
+    """Map and survey, a point in each of five voxels in a row, and what a detector says of them.
+
+    The map has the first three, the survey the last four: 0 went, 1 stays, 2 could not be judged, 3 came, 4 walked by.
+    """
+    middles = np.add(ORIGIN, [(0.52 + VOXEL * number, 0.5, 0.5) for number in range(5)])
+    points = (np.floor(middles / VOXEL) * VOXEL + VOXEL / 2).astype(np.float32)
+    keys = Voxels.keys_of(points, size=VOXEL)
+    voxels = VoxelScores(
+        keys=keys,
+        appeared=np.array([0, 0, 0, 0.75, 0.25], np.float32),
+        disappeared=np.array([0.875, 0, 0, 0, 0], np.float32),
+        judged=np.array([True, True, False, True, True]),
+        moving=np.array([False, False, False, False, True]),
+        seen_through=np.ones(5, np.int16),
+    )
+    objects = ChangeObjects(
+        objects=(),
+        moving=0,
+        voxel_size=VOXEL,
+        keys=keys,
+        before=np.array([2, 0, 0, 0, 0], np.int32),
+        now=np.array([0, 0, 0, 7, 0], np.int32),
+    )
+    share = np.array([1.0, 0.75, 0.5, 0.25], np.float32)
+    counts = np.arange(4, dtype=np.int32)
+    known = replace(four_states(), observed_share=share, appeared=counts, disappeared=counts)
+    return points[:3], points[1:], replace(known, voxels=voxels, objects=objects)
+
+
+@pytest.fixture
+def by_voxels(tmp_path: Path) -> Path:
+    reference, current, changes = _by_voxels()
+    write_coloured_cloud(tmp_path / "voxels.ply", reference, current, changes)
+    return tmp_path / "voxels.ply"
+
+
+def test_with_objects_each_point_bears_its_own_kind_score_and_number(by_voxels: Path) -> None:
+    cloud = o3d.t.io.read_point_cloud(by_voxels).point
+    kind, score, number, state = (
+        cloud[name].numpy().ravel() for name in ("kind", "change_score", "object_id", "tile_state")
+    )
+    lost = PointKind.DISAPPEARED
+    assert kind.tolist() == [
+        PointKind.UNCHANGED,
+        PointKind.NOT_JUDGED,
+        PointKind.APPEARED,
+        PointKind.MOVING,
+        lost,
+    ]
+    assert number.tolist() == [0, 0, 7, 0, 2]
+    assert score[[0, 2, 3, 4]].tolist() == [0.0, 0.75, 0.25, 0.875]
+    assert np.isnan(score[1])
+    assert state.tolist() == [TileState.UNCHANGED] * 5
+    assert (kind.dtype, number.dtype) == (np.uint8, np.int32)
+
+
+def test_with_objects_the_points_that_the_map_lost_are_in_the_cloud(by_voxels: Path) -> None:
+    reference, current, _ = _by_voxels()
+    assert read_scan(by_voxels).points.tolist() == [*current.tolist(), reference[0].tolist()]
+
+
+def test_with_objects_each_kind_has_a_colour_of_its_own(by_voxels: Path) -> None:
+    colors = read_scan(by_voxels).colors
+    assert colors is not None
+    order = (
+        PointKind.UNCHANGED,
+        PointKind.NOT_JUDGED,
+        PointKind.APPEARED,
+        PointKind.MOVING,
+        PointKind.DISAPPEARED,
+    )
+    assert [tuple(color) for color in colors.tolist()] == [KIND_COLORS[kind] for kind in order]
+    assert len(set(KIND_COLORS.values())) == len(PointKind)
+
+
+def test_with_voxels_a_tile_tells_what_could_be_judged_and_what_changed() -> None:
+    _, _, changes = _by_voxels()
+    result = tile_results(changes)[1]
+    assert (result.observed_share, result.appeared, result.disappeared) == (0.75, 1, 1)
+    plain = tile_results(four_states())[1]
+    assert (plain.observed_share, plain.appeared, plain.disappeared) == (None, None, None)
+
+
+def test_an_unobserved_tile_of_which_a_part_was_judged_has_a_score() -> None:
+    known = four_states()
+    probabilities = known.probabilities.copy()
+    probabilities[3] = (0.875, 0.125, 0.0)
+    result = tile_results(replace(known, probabilities=probabilities))[3]
+    assert (result.state, result.score) == ("unobserved", 0.125)
 
 
 def test_a_changed_tile_as_a_client_is_told_of_it() -> None:
