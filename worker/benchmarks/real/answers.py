@@ -6,6 +6,7 @@ import time
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,11 +19,13 @@ from worker.cloud.types import Floats, Indices
 from worker.cloud.voxel_keys import Keys, packed, rows_of
 from worker.cloud.voxels import Voxels, fused
 from worker.detectors.comparison import Comparison
-from worker.detectors.detector import Detection, Detector
-from worker.pipeline.flow import compare
+from worker.detectors.detector import Detector
+from worker.detectors.voxels.scores import tile_threshold
+from worker.pipeline.alarms import calibrated, visits_of
+from worker.pipeline.flow import compare, concluded
 from worker.pipeline.mapping.fusion import CurrentMap, reference_map
 from worker.pipeline.results.changes import TileState
-from worker.pipeline.results.objects import ChangeObject, ChangeObjects, change_objects
+from worker.pipeline.results.objects import ChangeObject, ChangeObjects
 from worker.pipeline.settings import PipelineSettings
 
 
@@ -67,7 +70,8 @@ class Answer:
     tiles: Indices  #: (T, 3)
     scores: NDArray[np.float32]  #: (T,) probability of change, NaN where it says nothing
     states: NDArray[np.uint8]  #: (T,) values of TileState
-    threshold: float  #: of the model's card
+    threshold: float  #: of tiles
+    least_score: float  #: expected voxels of an object, by the map's own scans and the model's card
     objects: tuple[FoundObject, ...] | None  #: None where it scores tiles alone
     moving: int  #: things that moved during a visit
     judged: int  #: voxels of either visit that the other could judge
@@ -85,6 +89,7 @@ class Answer:
             "model": self.model,
             "objects": None if self.objects is None else [one.document() for one in self.objects],
             "moving": self.moving,
+            "least_score": round(self.least_score, 1),
             "tiles": self.counts(),
             "voxels_judged": self.judged if self.objects is not None else None,
             "voxels": self.voxels,
@@ -93,26 +98,47 @@ class Answer:
 
 
 def answer_of(detector: Detector, visits: TwoVisits) -> Answer:
-    """Ask a model about two visits. Raises MapFailed for clouds that are no building."""
-    begun = time.perf_counter()
+    """Ask a model about two visits, as a survey of the service does. Raises MapFailed for clouds that are no building.
+
+    A map of several scans first says how strong a change has to be.
+    """
     settings = PipelineSettings().for_model(detector.card.preprocessing)
+    limit = _least_score(detector, visits.first, settings)
+    objects = settings.objects.with_values(min_score=limit)
+    threshold = tile_threshold(detector.card, limit) if limit else detector.card.threshold
+    begun = time.perf_counter()
     comparison = comparison_of(visits.first, visits.second, settings)
     detection = detector.detect(comparison)
-    told = None if detection.voxels is None else change_objects(comparison, detection.voxels)
-    states = _states(comparison, detection, detector.card.threshold, settings.tiling.min_observed_share)
+    told = concluded(
+        comparison, detection, threshold=threshold, settings=settings.with_values(objects=objects)
+    )
     return Answer(
         model=detector.card.model,
         grid=comparison.grid,
         tiles=comparison.tiles,
-        scores=detection.change,
-        states=states,
-        threshold=detector.card.threshold,
-        objects=None if told is None else _objects(told),
-        moving=0 if told is None else told.moving,
-        judged=0 if detection.voxels is None else int(detection.voxels.judged.sum()),
-        voxels=0 if detection.voxels is None else len(detection.voxels.keys),
+        scores=told.scores,
+        states=told.states,
+        threshold=threshold,
+        least_score=limit,
+        objects=None if told.objects is None else _objects(told.objects),
+        moving=0 if told.objects is None else told.objects.moving,
+        judged=0 if told.voxels is None else int(told.voxels.judged.sum()),
+        voxels=0 if told.voxels is None else len(told.voxels.keys),
         seconds=time.perf_counter() - begun,
     )
+
+
+def _least_score(detector: Detector, scans: Sequence[RealScan], settings: PipelineSettings) -> float:
+    """Return the least score of an object by the map's own scans; 0 for a detector of tiles."""
+    if detector.card.preprocessing.tiles != "touched":
+        return 0.0
+    size = settings.registration.voxel_size
+    visits = visits_of((partial(_same, scan) for scan in scans), voxel_size=size)
+    return calibrated(visits, detector, alarms_per_survey=settings.alarms_per_survey).min_score
+
+
+def _same(scan: RealScan) -> RealScan:
+    return scan
 
 
 def comparison_of(
@@ -134,24 +160,6 @@ def comparison_of(
         reference_seen=Seen.of(first, voxel_size=size),
         current_seen=Seen.of(second, voxel_size=size),
     )
-
-
-def _states(
-    comparison: Comparison, detection: Detection, threshold: float, least_share: float
-) -> NDArray[np.uint8]:
-    """Call a tile changed above the threshold, unobserved where less than `least_share` of it could be judged."""
-    scores = detection.change
-    if detection.observed_share is None:
-        unobserved = ~comparison.observed | np.isnan(scores)
-    else:
-        unobserved = (detection.observed_share < least_share) | np.isnan(scores)
-    states = np.full(len(scores), TileState.UNCHANGED, np.uint8)
-    states[unobserved] = TileState.UNOBSERVED
-    changed = np.nan_to_num(scores) > threshold
-    if detection.observed_share is None:
-        changed &= ~unobserved
-    states[changed] = TileState.CHANGED
-    return states
 
 
 def _objects(told: ChangeObjects) -> tuple[FoundObject, ...]:
