@@ -29,7 +29,7 @@ from service.catalog.tables import (
 )
 from service.catalog.tracking import Accepted, Part, Parts, Side, Sighting, Track, Visit, track_objects
 
-_MANY = 500  #: tiles; beyond that it is cheaper to read all than to name them
+_MANY = 500  #: tiles that a query names; where there are more it reads those of the whole map
 
 
 def note(session: Session, ready: tables.MapVersion | Survey | tables.Model) -> None:
@@ -183,46 +183,42 @@ def _write_changes(
 def _rewrite_objects(session: Session, map_id: str, accepted: Sequence[Acceptance]) -> tuple[Track, ...]:
     """Write which object each sighting is of, and what became of each object."""
     sightings = _sightings(session, map_id)
-    visits = _visits(session, map_id, sightings)
-    rows = {
-        row.object_id: row
-        for row in session.scalars(
-            select(MapObject)
-            .where(MapObject.map_id == map_id)
-            .order_by(MapObject.created, MapObject.object_id)
-        )
-    }
+    in_order_of_age = select(MapObject).where(MapObject.map_id == map_id)
+    in_order_of_age = in_order_of_age.order_by(MapObject.created, MapObject.object_id)
+    rows = {row.object_id: row for row in session.scalars(in_order_of_age)}
     taken = [
-        Accepted(
-            version=one.version, parts=tuple(_parts(thing["now"], thing["before"]) for thing in one.objects)
-        )
+        Accepted(version=one.version, parts=tuple(_parts(**places) for places in one.objects))
         for one in accepted
     ]
-    tracks = track_objects(visits, taken, ids=list(rows))
-    kept, links = set(), []
-    for track in tracks:
-        object_id = track.object_id or new_id("object")
-        kept.add(object_id)
-        links += [
-            {"survey_id": visit.survey_id, "number": one.number, "object_id": object_id}
-            for visit, one in track.sightings
-            if one.object_id != object_id
-        ]
+    tracks = track_objects(_visits(session, map_id, sightings), taken, ids=list(rows))
+    named = {track.object_id or new_id("object"): track for track in tracks}
+    for object_id, track in named.items():
         row = rows.get(object_id)
         if row is None:
             row = MapObject(object_id=object_id, map_id=map_id, created=now())
             session.add(row)
         _write_track(row, track, sightings)
-    if links:
-        session.execute(update(SurveyObject), links)
     for object_id, row in rows.items():
-        if object_id not in kept:
+        if object_id not in named:
             session.delete(row)
+    _link(session, named)
     return tracks
 
 
+def _link(session: Session, named: Mapping[str, Track]) -> None:
+    """Write the object of each sighting that has another one so far, or none."""
+    links = [
+        {"survey_id": visit.survey_id, "number": one.number, "object_id": object_id}
+        for object_id, track in named.items()
+        for visit, one in track.sightings
+        if one.object_id != object_id
+    ]
+    if links:
+        session.execute(update(SurveyObject), links)
+
+
 def _sightings(session: Session, map_id: str) -> dict[tuple[str, int], Row[Any]]:
-    """Return the columns of every sighting by survey and number; whole objects would cost ten times as much."""
+    """Return what the tracking needs of every sighting, by survey and number."""
     row = SurveyObject
     query = select(
         row.survey_id, row.number, row.object_id, row.kind, row.probability, row.now, row.before
@@ -274,9 +270,9 @@ def _observed(session: Session, map_id: str, tile_ids: set[str]) -> dict[str, di
     return observed
 
 
-def _parts(now_at: Mapping[str, Any] | None, before_at: Mapping[str, Any] | None) -> Parts:
+def _parts(now: Mapping[str, Any] | None, before: Mapping[str, Any] | None) -> Parts:
     """Return the parts of an object, whose places are JSON."""
-    places: dict[Side, Mapping[str, Any] | None] = {"now": now_at, "before": before_at}
+    places: dict[Side, Mapping[str, Any] | None] = {"now": now, "before": before}
     return {side: _part(place) for side, place in places.items() if place is not None}
 
 

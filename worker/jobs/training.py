@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import json
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -15,12 +15,14 @@ from worker.detectors.card import Card
 from worker.detectors.registry import trainable_detectors
 from worker.detectors.store import make_detector, read_card, resolve_device, settings_of, weights_of
 from worker.errors import Cancelled, TrainingFailed
+from worker.jobs import voxel_training
 from worker.jobs.maps import encode_reference
 from worker.jobs.models import card_that_fits, kept_detector, pipeline_settings
 from worker.jobs.scans import kept_scan
 from worker.jobs.site_training_set import halves, held_out_share, training_set
 from worker.jobs.step import Context, put, step
 from worker.jobs.versions import kept_reference
+from worker.jobs.voxel_training import VoxelTraining
 from worker.pipeline.registration.results import RegisteredScan
 from worker.training.dataset import load_tiles, save_tiles
 from worker.training.log import LOG
@@ -41,6 +43,9 @@ KEPT = (BEST, LOG, CHECKPOINT)  #: what a training goes on from, in the order it
 def pack_tiles(context: Context) -> None:
     """Pack the map's tiles as a training set, each seen by one half of its scans and by the other."""
     asked = _asked(context)  # a base that cannot be trained, or too small a map, fails before the wait
+    if asked.voxels is not None:
+        asked.voxels.pack(context)
+        return
     version, card = asked.version, asked.card
     settings = pipeline_settings(context, version, card)
     tiles = kept_reference(context, version).tiles(min_points=settings.tiling.min_points)
@@ -56,25 +61,33 @@ def train_model(context: Context) -> None:
     """Train from nothing or from another model, for so many minutes; go on from the last epoch that was kept."""
     asked = _asked(context)
     folder, work = context.scratch / "run", blob_keys.model_work(context.job.job_id)
-    base = asked.model.base
-    start = None if base is None else weights_of(kept_detector(context, base))
     _fetch(context, folder)
+    keep = functools.partial(_keep, context)
     try:
-        with context.catalog.blobs.local(blob_keys.model_tiles(context.job.job_id)) as tiles:
-            train(
-                _settings(context, asked, tiles),
-                tiles,
-                folder,
-                lambda _, share: context.report("training", share),
-                start=start,
-                on_epoch=functools.partial(_keep, context),
-            )
+        if asked.voxels is not None:
+            asked.voxels.train(context, folder, keep)
+        else:
+            _train_pairs(context, asked, folder, keep)
     except (FloatingPointError, ValueError) as error:  # no number, or files of an earlier release
         context.catalog.blobs.delete_prefix(work)
         raise TrainingFailed(str(error)) from error
     except Cancelled:
         context.catalog.blobs.delete_prefix(work)
         raise
+
+
+def _train_pairs(context: Context, asked: _Asked, folder: Path, keep: Callable[[Path], None]) -> None:
+    base = asked.model.base
+    start = None if base is None else weights_of(kept_detector(context, base))
+    with context.catalog.blobs.local(blob_keys.model_tiles(context.job.job_id)) as tiles:
+        train(
+            _settings(context, asked, tiles),
+            tiles,
+            folder,
+            lambda _, share: context.report("training", share),
+            start=start,
+            on_epoch=keep,
+        )
 
 
 @step
@@ -85,19 +98,29 @@ def finish_model(context: Context) -> None:
     _fetch(context, folder)
     context.report("calibrating", 0.0)
     try:
-        with blobs.local(blob_keys.model_tiles(context.job.job_id)) as tiles:
-            made = _published(context, asked, folder / BEST, tiles)
+        card, weights, log = _finished(context, asked, folder)
     except ValueError as error:  # files of an earlier release
         raise TrainingFailed(str(error)) from error
-    card = read_card(made).model_copy(update={"licence": ""})
-    weights = (made / str(card.weights)).read_bytes()
-    blobs.put_bytes(blob_keys.model_weights(context.job.job_id), weights)
-    blobs.put_file(blob_keys.model_log(context.job.job_id), folder / LOG)
     detector = make_detector(card, weights, context.settings.device)
+    if asked.voxels is not None:
+        card = card.model_copy(update={"quiet": asked.voxels.quiet(context, card, detector)})
+        detector = make_detector(card, weights, context.settings.device)
+    blobs.put_bytes(blob_keys.model_weights(context.job.job_id), weights)
+    blobs.put_file(blob_keys.model_log(context.job.job_id), log)
     encode_reference(context, asked.version, detector, asked.model.model)
     context.catalog.models.save_card(context.job.job_id, card.model_dump(mode="json"))
     context.catalog.jobs.succeed(context.job.job_id)
     blobs.delete_prefix(blob_keys.model_work(context.job.job_id))
+
+
+def _finished(context: Context, asked: _Asked, folder: Path) -> tuple[Card, bytes, Path]:
+    """Return card and weights of the model, and the log of its training."""
+    if asked.voxels is not None:
+        return asked.voxels.finish(context, folder, _command(asked.model))
+    with context.catalog.blobs.local(blob_keys.model_tiles(context.job.job_id)) as tiles:
+        made = _published(context, asked, folder / BEST, tiles)
+    card = read_card(made).model_copy(update={"licence": ""})
+    return card, (made / str(card.weights)).read_bytes(), folder / LOG
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -109,13 +132,23 @@ class _Asked:
     card: Card  #: of the model that is trained further, or of the one that the map was built for
     detector: str  #: key of what is trained
 
+    @property
+    def voxels(self) -> VoxelTraining | None:
+        """The training of a model that scores voxels; None of one that compares tiles by their points."""
+        if self.detector != voxel_training.DETECTOR:
+            return None
+        return VoxelTraining(model=self.model, version=self.version, card=self.card)
+
 
 def _asked(context: Context) -> _Asked:
     """Look up what the job asks for. Raises DetectorUnavailable, and TrainingFailed for a base that has no network."""
     model = context.catalog.models.of_job(context.job.job_id)
     version = context.catalog.versions.get(model.map_id, model.map_version)
     card = card_that_fits(context, model.base or version.model, version.model)
-    return _Asked(model=model, version=version, card=card, detector=_detector_key(model, card))
+    detector = _detector_key(model, card)
+    if detector == voxel_training.DETECTOR != card.detector:
+        card = card_that_fits(context, voxel_training.SHIPPED, version.model)
+    return _Asked(model=model, version=version, card=card, detector=detector)
 
 
 def _detector_key(model: ModelRecord, card: Card) -> str:
@@ -123,13 +156,14 @@ def _detector_key(model: ModelRecord, card: Card) -> str:
 
     Raises TrainingFailed.
     """
-    if card.detector in trainable_detectors():
+    trainable = [*trainable_detectors(), voxel_training.DETECTOR]
+    if card.detector in trainable:
         return card.detector
     if model.base is None:
-        return SITE.detector
+        return voxel_training.DETECTOR if card.preprocessing.tiles == "touched" else SITE.detector
     raise TrainingFailed(
         f"model {model.base} cannot be trained further: nothing of a detector {card.detector!r} is trained; "
-        f"name a base of {' or '.join(trainable_detectors())}, or none"
+        f"name a base of {' or '.join(trainable)}, or none"
     )
 
 
@@ -163,7 +197,6 @@ def _published(context: Context, asked: _Asked, best: Path, tiles: Path) -> Path
     model = asked.model
     other = model.base or asked.version.model
     title = replace(SITE, detector=asked.detector).network.title
-    wanted = {"base": model.base, "minutes": model.minutes, "epochs": model.epochs}
     return publish(
         best,
         tiles,
@@ -172,12 +205,17 @@ def _published(context: Context, asked: _Asked, best: Path, tiles: Path) -> Path
         version=str(model.version),
         summary=f"{title} trained on version {model.map_version} of map {model.map_id}"
         + ("" if model.base is None else f", from {model.base}"),
-        command=f"POST /maps/{model.map_id}/models {json.dumps(wanted)}",
+        command=_command(model),
         about={"map_id": model.map_id, "map_version": model.map_version, "base": model.base},
         beside={other: kept_detector(context, other)},
         base=model.base,
         preprocessing=asked.card.preprocessing,
     )
+
+
+def _command(model: ModelRecord) -> str:
+    wanted = {"base": model.base, "minutes": model.minutes, "epochs": model.epochs}
+    return f"POST /maps/{model.map_id}/models {json.dumps(wanted)}"
 
 
 def _scans(context: Context, version: VersionRecord) -> Iterator[RegisteredScan]:
@@ -188,14 +226,14 @@ def _scans(context: Context, version: VersionRecord) -> Iterator[RegisteredScan]
 
 
 def _keep(context: Context, folder: Path) -> None:
-    for name in KEPT:
+    for name in (*(name for name in KEPT if (folder / name).exists()), *voxel_training.kept_files(folder)):
         context.catalog.blobs.put_file(blob_keys.model_checkpoint(context.job.job_id, name), folder / name)
 
 
 def _fetch(context: Context, folder: Path) -> None:
     """Copy what an earlier attempt kept; a link would not do, for a log is written to."""
     folder.mkdir(parents=True, exist_ok=True)
-    for name in KEPT:
+    for name in (*KEPT, *voxel_training.FILES):
         key = blob_keys.model_checkpoint(context.job.job_id, name)
         if context.catalog.blobs.exists(key):
             with context.catalog.blobs.local(key) as path:

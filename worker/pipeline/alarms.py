@@ -6,6 +6,7 @@ them, held against the rest, is a false alarm. They are few, so the card's recor
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
@@ -65,11 +66,7 @@ def calibrated(
     surveys = len(visits) if len(visits) > 1 else 0
     for number in range(surveys):
         progress("calibrating", number / surveys)
-        rest = [visit for other, visit in enumerate(visits) if other != number]
-        reference = rest[0]
-        for visit in rest[1:]:
-            reference = reference.merged(visit)
-        scores += region_scores(detector, reference, visits[number])
+        scores += region_scores(detector, rest_of(visits, number), visits[number])
     progress("calibrating", 1.0)
     false = np.array(sorted(scores, reverse=True))
     return AlarmCalibration(
@@ -78,6 +75,12 @@ def calibrated(
         alarms_per_survey=alarms_per_survey,
         min_score=least_score(false, surveys, detector.card.quiet, alarms_per_survey),
     )
+
+
+def rest_of(visits: Sequence[Seen], number: int) -> Seen:
+    """Return what all visits but one saw together."""
+    rest = [visit for other, visit in enumerate(visits) if other != number]
+    return functools.reduce(Seen.merged, rest)
 
 
 def region_scores(detector: Detector, reference: Seen, current: Seen) -> list[float]:

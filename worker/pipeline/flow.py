@@ -180,10 +180,10 @@ def detect(
 def concluded(
     comparison: Comparison, detection: Detection, *, threshold: float, settings: PipelineSettings
 ) -> ChangeSet:
-    """Make of a detector's scores the states of tiles and, where it scored voxels, objects."""
+    """Make of a detector's scores the states of tiles and, where it scored voxels that both visits saw, objects."""
     least = settings.tiling.min_observed_share
     changes = decide(comparison.tile_pairs, detection, threshold=threshold, min_observed_share=least)
-    if detection.voxels is None:
+    if detection.voxels is None or comparison.reference.seen is None or comparison.current.seen is None:
         return changes
     objects = change_objects(comparison, detection.voxels, settings.objects)
     return replace(changes, voxels=detection.voxels, objects=objects)

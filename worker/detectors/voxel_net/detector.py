@@ -57,7 +57,7 @@ class VoxelNet(Scorer):
         settings = card.settings_as(VoxelNetSettings)
         networks = {name: settings.build() for name in (SEEING, BLIND)}
         for name, network in networks.items():
-            network.load_state_dict(_under(name, weights))
+            network.load_state_dict(weights_under(name, weights))
         return cls(card, networks, device)
 
     def weights(self) -> Weights:
@@ -99,7 +99,8 @@ def joined(states: dict[str, Weights]) -> Weights:
     return {f"{name}.{key}": value for name, state in states.items() for key, value in state.items()}
 
 
-def _under(name: str, weights: Weights) -> Weights:
+def weights_under(name: str, weights: Weights) -> Weights:
+    """Return the weights of one network out of those of a model."""
     return {
         key.removeprefix(f"{name}."): value for key, value in weights.items() if key.startswith(f"{name}.")
     }

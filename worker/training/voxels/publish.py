@@ -34,6 +34,8 @@ _BINS = 15  # of the expected calibration error (Guo et al., ICML 2017)
 #: What a card says of where the figures on held-out samples come from.
 ABOUT = "voxels of held-out simulated buildings, all views; a voxel is missing where the thing hit is not in the other visit"
 
+ABOUT_SITE = "voxels of the map's own scans, parted in two visits with solids put into either; rounds that training held out"
+
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
 class _Scored:
@@ -116,6 +118,25 @@ def publish(
     return write_model(model_store / card.name / version, card, weights)
 
 
+def site_network(
+    base: VoxelNetwork, trained: VoxelNetwork, samples: Sequence[VoxelSample]
+) -> tuple[VoxelNetwork, dict[str, Any]]:
+    """Return whichever network ranks a site's held-out samples better, calibrated on them, and figures of both."""
+    scored = {"base": _scored(base.eval(), samples), "trained": _scored(trained.eval(), samples)}
+    figures: dict[str, Any] = {name: _figures(told) for name, told in scored.items()}
+    better = figures["trained"]["average_precision"] > figures["base"]["average_precision"]
+    kept = "trained" if better else "base"
+    network, told = (trained if better else base), scored[kept]
+    if min(told.missing.sum(), (~told.missing).sum()) >= MIN_CHANGED:
+        _rescale(network, *logistic_fit(told.logits, told.missing))
+    return network, {
+        **figures,
+        "kept": kept,
+        "calibrated": _figures(_scored(network, samples)),
+        "about": ABOUT_SITE,
+    }
+
+
 def logistic_fit(values: Floats, truth: Bools) -> tuple[float, float]:
     """Return slope and offset of the logistic curve over values (N,) that fits the truth best (Platt, 1999)."""
     design = np.stack([values, np.ones_like(values)], axis=1)
@@ -179,7 +200,9 @@ def _figures(scored: _Scored) -> dict[str, Any]:
     return {
         "voxels": len(p),
         "missing": int(scored.missing.sum()),
-        "average_precision": round(precision_recall(p, scored.missing).average_precision, 4),
+        "average_precision": round(precision_recall(p, scored.missing).average_precision, 4)
+        if scored.missing.any()
+        else 0.0,
         "expected_calibration_error": round(calibration_error(p, scored.missing), 5),
     }
 
