@@ -204,6 +204,10 @@ def real(
         list[str] | None, typer.Option(help="name/version; may be given again. Left out: all that there are.")
     ] = None,
     model_store: ModelStore = MODEL_STORE,
+    place: Annotated[
+        list[str] | None,
+        typer.Option(help="room_scan, corridor_pair, 'ipad 808', 'ipad 560' or kinect; may be given again."),
+    ] = None,
     seeds: Annotated[
         int, typer.Option(min=1, help="Draws of things that are put into each visit of each pair.")
     ] = 2,
@@ -221,6 +225,7 @@ def real(
     """
     from worker.benchmarks.real.benchmark import RealBenchmarkSettings, evaluate  # noqa: PLC0415
     from worker.benchmarks.real.report import tables, write_report  # noqa: PLC0415
+    from worker.benchmarks.real.visits import PLACES  # noqa: PLC0415
 
     stored = sorted("/".join(card.parts[-3:-1]) for card in model_store.glob("*/*/card.json"))
     settings = RealBenchmarkSettings(
@@ -228,6 +233,7 @@ def real(
         models=tuple(model or stored),
         model_store=model_store,
         out=out,
+        places=tuple(place or PLACES),
         seeds=seeds,
         registered=registered,
     )

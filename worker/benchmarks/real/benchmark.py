@@ -8,12 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
-from worker.benchmarks.documents import Document
+from worker.benchmarks.documents import Document, names_among
 from worker.benchmarks.real.answers import Answer, answer_of
-from worker.benchmarks.real.edits import EditedVisits, Side, edited, real_things
+from worker.benchmarks.real.edits import SIDES, EditedVisits, Side, edited, real_things
 from worker.benchmarks.real.measures import Figures, PairCounts, counts_of, groups_of
 from worker.benchmarks.real.pictures import draw_edited, draw_visits
 from worker.benchmarks.real.visits import (
+    PLACES,
     PLANS,
     Plan,
     TwoVisits,
@@ -53,6 +54,7 @@ class RealBenchmarkSettings:
     models: tuple[str, ...]
     model_store: Path = MODEL_STORE
     out: Path | None = None  #: folder of the pictures
+    places: tuple[str, ...] = PLACES  #: that are taken
     seeds: int = 2  #: draws of things for each visit of each pair
     registered: bool = True  #: ask again with the poses of the product's own registration
 
@@ -60,11 +62,13 @@ class RealBenchmarkSettings:
 def evaluate(settings: RealBenchmarkSettings, progress: Progress = no_progress) -> Document:
     """Run all of it and draw what is to be drawn; JSON-ready.
 
-    Raises DetectorUnavailable, OSError for a missing file, ScanError for one that is none, and PipelineError.
+    Raises ValueError for an unknown place, DetectorUnavailable, OSError for a missing file, ScanError for one that is none, and PipelineError.
     """
     detectors = [open_detector(settings.model_store, model) for model in settings.models]
-    poses = given_poses(settings.folder, progress)
-    visits = {plan.name: visits_by(settings.folder, plan, poses) for plan in PLANS}
+    places = names_among(",".join(settings.places), PLACES, "place")
+    plans = [plan for plan in PLANS if plan.place in places]
+    poses = given_poses(settings.folder, places, progress)
+    visits = {plan.name: visits_by(settings.folder, plan, poses) for plan in plans}
     answers: dict[str, list[Answer]] = {}
     for done, (name, pair) in enumerate(visits.items()):
         progress(f"as they are: {name}", done / len(visits))
@@ -74,7 +78,7 @@ def evaluate(settings: RealBenchmarkSettings, progress: Progress = no_progress) 
     document: Document = {
         "models": list(settings.models),
         "pairs": [_pair(pair, answers[name]) for name, pair in visits.items()],
-        "registered": _registered(settings, detectors, poses, answers, progress)
+        "registered": _registered(settings, detectors, plans, poses, answers, progress)
         if settings.registered
         else None,
     }
@@ -101,14 +105,15 @@ def _pair(visits: TwoVisits, answers: Sequence[Answer]) -> Document:
 def _registered(
     settings: RealBenchmarkSettings,
     detectors: Sequence[Detector],
+    plans: Sequence[Plan],
     given: dict[str, Matrix4],
     answers: dict[str, list[Answer]],
     progress: Progress,
 ) -> list[Document]:
     """Ask again with the product's own poses; pairs of one map and its own scans stand where they stood."""
     rows = []
-    for done, plan in enumerate(PLANS):
-        progress(f"registered: {plan.name}", done / len(PLANS))
+    for done, plan in enumerate(plans):
+        progress(f"registered: {plan.name}", done / len(plans))
         rows.append(_registered_pair(settings, detectors, plan, given, answers[plan.name]))
     return rows
 
@@ -156,11 +161,18 @@ def _edited(
     things = [
         thing
         for name in THINGS_FROM
+        if name in visits
         for scan in (*visits[name].first, *visits[name].second)
         for thing in real_things(scan)
     ]
     counts: list[list[PairCounts]] = [[] for _ in detectors]
-    plan = [(name, side, seed) for name in EDITED for side in _sides() for seed in range(settings.seeds)]
+    plan = [
+        (name, side, seed)
+        for name in EDITED
+        if name in visits
+        for side in SIDES
+        for seed in range(settings.seeds)
+    ]
     pairs = []
     for done, (name, side, seed) in enumerate(plan):
         progress(f"with things put in: {name}", done / len(plan))
@@ -200,10 +212,6 @@ def _edited_pair(pair: EditedVisits, counts: Sequence[PairCounts]) -> Document:
         "false_objects": [one.false_of_any_size for one in counts],
         "tiles": [one.tiles.figures() for one in counts],
     }
-
-
-def _sides() -> tuple[Side, Side]:
-    return "first", "second"
 
 
 def _seed(name: str, side: Side, seed: int) -> int:

@@ -25,8 +25,8 @@ from worker.training.voxels.insertion import InsertedScan, inserted, random_soli
 from worker.training.voxels.solids import Box, CloudObject, Cylinder, Solid, spheres_meet
 
 VOXEL = 0.05  #: metres, of the truth
-SIDES = ("first", "second")
 Side = Literal["first", "second"]
+SIDES: tuple[Side, Side] = ("first", "second")
 
 _SIZE = (0.2, 1.0)  # metres, extents of boxes and cylinders
 _BLIND_SIZE = (0.2, 0.6)  # metres, likewise where rays are unknown: what lies farther in, nobody knows
@@ -35,7 +35,7 @@ _KNOWN = 0.3  # metres from what a blind visit hit, within which it is said to k
 _TRIES = 200
 _NOISE = 0.01  # metres
 _VIEWS = 8  # places around a solid from which its surface is sampled, where there are no rays
-_THING_POINTS, _THING_SIZE, _THINNEST = 150, (0.4, 1.2), 0.25  # points; metres, longest and middle extent
+_THING_POINTS, _THING_SIZE, _THINNEST = 150, (0.4, 1.2), 0.2  # points; metres, longest and least extent
 _OFF_FLOOR, _UP_TO, _UNDER_CEILING = 0.08, 1.0, (1.8, 0.15)  # metres between which things are looked for
 
 
@@ -87,10 +87,10 @@ def real_things(scan: RealScan) -> list[CloudObject]:
 
     They are chairs and boxes in one data set and lamps in another; walls and large furniture are too large.
     """
-    points = scan.points
-    floor = (
-        floor_height(points, CarrierSettings.model_validate({})) if scan.sensor_origin is not None else None
-    )
+    points, floor = scan.points, None
+    if scan.sensor_origin is not None:
+        below = floor_height(points - scan.sensor_origin, CarrierSettings.model_validate({}))
+        floor = None if below is None else float(scan.sensor_origin[2]) + below
     top = float(np.percentile(points[:, 2], 99))
     low, high = (
         (top - _UNDER_CEILING[0], top - _UNDER_CEILING[1])
@@ -111,7 +111,7 @@ def real_things(scan: RealScan) -> list[CloudObject]:
 
 def _is_thing(points: Points) -> bool:
     extents = np.sort(np.ptp(points, axis=0))
-    return bool(_THING_SIZE[0] <= extents[2] <= _THING_SIZE[1] and extents[1] >= _THINNEST)
+    return bool(_THING_SIZE[0] <= extents[2] <= _THING_SIZE[1] and extents[0] >= _THINNEST)
 
 
 def _drawn(visits: TwoVisits, things: Sequence[CloudObject], rng: np.random.Generator) -> list[Solid]:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from worker.benchmarks.documents import Document
 from worker.benchmarks.real.answers import Answer, FoundObject, scores_at, tiles_of
-from worker.benchmarks.real.edits import VOXEL, EditedVisits, Side, TrueRegion
+from worker.benchmarks.real.edits import SIDES, VOXEL, EditedVisits, Side, TrueRegion
 from worker.cloud.types import Bools, Floats, Indices
 from worker.cloud.voxel_keys import Keys, centers, near, packed
 from worker.metrics import Confusion, confusion, pooled
@@ -81,7 +81,7 @@ def _is_found(region: TrueRegion, objects: Sequence[FoundObject]) -> bool:
 def _is_true(thing: FoundObject, regions: Sequence[TrueRegion]) -> bool:
     """Tell whether at least half of an object's voxels lie within 2 voxels of something that was put in."""
     by = 0
-    for side in ("first", "second"):
+    for side in SIDES:
         hits = [region.hit for region in regions if region.side == side]
         keys = thing.before if side == "first" else thing.now
         if hits and len(keys):

@@ -93,18 +93,25 @@ def _plans() -> tuple[Plan, ...]:
 
 
 PLANS = _plans()
+PLACES = tuple(dict.fromkeys(plan.place for plan in PLANS))
 
 
-def given_poses(folder: Path, progress: Progress = no_progress) -> dict[str, Matrix4]:
-    """Return of each file where it stands in the frame of its place, place_from_scan.
+def given_poses(
+    folder: Path, places: Sequence[str] = PLACES, progress: Progress = no_progress
+) -> dict[str, Matrix4]:
+    """Return of each file of some places where it stands in the frame of its place, place_from_scan.
 
     Transforms lie beside the pairs; the frames of the Kinect are registered together, by us. Raises OSError where a
     file is missing, and PipelineError where the frames make no map.
     """
     poses: dict[str, Matrix4] = {}
     for pair in PAIRS:
+        if pair.name not in places:
+            continue
         poses[f"{pair.folder}/{pair.first}"] = np.eye(4)
         poses[f"{pair.folder}/{pair.second}"] = np.loadtxt(folder / pair.folder / pair.transform)
+    if "kinect" not in places:
+        return poses
     built = build_map(_files(folder, FRAMES), settings=PipelineSettings(), progress=progress)
     for name, outcome in zip(FRAMES, built.outcomes, strict=True):
         poses[name] = _LEVEL @ _map_from_scan(outcome)
