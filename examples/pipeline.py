@@ -23,10 +23,10 @@ from worker.simulation.visits import visit
 
 def changed_tiles(before: list[ScanFile], after: list[ScanFile], cloud: Path) -> list[TileResult]:
     """Return the tiles that changed between two visits, and write the later one as a coloured cloud."""
-    detector = open_detector(MODEL_STORE, "spicd-net/1")
+    detector = open_detector(MODEL_STORE, "voxel-net/1")
     settings = PipelineSettings().for_model(detector.card.preprocessing)
     built = build_map(before, settings=settings)
-    survey = locate_survey(after, built.reference, settings=settings)
+    survey = locate_survey(after, built.reference, settings=settings, reference_seen=built.seen)
     changes = detect(survey.comparison, detector)
     write_coloured_cloud(cloud, built.reference.points, survey.current.points, changes)
     return [tile for tile in tile_results(changes) if tile.state == "changed"]

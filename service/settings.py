@@ -35,7 +35,7 @@ class Settings(BaseSettings):
         default_factory=_model_store,
         description="folder of the models and their cards; unset: the checkout's, without one `./model_store`",
     )
-    model: str = Field("spicd-net/1", description="model used where a request names none")
+    model: str = Field("voxel-net/1", description="model used where a request names none")
     geometry_workers: int = Field(1, ge=0, description="worker processes of the geometry queue")
     inference_workers: int = Field(1, ge=0, description="worker processes of the inference queue")
     max_upload_bytes: int = Field(2 * 1024**3, gt=0, description="largest body of one request")

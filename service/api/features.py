@@ -96,7 +96,7 @@ class TileProperties(Document):
     map_id: str = Field(examples=["lobby"])
     map_version: int = Field(description="that the survey was compared with", examples=[1])
     survey_id: str = Field(examples=["survey-91c4"])
-    model: str = Field(examples=["spicd-net/1"])
+    model: str = Field(examples=["voxel-net/1"])
     captured_at: str = Field(examples=["2026-03-01T12:00:00Z"])
     first_seen: str | None = Field(
         description="by a visit that saw this change of the tile; null where it is not changed",

@@ -49,7 +49,7 @@ class ModelList(Document):
     """The cards, and the model that is used where a request names none."""
 
     models: list[dict[str, Any]]
-    default: str = Field(examples=["spicd-net/1"])
+    default: str = Field(examples=["voxel-net/1"])
 
 
 class ModelRequest(Request):

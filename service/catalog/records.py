@@ -224,7 +224,7 @@ class Built(Record):
     map_id: str = Field(examples=["lobby"])
     version: int = Field(examples=[1])  #: 1, 2, ... of the map
     status: MapStatus
-    model: str = Field(examples=["spicd-net/1"])  #: `name/version`, whose card gives voxel and tile size
+    model: str = Field(examples=["voxel-net/1"])  #: `name/version`, whose card gives voxel and tile size
     settings: dict[str, Any]
     scans: tuple[ScanOutcome, ...]  #: those of the base that were accepted, then the new ones, as requested
     bounds: Bounds | None = Field(description="metres, map frame")  #: None until it is built
@@ -266,7 +266,7 @@ class SurveyRecord(Record):
     map_id: str = Field(examples=["lobby"])
     map_version: int = Field(description="of the map, that the survey is compared with", examples=[1])
     status: SurveyStatus
-    model: str = Field(examples=["spicd-net/1"])
+    model: str = Field(examples=["voxel-net/1"])
     threshold: float | None = Field(description="asked for, then the one that was used")
     device_id: str | None
     captured_at: Utc  #: given, else the latest of its scans, else the time of the request

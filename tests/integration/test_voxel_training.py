@@ -21,15 +21,15 @@ MODEL, MAP = "voxel-net/1", "hall"
 
 @pytest.fixture(autouse=True)
 def tiny(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("SPICD_MODEL_STORE", str(MODEL_STORE))
-    monkeypatch.setattr(voxel_training, "SITE", replace(voxel_training.SITE, rounds=6, solids=4))
+    monkeypatch.setattr(voxel_training, "SITE", replace(voxel_training.SITE, rounds=6, solids=6, quiet=0.0))
     training = voxel_training.TRAINING.with_values(steps=2, crops=2, held_out=2)
     monkeypatch.setattr(voxel_training, "TRAINING", training)
 
 
 @pytest.fixture
-def hall(house: House) -> House:
+def hall(house: House, monkeypatch: pytest.MonkeyPatch) -> House:
     """The same scans as a map of the shipped model."""
+    monkeypatch.setenv("SPICD_MODEL_STORE", str(MODEL_STORE))
     scans = [house.add(f"hall-{number}.pcd", scan) for number, scan in enumerate(house.material.before)]
     ids = [scan.scan_id for scan in scans]
     job = house.catalog.maps.create(scan_ids=ids, model=MODEL, map_id=MAP, settings=SETTINGS)[1]

@@ -35,36 +35,15 @@ TileScore = NDArray[np.floating[Any]]
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Method:
-    """A way of comparing tiles."""
+    """A way of comparing tiles that needs no training."""
 
     name: str
     score: Callable[[TilePairs], TileScore]
-    stated: float | None = None  #: the threshold it comes with; None where it has none
-    sha256: str | None = None  #: of its weights; None where it has none
 
 
 def baseline_methods() -> tuple[Method, ...]:
     """Return the baselines that this machine can run."""
     return tuple(Method(name=baseline.name, score=baseline.score) for baseline in installed_baselines())
-
-
-def detector_methods(model_store: Path, model: str, weights: tuple[Path, ...]) -> tuple[Method, ...]:
-    """Return the model with the threshold of its card; or, without one, the checkpoints in its place.
-
-    Raises DetectorUnavailable.
-    """
-    methods = []
-    for path in weights or (None,):
-        detector = open_model(model_store, model, path)
-        methods.append(
-            Method(
-                name=model if path is None else "/".join(path.parts[-2:]),
-                score=CachedDetector(detector=detector).score,
-                stated=detector.card.threshold if path is None else None,
-                sha256=detector.card.sha256,
-            )
-        )
-    return tuple(methods)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -199,16 +178,16 @@ def encode_reference(detector: Detector, tiles: Tiles, progress: Progress = no_p
     return detector.encode_reference(side_of(tiles), tiles, progress=progress)
 
 
-def tile_scores(detector: Detector, pairs: TilePairs, embedding: Arrays | None = None) -> Detection:
+def tile_scores(detector: Detector, comparison: Comparison, embedding: Arrays | None = None) -> Detection:
     """Compare every observed pair; `embedding` is that of the map, if kept."""
-    return detector.detect(Comparison.of_tiles(pairs), embedding=embedding)
+    return detector.detect(comparison, embedding=embedding)
 
 
 def change_scores(
     detector: Detector, pairs: TilePairs, embedding: Arrays | None = None
 ) -> NDArray[np.float32]:
     """Return the probability of change (T,), NaN where not observed."""
-    return tile_scores(detector, pairs, embedding).change
+    return tile_scores(detector, Comparison.of_tiles(pairs), embedding).change
 
 
 @dataclass(kw_only=True, slots=True)

@@ -14,7 +14,7 @@ import typer
 
 from worker.cli import terminal
 from worker.cli.command_line import command_line
-from worker.cli.options import DEFAULT_MODEL, AsJson, Model, ModelStore
+from worker.cli.options import DEFAULT_MODEL, PAPER_MODEL, AsJson, Model, ModelStore
 from worker.detectors.card import MODEL_STORE
 
 
@@ -87,7 +87,7 @@ def registration(
 
 def paper(
     context: typer.Context,
-    model: Model = DEFAULT_MODEL,
+    model: Model = PAPER_MODEL,
     model_store: ModelStore = MODEL_STORE,
     weights: Annotated[
         Path | None, typer.Option(help="Checkpoint of training to measure, under the model's card.")
@@ -196,6 +196,50 @@ def revisit(
         return
     write_json(out / "revisit.json", result)
     terminal.show(result, tables, f"saved in {out}", as_json=as_json)
+
+
+def real(
+    folder: Annotated[Path, typer.Argument(help="Real scans: see docs/test-data.md.")],
+    model: Annotated[
+        list[str] | None, typer.Option(help="name/version; may be given again. Left out: all that there are.")
+    ] = None,
+    model_store: ModelStore = MODEL_STORE,
+    place: Annotated[
+        list[str] | None,
+        typer.Option(help="room_scan, corridor_pair, 'ipad 808', 'ipad 560' or kinect; may be given again."),
+    ] = None,
+    seeds: Annotated[
+        int, typer.Option(min=1, help="Draws of things that are put into each visit of each pair.")
+    ] = 2,
+    registered: Annotated[
+        bool, typer.Option(help="Also ask with the poses of the product's own registration.")
+    ] = True,
+    out: Annotated[Path, typer.Option(help="Folder for real.json, real.md and pictures.")] = Path(
+        "bench/real"
+    ),
+    as_json: AsJson = False,
+) -> None:
+    """Say what models make of real scans, as they are and with things put into one of two visits.
+
+    Nobody knows all that truly changed in the scans; docs/real-scans.md says what can be seen in them.
+    """
+    from worker.benchmarks.real.benchmark import RealBenchmarkSettings, evaluate  # noqa: PLC0415
+    from worker.benchmarks.real.report import tables, write_report  # noqa: PLC0415
+    from worker.benchmarks.real.visits import PLACES  # noqa: PLC0415
+
+    stored = sorted("/".join(card.parts[-3:-1]) for card in model_store.glob("*/*/card.json"))
+    settings = RealBenchmarkSettings(
+        folder=folder,
+        models=tuple(model or stored),
+        model_store=model_store,
+        out=out,
+        places=tuple(place or PLACES),
+        seeds=seeds,
+        registered=registered,
+    )
+    with terminal.progress_bar() as progress:
+        result = evaluate(settings, progress)
+    terminal.show(result, tables, f"saved in {write_report(result, out)}", as_json=as_json)
 
 
 def record(

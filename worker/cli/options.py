@@ -13,4 +13,5 @@ ModelStore = Annotated[
 ]
 Device = Annotated[Literal["auto", "cpu", "cuda"], typer.Option(envvar="SPICD_DEVICE")]
 AsJson = Annotated[bool, typer.Option("--json", help="Results as JSON on stdout, nothing else there.")]
-DEFAULT_MODEL = "spicd-net/1"
+DEFAULT_MODEL = "voxel-net/1"
+PAPER_MODEL = "spicd-net/1"  #: the method of the paper, which its experiments are made for

@@ -49,7 +49,7 @@ def detector_class(key: str) -> DetectorClass:
     return opens
 
 
-def open_detector(model_store: Path, name: str = "spicd-net/1", device: Device = "auto") -> Detector:
+def open_detector(model_store: Path, name: str = "voxel-net/1", device: Device = "auto") -> Detector:
     """Return the detector `<name>/<version>`, ready to score.
 
     Raises DetectorUnavailable when there is no such model, its card is unsound, its weights are not those of

@@ -200,8 +200,13 @@ def passing_rays(places: Floats, scene: Scene, scans: Sequence[SimulatedScan]) -
 
 
 def _passing_rays_of(places: Floats, scan: SimulatedScan, mirror_ids: Sequence[int]) -> NDArray[np.int64]:
-    origin = scan.world_from_sensor[:3, 3]
-    rays = scan.world_points[~np.isin(scan.object_ids, mirror_ids)] - origin
+    returns = scan.world_points[~np.isin(scan.object_ids, mirror_ids)]
+    return rays_past(places, scan.world_from_sensor[:3, 3], returns)
+
+
+def rays_past(places: Floats, origin: Floats, returns: NDArray[np.floating]) -> NDArray[np.int64]:
+    """Count for each place (P, 3) the returns (N, 3) of one scan from `origin` (3,) whose rays went through: (P,)"""
+    rays = returns - origin
     ranges = np.linalg.norm(rays, axis=1)
     depths = np.linalg.norm(places - origin, axis=1)
     far = ranges > depths.min(initial=np.inf) + BEHIND

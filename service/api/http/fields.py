@@ -89,5 +89,5 @@ Pose = Annotated[Matrix, BeforeValidator(from_text), AfterValidator(rigid), With
 Text = Annotated[str, Field(pattern=r"^[^\x00-\x1f\x7f]*$")]  #: one line; PostgreSQL takes no NUL
 DeviceId = Annotated[Text, Field(min_length=1, max_length=128, examples=["robot-7"])]
 Model = Annotated[
-    str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*/[A-Za-z0-9][A-Za-z0-9_.-]*$", examples=["spicd-net/1"])
+    str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*/[A-Za-z0-9][A-Za-z0-9_.-]*$", examples=["voxel-net/1"])
 ]

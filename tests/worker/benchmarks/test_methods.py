@@ -15,18 +15,22 @@ from tests.support.detectors import CountingDetector
 from worker.benchmarks.methods import (
     CachedDetector,
     baseline_methods,
-    detector_methods,
     open_model,
+    revisit_methods,
+    stored_models,
     training_log,
 )
 from worker.cloud.tiling import TileGrid, TilePairs, Tiles
 from worker.detectors.card import MODEL_STORE
+from worker.detectors.comparison import Comparison
 from worker.detectors.spicd_net.network import SpicdNetwork
-from worker.detectors.store import WEIGHTS, open_card, read_card, write_model
+from worker.detectors.store import WEIGHTS, open_card, read_card, write_card, write_model
 from worker.errors import DetectorUnavailable
+from worker.pipeline.settings import PipelineSettings
 from worker.training.log import LOG
 
 MODEL = "spicd-net/1"
+PIPELINE = PipelineSettings()
 SOUND = {"seed": 7, "pairs": {"patch_points": 1024}}
 
 
@@ -49,9 +53,11 @@ def pairs() -> TilePairs:
 
 
 def test_a_model_of_the_store_comes_with_the_threshold_and_the_weights_of_its_card() -> None:
-    (method,) = detector_methods(MODEL_STORE, MODEL, ())
+    (method,), left_out = revisit_methods(MODEL_STORE, MODEL, (), PIPELINE, others=False)
     card = open_card(MODEL_STORE, MODEL)
     assert (method.name, method.stated, method.sha256) == (MODEL, card.threshold, card.sha256)
+    assert (method.tiles, method.min_points) == ("dense", 512)
+    assert left_out == []
 
 
 def test_a_checkpoint_scores_with_its_own_weights_and_states_no_threshold(
@@ -61,12 +67,43 @@ def test_a_checkpoint_scores_with_its_own_weights_and_states_no_threshold(
     path.parent.mkdir()
     torch.manual_seed(1)
     torch.save({"network": SpicdNetwork().state_dict(), "settings": SOUND}, path)
-    (method,) = detector_methods(MODEL_STORE, MODEL, (path,))
+    (method,), _ = revisit_methods(MODEL_STORE, MODEL, (path,), PIPELINE, others=False)
     assert (method.name, method.stated) == ("run/best.pt", None)
-    scores = method.score(pairs)
+    scores = method.detect(Comparison.of_tiles(pairs)).change
     assert np.isnan(scores).tolist() == (~pairs.observed).tolist()
-    (shipped,) = detector_methods(MODEL_STORE, MODEL, ())
-    assert not np.allclose(scores, shipped.score(pairs), equal_nan=True)
+    (shipped,), _ = revisit_methods(MODEL_STORE, MODEL, (), PIPELINE, others=False)
+    assert not np.allclose(scores, shipped.detect(Comparison.of_tiles(pairs)).change, equal_nan=True)
+
+
+def test_all_models_of_the_store_come_after_the_one_that_is_asked_for_then_the_baselines() -> None:
+    methods, left_out = revisit_methods(MODEL_STORE, MODEL, (), PIPELINE)
+    names = [method.name for method in methods]
+    stored = stored_models(MODEL_STORE)
+    assert {"c2c/1", "spicd-net/1", "voxel-rule/1"} <= set(stored)
+    assert names[0] == MODEL
+    assert set(names[1 : len(stored)]) == set(stored) - {MODEL}
+    assert names[len(stored)] == "C2C (mean)"
+    assert {method.name for method in methods if method.tells_voxels} >= {"voxel-rule/1"}
+    installed = any(name == "M3C2" for name in names)
+    assert left_out == ([] if installed else ["M3C2: py4dgeo is not installed"])
+
+
+def test_a_model_that_needs_other_voxels_is_left_out_and_refused_where_it_is_asked_for(
+    tmp_path: Path,
+) -> None:
+    card = open_card(MODEL_STORE, "c2c/1")
+    coarse = card.preprocessing.model_copy(update={"voxel_size": 0.1})
+    for name, needs in (("c2c", card.preprocessing), ("coarse", coarse)):
+        (tmp_path / name / "1").mkdir(parents=True)
+        write_card(
+            tmp_path / name / "1",
+            card.model_copy(update={"name": name, "version": "1", "preprocessing": needs}),
+        )
+    methods, left_out = revisit_methods(tmp_path, "c2c/1", (), PIPELINE)
+    assert "coarse/1" not in [method.name for method in methods]
+    assert "coarse/1 needs voxels of 0.1 m" in left_out[0]
+    with pytest.raises(DetectorUnavailable, match="coarse/1 needs voxels"):
+        revisit_methods(tmp_path, "coarse/1", (), PIPELINE)
 
 
 def test_a_checkpoint_brings_its_weights_patch_size_and_seed(tmp_path: Path) -> None:

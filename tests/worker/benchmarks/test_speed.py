@@ -7,7 +7,7 @@ import pytest
 
 from tests.support.detectors import CountingDetector
 from worker.benchmarks.methods import open_model
-from worker.benchmarks.speed import BenchSettings, bench, resized, scoring_bench, tables
+from worker.benchmarks.speed import BenchSettings, bench, resized, scoring_bench, tables, ways
 from worker.cloud.tiling import TileGrid, TilePairs, Tiles
 from worker.detectors import registry
 from worker.detectors.card import Card, Preprocessing
@@ -50,6 +50,16 @@ def test_bench_times_every_stage_and_finds_the_same_scores_each_way(model_store:
     assert tables(figures).renderables
 
 
+def test_a_detector_by_voxels_is_timed_with_its_objects_beside_c2c_on_the_same_clouds() -> None:
+    figures = bench(BenchSettings(scans=4, repeats=1, model="voxel-rule/1"))
+    assert list(figures["network"]["seconds"]) == ["c2c", "voxels"]
+    assert figures["network"]["times_c2c"]["voxels"] > 0
+    assert figures["network"]["largest_score_difference"] is None
+    survey = figures["survey_with_prior"]  # with so few scans it may well be refused
+    assert "rejected" in survey or survey["objects"] > 0
+    assert tables(figures).renderables
+
+
 def test_any_detector_of_the_store_can_be_timed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = tmp_path / "counting" / "1"
     folder.mkdir(parents=True)
@@ -57,7 +67,8 @@ def test_any_detector_of_the_store_can_be_timed(tmp_path: Path, monkeypatch: pyt
     entry = registry.Entry(detector=f"{__name__}:CountingDetector")
     monkeypatch.setitem(registry.DETECTORS, "counting", entry)
     detector = open_model(tmp_path, "counting/1")
-    figures = scoring_bench(made_pairs(), detector, repeats=2)
+    pairs = made_pairs()
+    figures = scoring_bench(pairs, ways(pairs, detector), repeats=2)
     assert list(figures["seconds"]) == ["c2c", "uncached", "cached"]
     assert isinstance(detector, CountingDetector)
     assert detector.encoded == 3  # once for the map, and with each of the two uncached scores

@@ -96,12 +96,17 @@ def evaluate(settings: PaperSettings, progress: Progress = no_progress) -> Paper
     chosen = experiments(settings.only)
     detector = open_model(settings.model_store, settings.model, settings.weights)
     log = training_log(settings.model_store, settings.model, settings.weights)
-    pipeline = PipelineSettings().for_model(detector.card.preprocessing)
+    needs = detector.card.preprocessing
+    by_voxels = needs.tiles == "touched"
+    # The stored reference is the dense tiles, as the paper has it, whatever the detector could score besides.
+    pipeline = PipelineSettings().for_model(needs.model_copy(update={"tiles": "dense"}))
     sites, carried_out = [], []
     for seed in (settings.site.seed, settings.validation_seed):
         site = build_site(replace(settings.site, seed=seed), pipeline, progress)
         sites.append(site)
-        carried_out.append(tuple(trials(site, chosen, progress, everywhere=settings.everywhere)))
+        carried_out.append(
+            tuple(trials(site, chosen, progress, everywhere=settings.everywhere, seen=by_voxels))
+        )
     caches = [CachedDetector(detector=detector) for _ in sites]
     progress(f"scoring by {settings.model}", 0.0)
     test, validation = (
@@ -111,7 +116,7 @@ def evaluate(settings: PaperSettings, progress: Progress = no_progress) -> Paper
     ours = _result(test, validation, sweep_all=False)
     baselines = _baselines(carried_out, progress)
     disturbed: tuple[RobustnessPoint, ...] = ()
-    if settings.robustness:
+    if settings.robustness and not by_voxels:  # what is disturbed are points of tiles, not what scans saw
         swept = chosen_trials(carried_out[0])
         disturbed = sweep_disturbances(sites[0], swept, caches[0], ours.threshold, progress)
     progress("embedding", 0.0)

@@ -7,8 +7,8 @@ Sections 3.5.1 and 4.2).
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cache
 from importlib.resources import files
 from typing import Any
@@ -18,9 +18,11 @@ import numpy as np
 from worker.benchmarks.paper.site import Site
 from worker.cloud.formats.scan import Scan
 from worker.cloud.poses import inverse, transformed
+from worker.cloud.seen import Seen
 from worker.cloud.tiling import TilePairs, pair_tiles
-from worker.cloud.types import Bools, Points
+from worker.cloud.types import Bools, Floats, Points
 from worker.cloud.voxels import Voxels, merged_in_order
+from worker.detectors.comparison import Comparison, Side, side_of
 from worker.pipeline.registration.preprocessing import prepare
 from worker.pipeline.registration.results import ScanRejected
 from worker.pipeline.registration.scan_to_map import register
@@ -151,39 +153,84 @@ class Trial:
     traces: tuple[Trace, ...]  #: what was changed in them
     current: Points  #: (M, 3) float32, the current map, map frame
     left_out: int  #: modified scans that could not be registered again
+    seen: tuple[Seen, Seen] | None = (
+        None  #: what the scans of the map and of the current map saw; if asked for
+    )
+
+    @property
+    def comparison(self) -> Comparison:
+        """The map and the current map side by side."""
+        first, second = self.seen or (None, None)
+        reference = replace(side_of(self.pairs.reference), seen=first)
+        return Comparison(
+            reference=reference, current=Side(points=self.current, seen=second), tile_pairs=self.pairs
+        )
+
+
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class PlacedPoints:
+    """A scan of a trial where it was registered."""
+
+    points: Points  #: (n, 3) float32, metres, map frame
+    sensor_origin: Floats  #: (3,) metres, map frame
 
 
 def trials(
-    site: Site, experiments: Sequence[Experiment], progress: Progress, *, everywhere: bool = False
+    site: Site,
+    experiments: Sequence[Experiment],
+    progress: Progress,
+    *,
+    everywhere: bool = False,
+    seen: bool = False,
 ) -> Iterator[Trial]:
-    """Carry out one experiment after the other; each holds some ten megabytes."""
+    """Carry out one experiment after the other; each holds some ten megabytes.
+
+    With `seen` each comes with what the scans saw, for detectors by voxels: one to two seconds more.
+    """
+    before = seen_by(site, {}) if seen else None
     for number, experiment in enumerate(experiments):
         progress(f"{site.name}: {experiment.name}", number / len(experiments))
-        yield _carried_out(site, experiment, inject(site, experiment, number, everywhere=everywhere))
+        yield _carried_out(site, experiment, inject(site, experiment, number, everywhere=everywhere), before)
 
 
-def _carried_out(site: Site, experiment: Experiment, injection: Injection) -> Trial:
-    changed = {scan: _voxels(site, scan, points) for scan, points in injection.scans.items()}
-    every = [changed.get(scan, voxels) for scan, voxels in enumerate(site.voxels)]
-    current = merged_in_order([voxels for voxels in every if voxels is not None]).points
+def seen_by(site: Site, changed: Mapping[int, PlacedPoints | None]) -> Seen:
+    """Return what all scans of the site saw, those that changed in place of what they were; None is left out."""
+    every = (changed[scan] if scan in changed else _placed(site, scan) for scan in range(len(site.scans)))
+    present = (scan for scan in every if scan is not None)
+    return Seen.of(present, voxel_size=site.settings.registration.voxel_size)
+
+
+def _placed(site: Site, scan: int) -> PlacedPoints:
+    return PlacedPoints(points=site.placed(scan), sensor_origin=site.poses[scan][:3, 3])
+
+
+def _carried_out(site: Site, experiment: Experiment, injection: Injection, before: Seen | None) -> Trial:
+    changed = {scan: _registered(site, scan, points) for scan, points in injection.scans.items()}
+    size = site.settings.registration.voxel_size
+    parts = {
+        scan: Voxels.of(placed.points, size=size) for scan, placed in changed.items() if placed is not None
+    }
+    every = [parts.get(scan, voxels) for scan, voxels in enumerate(site.voxels)]
+    left_out = changed.keys() - parts.keys()
+    current = merged_in_order([part for scan, part in enumerate(every) if scan not in left_out]).points
     return Trial(
         experiment=experiment,
         pairs=pair_tiles(site.tiles, current, settings=site.settings.tiling),
         truth=injection.truth,
         traces=injection.traces,
         current=current,
-        left_out=sum(voxels is None for voxels in every),
+        left_out=len(left_out),
+        seen=None if before is None else (before, seen_by(site, changed)),
     )
 
 
-def _voxels(site: Site, scan: int, points: Points) -> Voxels | None:
+def _registered(site: Site, scan: int, points: Points) -> PlacedPoints | None:
     """Register a modified scan (n, 3), map frame, to the map again, from where it stood; None where it is not accepted.
 
     Where poses are to be true ones it stays where it is.
     """
-    size = site.settings.registration.voxel_size
     if site.surface is None:
-        return Voxels.of(points, size=size)
+        return PlacedPoints(points=points, sensor_origin=site.poses[scan][:3, 3])
     own = transformed(points, inverse(site.poses[scan])).astype(np.float32)
     read = Scan(name=f"scan {scan}", points=own, colors=None, sensor_pose=np.eye(4), n_dropped=0)
     settings = site.settings.registration
@@ -193,4 +240,5 @@ def _voxels(site: Site, scan: int, points: Points) -> Voxels | None:
         )
     except ScanRejected:
         return None
-    return Voxels.of(transformed(own, hypothesis.target_from_source).astype(np.float32), size=size)
+    pose = hypothesis.target_from_source
+    return PlacedPoints(points=transformed(own, pose).astype(np.float32), sensor_origin=pose[:3, 3])

@@ -9,10 +9,18 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from worker.benchmarks.methods import CachedDetector, Method, TileScore, change_scores, encode_reference
+from worker.benchmarks.methods import (
+    CachedDetector,
+    Method,
+    TileScore,
+    change_scores,
+    encode_reference,
+    tile_scores,
+)
 from worker.benchmarks.paper.experiments import Trial
 from worker.cloud.tiling import Tiles
 from worker.cloud.types import Bools, Floats
+from worker.detectors.detector import Detector
 
 UNCHANGED_A_TRIAL = 15  #: of the many that are rightly left alone; the others are drawn all
 SEED = 42
@@ -41,14 +49,25 @@ class MethodScores:
 def scored_by_detector(name: str, cached: CachedDetector, trials: Sequence[Trial]) -> MethodScores:
     """Score every trial by the detector; its seconds are those of one map scored as a survey does it.
 
-    Nothing is kept for that but the reference embedding.
+    Nothing is kept for that but the reference embedding. A detector by voxels is given what the scans saw.
     """
+    if trials[0].seen is not None:
+        return _scored_by_voxels(name, cached.detector, trials)
     pairs = trials[0].pairs
     embedding = cached.embedding(pairs.reference)
     begun = time.perf_counter()
     change_scores(cached.detector, pairs, embedding)
     seconds = time.perf_counter() - begun
     return _method_scores(name, [cached.score(trial.pairs) for trial in trials], trials, seconds)
+
+
+def _scored_by_voxels(name: str, detector: Detector, trials: Sequence[Trial]) -> MethodScores:
+    scores, seconds = [], []
+    for trial in trials:
+        begun = time.perf_counter()
+        scores.append(tile_scores(detector, trial.comparison).change)
+        seconds.append(time.perf_counter() - begun)
+    return _method_scores(name, scores, trials, float(np.median(seconds)))
 
 
 def scored_by_baseline(baseline: Method, trials: Sequence[Trial]) -> MethodScores:

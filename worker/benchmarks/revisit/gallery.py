@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -10,17 +10,14 @@ from typing import Literal
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from worker.benchmarks import plots
 from worker.benchmarks.documents import Document
 from worker.benchmarks.plots import FOUND, MISSED, WRONG
 from worker.benchmarks.revisit.answers import Answers, PredictedObject
 from worker.benchmarks.revisit.measures import Measured
-from worker.benchmarks.revisit.plan import VisitPlan
-from worker.benchmarks.revisit.things import Things, is_true
-from worker.benchmarks.revisit.tiles import TileTable
-from worker.benchmarks.revisit.visits import Revisit, RevisitSite
+from worker.benchmarks.revisit.part import RevisitPart
+from worker.benchmarks.revisit.things import is_true
 from worker.cloud.types import Floats
 from worker.cloud.voxel_keys import Keys, centers
 from worker.simulation.hits import Visit
@@ -43,34 +40,24 @@ class Mistake:
     note: str
 
 
-def draw_gallery(
-    folder: Path,
-    plans: Sequence[VisitPlan],
-    visits: Sequence[Revisit],
-    sites: Mapping[str, RevisitSite],
-    table: TileTable,
-    things: Things,
-    measured: Measured,
-    answers: Answers,
-) -> list[Document]:
+def draw_gallery(folder: Path, part: RevisitPart, measured: Measured, answers: Answers) -> list[Document]:
     """Draw the ten worst misses of tiles and of objects, all false objects, and all false tiles of quiet visits.
 
     Each of the first 80 is one PNG in `errors` of the folder; returns what all of them are, with the pictures' names.
     Raises OSError.
     """
+    for old in (folder / FOLDER).glob("*.png"):
+        old.unlink()
     documents = []
-    mistakes = _mistakes(visits, sites, plans, table, things, measured, answers)
-    for number, mistake in enumerate(mistakes, start=1):
-        plan, revisit = plans[mistake.visit], visits[mistake.visit]
+    for number, mistake in enumerate(_mistakes(part, measured, answers), start=1):
         name = f"{FOLDER}/{number:03d}-{mistake.what.replace(' ', '-')}.png"
         if number <= DRAWN:
             told = answers.visits[mistake.visit].objects or ()
-            title = f"{mistake.what}, {plan.name}: {mistake.note}"
-            plots.save(_figure(sites[plan.site.name], revisit, mistake, told, title), folder / name)
+            plots.save(_figure(part, mistake, told), folder / name)
         documents.append(
             {
                 "what": mistake.what,
-                "visit": plan.name,
+                "visit": part.plans[mistake.visit].name,
                 "voxels": len(mistake.keys),
                 "middle": centers(mistake.keys, CELL).mean(axis=0).round(2).tolist(),
                 "note": mistake.note,
@@ -80,101 +67,83 @@ def draw_gallery(
     return documents
 
 
-def _mistakes(
-    visits: Sequence[Revisit],
-    sites: Mapping[str, RevisitSite],
-    plans: Sequence[VisitPlan],
-    table: TileTable,
-    things: Things,
-    measured: Measured,
-    answers: Answers,
-) -> Iterator[Mistake]:
-    yield from _worst(_missed_objects(things, measured))
-    yield from _worst(_missed_tiles(visits, sites, plans, table, measured))
-    yield from _false_objects(visits, answers)
-    yield from _false_tiles(visits, sites, plans, table, measured)
+def _mistakes(part: RevisitPart, measured: Measured, answers: Answers) -> Iterator[Mistake]:
+    yield from _worst(_missed_objects(part, measured))
+    yield from _worst(_missed_tiles(part, measured))
+    yield from _false_objects(part, answers)
+    yield from _false_tiles(part, measured)
 
 
 def _worst(mistakes: Iterator[Mistake]) -> list[Mistake]:
     return sorted(mistakes, key=lambda mistake: -mistake.weight)[:WORST]
 
 
-def _missed_objects(things: Things, measured: Measured) -> Iterator[Mistake]:
+def _missed_objects(part: RevisitPart, measured: Measured) -> Iterator[Mistake]:
     if measured.objects is None:
         return
     for row in np.flatnonzero(~measured.objects.found).tolist():
-        region = things.regions[row]
+        region = part.things.regions[row]
         side = "gone" if region.side is Visit.FIRST else "come"
-        note = f"{region.kind}, {side}, {len(region.keys)} voxels, {region.size:.2f} m"
+        count = len(region.keys)
+        note = f"{region.kind}, {side}, {count} voxels, {region.size:.2f} m"
+        yield Mistake(what="missed object", visit=region.visit, keys=region.keys, weight=count, note=note)
+
+
+def _missed_tiles(part: RevisitPart, measured: Measured) -> Iterator[Mistake]:
+    missed = part.tiles.changed & ~(measured.scores > measured.chosen.threshold)
+    for row in np.flatnonzero(missed).tolist():
+        cells, score = int(part.tiles.cells[row].sum()), measured.scores[row]
+        told = "no score" if np.isnan(score) else f"score {score:.3g}"
         yield Mistake(
-            what="missed object", visit=region.visit, keys=region.keys, weight=len(region.keys), note=note
+            what="missed tile",
+            visit=int(part.tiles.visit[row]),
+            keys=_keys_in_tile(row, part),
+            weight=cells,
+            note=f"{cells} changed voxels, {told}",
         )
 
 
-def _missed_tiles(
-    visits: Sequence[Revisit],
-    sites: Mapping[str, RevisitSite],
-    plans: Sequence[VisitPlan],
-    table: TileTable,
-    measured: Measured,
-) -> Iterator[Mistake]:
-    missed = table.changed & ~(measured.scores > measured.chosen.threshold)
-    for row in np.flatnonzero(missed).tolist():
-        number = int(table.visit[row])
-        cells, score = int(table.cells[row].sum()), measured.scores[row]
-        told = "no score" if np.isnan(score) else f"score {score:.3g}"
-        keys = _keys_in_tile(row, table, visits[number], sites[plans[number].site.name])
-        note = f"{cells} changed voxels, {told}"
-        yield Mistake(what="missed tile", visit=number, keys=keys, weight=cells, note=note)
-
-
-def _false_objects(visits: Sequence[Revisit], answers: Answers) -> Iterator[Mistake]:
+def _false_objects(part: RevisitPart, answers: Answers) -> Iterator[Mistake]:
     for number, answer in enumerate(answers.visits):
         for thing in answer.objects or ():
-            if not is_true(thing, visits[number]):
-                note = f"{thing.kind}, {len(thing.keys)} voxels, P {thing.probability:.2f}"
-                yield Mistake(
-                    what="false object", visit=number, keys=thing.keys, weight=len(thing.keys), note=note
-                )
+            if not is_true(thing, part.visits[number]):
+                count = len(thing.keys)
+                note = f"{thing.kind}, {count} voxels, P {thing.probability:.2f}"
+                yield Mistake(what="false object", visit=number, keys=thing.keys, weight=count, note=note)
 
 
-def _false_tiles(
-    visits: Sequence[Revisit],
-    sites: Mapping[str, RevisitSite],
-    plans: Sequence[VisitPlan],
-    table: TileTable,
-    measured: Measured,
-) -> Iterator[Mistake]:
+def _false_tiles(part: RevisitPart, measured: Measured) -> Iterator[Mistake]:
+    table = part.tiles
     flagged = (measured.scores > measured.chosen.threshold) & table.counted & ~table.changed & table.quiet
     for row in np.flatnonzero(flagged).tolist():
-        number = int(table.visit[row])
-        keys = _keys_in_tile(row, table, visits[number], sites[plans[number].site.name])
         score = float(measured.scores[row])
-        yield Mistake(what="false tile", visit=number, keys=keys, weight=score, note=f"score {score:.3g}")
+        yield Mistake(
+            what="false tile",
+            visit=int(table.visit[row]),
+            keys=_keys_in_tile(row, part),
+            weight=score,
+            note=f"score {score:.3g}",
+        )
 
 
-def _keys_in_tile(row: int, table: TileTable, revisit: Revisit, site: RevisitSite) -> Keys:
+def _keys_in_tile(row: int, part: RevisitPart) -> Keys:
     """Return the decidable changed voxels in a tile, or where it has none, what either visit hit there."""
-    first = int(np.flatnonzero(table.visit == table.visit[row])[0])
+    number = int(part.tiles.visit[row])
+    site, revisit = part.site_of(number), part.visits[number]
+    first = int(np.flatnonzero(part.tiles.visit == number)[0])
     grid, tile = site.reference.grid, revisit.tiles[row - first]
 
-    def inside(keys: Keys) -> NDArray[np.bool_]:
+    def inside(keys: Keys) -> Keys:
         places = np.floor((centers(keys, CELL) - grid.origin) / grid.size)
-        within: NDArray[np.bool_] = np.all(places == tile, axis=1)
-        return within
+        return keys[np.all(places == tile, axis=1)]
 
-    changed = revisit.truth.decidable_keys()
-    chosen = changed[inside(changed)]
-    if len(chosen):
-        return chosen
-    both = np.union1d(site.seen.keys, revisit.seen.keys)
-    return both[inside(both)]
+    changed = inside(revisit.truth.decidable_keys())
+    return changed if len(changed) else np.union1d(inside(site.seen.keys), inside(revisit.seen.keys))
 
 
-def _figure(
-    site: RevisitSite, revisit: Revisit, mistake: Mistake, told: Sequence[PredictedObject], title: str
-) -> Figure:
+def _figure(part: RevisitPart, mistake: Mistake, told: Sequence[PredictedObject]) -> Figure:
     """Draw the place from above and from the side: the map grey, the survey blue, truth green, what was told red."""
+    site, revisit = part.site_of(mistake.visit), part.visits[mistake.visit]
     places = centers(mistake.keys, CELL)
     low, high = places.min(axis=0) - AROUND, places.max(axis=0) + AROUND
     figure = Figure(figsize=(10, 5), dpi=90, layout="constrained")
@@ -197,6 +166,7 @@ def _figure(
         across_names = ["xyz"[axis] for axis in across]
         plots.label(axes, f"seen from {side}: {across_names[0]} (m)", f"{across_names[1]} (m)", legend=False)
     figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=5, frameon=False)
+    title = f"{mistake.what}, {part.plans[mistake.visit].name}: {mistake.note}"
     figure.suptitle(title, fontsize=10, x=0.01, ha="left")
     return figure
 

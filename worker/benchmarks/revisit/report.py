@@ -29,6 +29,7 @@ TITLES = {
 OBJECT_TITLES = {
     "kind": "kind of change",
     "voxels": "decidable voxels",
+    "size": "longest edge of the thing",
     "case": "second visit",
     "building": "building",
 }
@@ -106,8 +107,9 @@ def _objects(rows: Sequence[Document], title: str) -> Table | None:
         "method", "recall (95%)", "precision (95%)", "false objects", "a quiet visit", "quiet visits with one",
         "moved, told as moved", "ECE of voxels",
     )  # fmt: skip
-    regions = told[0]["objects"]["regions"]
-    return titled_table(f"{title}: {regions} regions of 40 decidable voxels", columns, map(_object_row, told))
+    regions, least = told[0]["objects"]["regions"], told[0]["objects"]["min_voxels"]
+    title = f"{title}: {regions} regions of {least} decidable voxels or more"
+    return titled_table(title, columns, map(_object_row, told))
 
 
 def _object_row(row: Document) -> tuple[str, ...]:
@@ -151,7 +153,8 @@ def _object_groups(rows: Sequence[Document], title: str) -> Table | None:
         table.add_row(heading, style="bold")
         for group in told[0]["objects"]["groups"][by]:
             cells = [row["objects"]["groups"][by][group] for row in told]
-            table.add_row(f"  {group}", *(f"{cell['found']} of {cell['regions']}" for cell in cells))
+            if cells[0]["regions"]:
+                table.add_row(f"  {group}", *(f"{cell['found']} of {cell['regions']}" for cell in cells))
     return table
 
 

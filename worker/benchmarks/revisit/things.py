@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 from worker.benchmarks.documents import Document
 from worker.benchmarks.revisit.answers import PredictedObject, VisitAnswer
 from worker.benchmarks.revisit.plan import VisitPlan
+from worker.benchmarks.revisit.tiles import binned
 from worker.benchmarks.revisit.visits import Revisit
 from worker.cloud.types import Bools
 from worker.cloud.voxel_keys import Keys, near
@@ -19,16 +19,18 @@ from worker.simulation.hits import Visit
 from worker.simulation.truth import KINDS
 
 MIN_VOXELS = 40  #: decidable voxels of a region that is to be found, and voxels of an object that is counted
+HARD_MIN_VOXELS = 12  #: the same in the hard part, whose small things have 12 to 30
 COVERED = 0.25  #: share of a region's voxels that one object has to cover
 TRUE = 0.5  #: share of an object's voxels that has to lie by a true change
 MATCH, NEARBY = 1, 2  #: voxels; poses are off by a centimetre, and so are the surfaces
-#: Voxels, edges of bins by a region's size.
-SIZES = (MIN_VOXELS, 100, 250, 600, np.inf)
+#: Edges of bins, by the decidable voxels of a region and by the longest edge of its thing in metres.
+VOXEL_EDGES = (HARD_MIN_VOXELS, MIN_VOXELS, 100, 250, 600, np.inf)
+SIZE_EDGES = (0.0, 0.2, 0.4, 0.7, 1.0, 1.5, np.inf)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
 class TrueRegion:
-    """A place where an edited thing stands in one visit only."""
+    """A place where an edited thing stands in one visit only, of any size."""
 
     visit: int  #: number of the second visit
     object_id: int
@@ -42,10 +44,11 @@ class TrueRegion:
 class Things:
     """What there was to find in some visits."""
 
-    regions: tuple[TrueRegion, ...]  #: of at least 40 decidable voxels
+    regions: tuple[TrueRegion, ...]  #: of at least `min_voxels` decidable voxels
     case: tuple[str, ...]  #: of each visit
     building: tuple[str, ...]  #: of each visit
     quiet: tuple[bool, ...]  #: of each visit: nothing was edited
+    min_voxels: int  #: of a region, and of an object that is counted
 
     @property
     def moved(self) -> tuple[tuple[int, int], ...]:
@@ -62,7 +65,6 @@ class Things:
 
     def groups(self) -> dict[str, dict[str, Bools]]:
         """Return the regions (R,) of each group, by what they are grouped by."""
-        sizes = np.array([len(region.keys) for region in self.regions])
         columns = {
             "kind": [f"{region.kind}, {_gone_or_come(region.side)}" for region in self.regions],
             "case": [self.case[region.visit] for region in self.regions],
@@ -72,17 +74,18 @@ class Things:
             by: {name: np.array([one == name for one in names]) for name in dict.fromkeys(sorted(names))}
             for by, names in columns.items()
         }
-        edges = itertools.pairwise(SIZES)
-        groups["voxels"] = {
-            f"over {low:g}" if np.isinf(high) else f"{low:g} to {high:g}": (sizes >= low) & (sizes < high)
-            for low, high in edges
+        voxels = np.array([len(region.keys) for region in self.regions], np.float64)
+        metres = np.array([region.size for region in self.regions], np.float64)
+        return {
+            **groups,
+            "voxels": binned(voxels, VOXEL_EDGES, "{:g}"),
+            "size": binned(metres, SIZE_EDGES, "{:g} m"),
         }
-        return groups
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
 class ObjectFigures:
-    """What a method found of the regions (R,), and its objects (P,) of at least 40 voxels in all visits."""
+    """What a method found of the regions (R,), and its objects (P,) that are large enough, in all visits."""
 
     found: Bools  #: (R,)
     told_moved: Bools  #: (M,) of `Things.moved`, told as one thing that moved
@@ -95,6 +98,7 @@ class ObjectFigures:
         quiet = np.array(things.quiet)
         false = np.bincount(self.of_visit[~self.true], minlength=len(quiet))
         return {
+            "min_voxels": things.min_voxels,
             "regions": len(self.found),
             "recall": _share(self.found),
             "objects": len(self.true),
@@ -115,11 +119,17 @@ class ObjectFigures:
         }
 
 
-def things_of(plans: Sequence[VisitPlan], visits: Sequence[Revisit]) -> Things:
-    """List what there was to find."""
+def things_of(
+    plans: Sequence[VisitPlan], visits: Sequence[Revisit], *, min_voxels: int = MIN_VOXELS
+) -> Things:
+    """List what there was to find: regions of at least so many decidable voxels."""
     return Things(
+        min_voxels=min_voxels,
         regions=tuple(
-            region for number, revisit in enumerate(visits) for region in _regions(number, revisit)
+            region
+            for number, revisit in enumerate(visits)
+            for region in _regions(number, revisit)
+            if len(region.keys) >= min_voxels
         ),
         case=tuple(plan.case for plan in plans),
         building=tuple(plan.site.kind for plan in plans),
@@ -133,17 +143,16 @@ def _regions(number: int, revisit: Revisit) -> list[TrueRegion]:
     for thing in truth.things:
         for side in Visit:
             keys = np.unique(truth.keys[truth.rows(side, thing.object_id)])
-            if len(keys) >= MIN_VOXELS:
-                regions.append(
-                    TrueRegion(
-                        visit=number,
-                        object_id=thing.object_id,
-                        side=side,
-                        kind=KINDS[thing.kind],
-                        size=thing.size,
-                        keys=keys,
-                    )
+            regions.append(
+                TrueRegion(
+                    visit=number,
+                    object_id=thing.object_id,
+                    side=side,
+                    kind=KINDS[thing.kind],
+                    size=thing.size,
+                    keys=keys,
                 )
+            )
     return regions
 
 
@@ -158,7 +167,7 @@ def object_figures(
         (number, thing, is_true(thing, visits[number]))
         for number, objects in told.items()
         for thing in objects
-        if len(thing.keys) >= MIN_VOXELS
+        if len(thing.keys) >= things.min_voxels
     ]
     return ObjectFigures(
         found=np.array([is_found(region, told[region.visit]) for region in things.regions], bool),

@@ -111,6 +111,21 @@ def test_a_removal_everywhere_leaves_fewer_voxels_than_one_in_a_single_scan(site
     assert len(everywhere.current) < len(alone.current) < len(site.points)
 
 
+def test_with_what_was_seen_the_same_tiles_come_with_the_hits_and_range_images_of_all_scans(
+    site: Site,
+) -> None:
+    nothing, removed = trials(site, [NOTHING, ONE], no_progress, seen=True)
+    assert nothing.seen is not None
+    assert removed.seen is not None
+    (before, same), (also, after) = nothing.seen, removed.seen
+    assert also is before
+    assert removed.comparison.current.seen is after
+    assert all(seen.sights is not None and len(seen.sights) == 3 for seen in (before, same, after))
+    assert before.hits.sum() == sum(map(len, site.scans))
+    assert before.hits.sum() - after.hits.sum() == 0.35 * POINTS
+    assert np.array_equal(same.keys, before.keys)
+
+
 def test_an_experiment_that_the_paper_has_not_is_refused() -> None:
     with pytest.raises(ValueError, match="no experiment fog; there are magnitude_5cm"):
         experiments(("fog", "type_add"))

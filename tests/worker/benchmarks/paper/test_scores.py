@@ -7,11 +7,12 @@ import pytest
 
 from tests.support.detectors import CountingDetector
 from tests.worker.benchmarks.paper.test_experiments import NOTHING, ONE
-from worker.benchmarks.methods import CachedDetector
+from worker.benchmarks.methods import CachedDetector, open_model
 from worker.benchmarks.paper.experiments import trials
 from worker.benchmarks.paper.scores import outcomes_of, principal, scored_by_detector
 from worker.benchmarks.paper.site import Site
 from worker.cloud.tiling import TilePairs
+from worker.detectors.card import MODEL_STORE
 from worker.progress import no_progress
 
 
@@ -26,6 +27,15 @@ def test_only_tiles_with_new_points_are_scored_again(site: Site) -> None:
     expected = 1 - len(carried_out[1].pairs.current[tile]) / len(site.tiles.points[tile])
     assert expected > 0
     assert method.scores[1][tile] == pytest.approx(expected, abs=1e-6)
+
+
+def test_a_detector_by_voxels_is_given_what_the_scans_saw(site: Site) -> None:
+    carried_out = list(trials(site, [NOTHING, ONE], no_progress, seen=True))
+    cached = CachedDetector(detector=open_model(MODEL_STORE, "voxel-rule/1"))
+    method = scored_by_detector("voxel-rule/1", cached, carried_out)
+    assert [len(scores) for scores in method.scores] == [4, 4]
+    assert np.nan_to_num(method.scores[0]).max() < 0.5
+    assert method.seconds > 0
 
 
 def test_a_tile_that_was_not_observed_has_no_score(site: Site) -> None:

@@ -12,7 +12,7 @@ from rich.console import Console
 from tests.worker.benchmarks.revisit.conftest import SEED, TINY
 from tests.worker.benchmarks.revisit.test_answers import by_voxels
 from worker.benchmarks.methods import RevisitMethod
-from worker.benchmarks.revisit import benchmark, gallery
+from worker.benchmarks.revisit import benchmark, gallery, part
 from worker.benchmarks.revisit.plan import CASES, RevisitSettings, plan_visits
 from worker.benchmarks.revisit.report import tables
 from worker.benchmarks.revisit.tiles import tile_table
@@ -30,7 +30,7 @@ def heights(comparison: Comparison) -> Detection:
 def out(visits_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The benchmark's folder, the visits already in it."""
     folder = tmp_path_factory.mktemp("out")
-    (folder / benchmark.VISITS).symlink_to(visits_folder)
+    (folder / part.VISITS).symlink_to(visits_folder)
     return folder
 
 
@@ -91,7 +91,7 @@ def test_the_hard_part_is_counted_by_itself(result: dict):
 def test_pictures_are_drawn_and_those_of_mistakes_are_listed(out: Path, result: dict):
     names = sorted(path.name for path in out.glob("*.png"))
     assert names == ["curves.png", "recall.png", "reliability.png"]
-    listed = result["methods"][0]["test_errors"]
+    listed = result["methods"][0]["errors"]
     assert "false object" in {row["what"] for row in listed}
     drawn = [out / "test" / row["picture"] for row in listed if row["picture"]]
     assert len(drawn) == 3 < len(listed)

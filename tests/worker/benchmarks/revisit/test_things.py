@@ -7,7 +7,7 @@ import pytest
 
 from worker.benchmarks.revisit.answers import PredictedObject, VisitAnswer
 from worker.benchmarks.revisit.plan import RevisitSettings, plan_visits
-from worker.benchmarks.revisit.things import object_figures, things_of
+from worker.benchmarks.revisit.things import HARD_MIN_VOXELS, object_figures, things_of
 from worker.cloud.voxel_keys import packed, unpacked
 from worker.simulation.hits import Visit
 
@@ -79,6 +79,19 @@ def test_regions_of_fewer_than_forty_decidable_voxels_are_nobodys_to_find(figure
     _, things = figures(changes, [])
     assert [(region.kind, len(region.keys)) for region in things.regions] == [("remove", 40)]
     assert list(things.groups()["kind"]) == ["remove, gone"]
+
+
+def test_in_the_hard_part_smaller_ones_are_to_be_found(made_visit, upright):
+    (plan,) = plan_visits(1, RevisitSettings(kinds=("room",)), first_seed=1)
+    changes = [(upright(tile, count), "add", Visit.SECOND, True) for tile, count in enumerate((11, 12, 39))]
+    visit = made_visit(plan.name, tiles=4, changes=changes)
+    things = things_of([plan], [visit], min_voxels=HARD_MIN_VOXELS)
+    assert [len(region.keys) for region in things.regions] == [12, 39]
+    told_of = [told(now=upright(3, count)) for count in (11, 12)]
+    answer = VisitAnswer(scores=np.zeros(4), objects=tuple(told_of), reliability=None)
+    figures = object_figures(things, [visit], [answer])
+    assert figures is not None
+    assert len(figures.true) == 1
 
 
 def test_an_object_is_true_if_half_of_it_lies_within_two_voxels_of_a_change_decidable_or_not(
