@@ -19,7 +19,7 @@ from matplotlib.patches import Patch, Rectangle
 from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
-from worker.cloud.types import Points
+from worker.cloud.types import Bools, Points
 from worker.cloud.voxel_keys import centers
 from worker.files import write_atomically
 from worker.pipeline.results.changes import ChangeSet, TileState
@@ -88,7 +88,7 @@ def dress(figure: Figure, axes: Axes, extent: Extent, changes: ChangeSet, title:
         fontsize=8,
         frameon=False,
     )
-    dashed = "" if changes.objects is None else "dashed: where it was; "
+    dashed = "" if changes.objects is None else "dashed: where it was; tiles with stray points are left out; "
     note = (
         f"seen from above, between 0.15 and 2 m over the floor; {dashed}"
         "of tiles above each other the first in this list is drawn"
@@ -140,7 +140,7 @@ _DARKEST_WALL = 0.5  # grey of the map, so that ink on it is seen at once
 _ROOM_FOR_ID = 0.75  # inches; a smaller tile shows its score alone
 _WIDEST, _HIGHEST, _NARROWEST = 11.0, 9.0, 6.5  # inches of the map's part of the picture
 _LOWEST = 2.5  # inches, where objects are listed beside it
-_STRAY = 20  # points; a tile with fewer does not widen the picture
+_STRAY = 0.1  # of the points of a full tile; one with fewer neither widens the picture nor is drawn in it
 
 
 def draw_picture(path: Path, reference: Points, current: Points, changes: ChangeSet, *, title: str) -> None:
@@ -175,15 +175,24 @@ def draw_picture(path: Path, reference: Points, current: Points, changes: Change
 
 
 def _extent(changes: ChangeSet) -> Extent:
-    """Return left, right, bottom, top in metres: all tiles with more than stray points, and half a metre around."""
+    """Return left, right, bottom, top in metres: all tiles that tell something, and half a metre around."""
     tiles = changes.pairs.reference
     lower = tiles.grid.lower(tiles.indices)
-    counts = [len(a) + len(b) for a, b in zip(tiles.points, changes.pairs.current, strict=True)]
-    dense = np.array(counts) >= _STRAY
-    lower = lower[dense] if dense.any() else lower
+    told = _telling(changes)
+    lower = lower[told] if told.any() else lower
     left, bottom = lower[:, :2].min(axis=0) - 0.5
     right, top = (lower + tiles.grid.size)[:, :2].max(axis=0) + 0.5
     return float(left), float(right), float(bottom), float(top)
+
+
+def _telling(changes: ChangeSet) -> Bools:
+    """Tell (T,) which tiles have changed, or hold more than what was seen through a window or beside a mirror."""
+    counts = np.array(
+        [len(a) + len(b) for a, b in zip(changes.pairs.reference.points, changes.pairs.current, strict=True)]
+    )
+    few = _STRAY * np.percentile(counts, 90) if len(counts) else 0.0
+    telling: Bools = (counts >= few) | (changes.states == TileState.CHANGED)
+    return telling
 
 
 def _draw_walls(axes: Axes, reference: Points, current: Points, extent: Extent, *, with_news: bool) -> None:
@@ -239,11 +248,11 @@ def _near(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
 def _draw_tiles(axes: Axes, changes: ChangeSet, *, tile_inches: float) -> None:
     tiles = changes.pairs.reference
     lower = tiles.grid.lower(tiles.indices)
-    faint = changes.objects is not None
+    faint, told = changes.objects is not None, _telling(changes)
     for row in _topmost(changes):
         state = TileState(int(changes.states[row]))
         changed = state is TileState.CHANGED
-        if faint and state not in FAINT:
+        if faint and (state not in FAINT or not told[row]):
             continue
         color, (fill, hatch) = color_of(state), (FAINT if faint else STYLES)[state]
         edge = (0.6, 0.6, 0.6, 0.35) if state is TileState.UNCHANGED else (*color, 0.35 if faint else 1.0)

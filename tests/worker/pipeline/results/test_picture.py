@@ -177,6 +177,26 @@ def test_a_picture_of_many_objects_is_made_and_counts_those_that_are_not_listed(
     assert 800 < columns < 2400
 
 
+def test_a_few_points_through_a_window_do_not_widen_the_picture(tmp_path: Path) -> None:
+    near = with_objects(thing(1, now=place(1.0, 0.7)))
+    full = tuple(np.repeat(points, 1000, axis=0) for points in near.pairs.reference.points)
+    far = np.concatenate([near.pairs.reference.indices, [[40, 30, 0]]]).astype(np.int32)
+    stray = np.full((3, 3), 50.0, np.float32)
+    pairs = TilePairs(
+        reference=replace(near.pairs.reference, indices=far, points=(*full, stray)),
+        current=(*full, stray),
+        observed=np.append(near.pairs.observed, False),
+    )
+    windowed = replace(
+        near,
+        pairs=pairs,
+        probabilities=np.concatenate([near.probabilities, near.probabilities[:1]]),
+        states=np.append(near.states, TileState.UNOBSERVED).astype(np.uint8),
+    )
+    sizes = [drawn(tmp_path / "p.png", each).shape for each in (near, windowed)]
+    assert sizes[0] == sizes[1]
+
+
 def test_the_head_counts_objects_and_what_moved_meanwhile() -> None:
     said = summary(with_objects(thing(1, now=place(1, 0.7))))
     assert said == "1 object changed, in 1 of 4 tiles; 2 more moved during the visit"
