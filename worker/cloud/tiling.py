@@ -63,10 +63,14 @@ class TileGrid:
 
     def cells(self, indices: NDArray[np.integer[Any]]) -> NDArray[np.int64]:
         """Return (T,) the cell of each tile (T, 3); -1 outside the grid."""
-        place = indices.astype(np.int64) - self.lowest
-        inside = np.all((place >= 0) & (place < self.shape), axis=1)
-        cells = np.full(len(place), -1, np.int64)
-        cells[inside] = np.ravel_multi_index(tuple(place[inside].T), self.shape)
+        cells = np.zeros(len(indices), np.int64)
+        inside = np.ones(len(indices), bool)
+        for axis, (lowest, count) in enumerate(zip(self.lowest, self.shape, strict=True)):  # faster than by rows
+            place = indices[:, axis].astype(np.int64) - lowest
+            inside &= (place >= 0) & (place < count)
+            cells *= count
+            cells += place
+        cells[~inside] = -1
         return cells
 
     def locate_among(self, points: Points | Floats, indices: Indices) -> NDArray[np.int64]:
@@ -130,8 +134,9 @@ def grown(grid: TileGrid, points: Points) -> TileGrid:
 
 
 def _spanned(points: Points, origin: Floats, size: Floats) -> TileGrid:
-    low = np.floor((points.min(axis=0) - origin) / size).astype(np.int64)
-    count = np.floor((points.max(axis=0) - origin) / size).astype(np.int64) + 1 - low
+    least, most = (np.array([end(points[:, axis]) for axis in range(3)]) for end in (np.min, np.max))
+    low = np.floor((least - origin) / size).astype(np.int64)
+    count = np.floor((most - origin) / size).astype(np.int64) + 1 - low
     if count.prod() > _MOST_TILES:
         extent = " x ".join(f"{edge:.0f}" for edge in count * size)
         raise MapFailed(f"the map spans {extent} m; remove stray points, or cut it into several maps")

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from service.catalog import blob_keys
 from service.catalog.records import ModelRecord, VersionRecord
@@ -31,7 +30,14 @@ from worker.pipeline.alarms import region_scores, rest_of, visits_of
 from worker.training.voxels.insertion import SiteSettings, site_samples
 from worker.training.voxels.publish import site_network
 from worker.training.voxels.samples import MISSING, SampleSet, VoxelSample
-from worker.training.voxels.trainer import BEST, CHECKPOINT, LOG, VoxelTrainSettings, train_network
+from worker.training.voxels.trainer import (
+    BEST,
+    CHECKPOINT,
+    LOG,
+    VoxelTrainSettings,
+    load_checkpoint,
+    train_network,
+)
 
 DETECTOR = "voxel-net"
 SHIPPED = (
@@ -100,7 +106,7 @@ class VoxelTraining:
         kind = _kind_of(samples)
         base = weights_of(kept_detector(context, self.base))
         networks = {name: self._network(weights_under(name, base)) for name in (SEEING, BLIND)}
-        state = torch.load(folder / BEST.format(kind), map_location="cpu", weights_only=True)
+        state = load_checkpoint(folder / BEST.format(kind))
         held_out = [sample for sample in samples if sample.building % TRAINING.held_out == 0]
         held_out = [sample for sample in held_out if sample.free_space == (kind == SEEING)]
         networks[kind], figures = site_network(networks[kind], self._network(state["network"]), held_out)

@@ -260,6 +260,12 @@ class _Run:
             writer.writerow(asdict(row))
 
 
+def load_checkpoint(path: Path) -> dict[str, Any]:
+    """Read what a training kept: settings, network, seconds, and what was measured. Raises OSError."""
+    state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
+    return state
+
+
 def voxel_loss(logits: Tensor, labels: Tensor, *, dice: float) -> Tensor:
     """Return binary cross-entropy over the voxels (N,) whose truth is known, and the soft Dice loss by its weight."""
     known = labels != UNKNOWN
