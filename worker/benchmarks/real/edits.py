@@ -106,7 +106,7 @@ def real_things(scan: RealScan) -> list[CloudObject]:
         chosen[label == number]
         for number in np.flatnonzero(np.bincount(label, minlength=count) >= _THING_POINTS)
     ]
-    return [CloudObject.of(part) for part in parts if _is_thing(part)]
+    return [CloudObject.of(part, spacing=VOXEL) for part in parts if _is_thing(part)]
 
 
 def _is_thing(points: Points) -> bool:

@@ -40,18 +40,7 @@ def draw_visits(folder: Path, visits: TwoVisits, answers: Sequence[Answer]) -> N
 
 def draw_edited(folder: Path, edited: EditedVisits, answer: Answer) -> None:
     """Write `edited-NAME.png`: what was put in, and what the model found of it. Raises OSError."""
-    figure = Figure(figsize=(7, 6), dpi=80, layout="constrained")
-    axes = figure.add_subplot()
-    _plan(axes, edited.visits)
-    for region in edited.regions:
-        _dots(axes, region.hit, "#90caf9", size=4)
-        _dots(axes, region.decidable, MAP, size=4)
-    for thing in answer.objects or ():
-        _outline(axes, thing.change)
-    axes.set_title(
-        f"{edited.visits.name}\n{answer.model}; blue: put in (dark: decidable)", fontsize=8, loc="left"
-    )
-    plots.save(figure, folder / f"edited-{file_name(edited.visits.name)}.png")
+    plots.save(edited_plan(edited, answer), folder / f"edited-{file_name(edited.visits.name)}.png")
 
 
 def file_name(name: str) -> str:
@@ -76,6 +65,22 @@ def plans(visits: TwoVisits, answers: Sequence[Answer]) -> Figure:
             f"{answer.model}: {objects}, {counts['changed']} tiles changed", fontsize=9, loc="left"
         )
     figure.suptitle(visits.name, fontsize=11, x=0.01, ha="left", weight="bold")
+    return figure
+
+
+def edited_plan(edited: EditedVisits, answer: Answer) -> Figure:
+    """Draw what was put in, from above, blue and where the other visit decides it dark; and the objects of a model."""
+    figure = Figure(figsize=(7, 6), dpi=80, layout="constrained")
+    axes = figure.add_subplot()
+    _plan(axes, edited.visits)
+    for region in edited.regions:
+        _dots(axes, region.hit, "#90caf9", size=4)
+        _dots(axes, region.decidable, MAP, size=4)
+    for thing in answer.objects or ():
+        _outline(axes, thing.change)
+    axes.set_title(
+        f"{edited.visits.name}\n{answer.model}; blue: put in (dark: decidable)", fontsize=8, loc="left"
+    )
     return figure
 
 

@@ -144,16 +144,21 @@ class CloudObject:
 
     points: Floats  #: (N, 3) metres, map frame; at least two
     middle: Floats  #: (3,) metres: the middle of the box around them
-    spacing: float  #: metres from a point to its nearest neighbour, all but a tenth of them less
+    spacing: float  #: metres between points of one surface, or less
 
     @classmethod
-    def of(cls, points: NDArray[Any]) -> Self:
-        """Take the points (N, 3) of a thing, metres. Raises ValueError for fewer than two."""
+    def of(cls, points: NDArray[Any], *, spacing: float | None = None) -> Self:
+        """Take the points (N, 3) of a thing, metres. Raises ValueError for fewer than two.
+
+        Say the spacing of a scanner whose lines lie farther apart than the points of a line, or one sees through
+        between them.
+        """
         if len(points) < 2:
             raise ValueError(f"an object of {len(points)} points has no surface; give at least two")
         exact = np.asarray(points, np.float64)
-        nearest, _ = cKDTree(exact).query(exact, k=2)
-        spacing = float(np.percentile(nearest[:, 1], 90))
+        if spacing is None:
+            nearest, _ = cKDTree(exact).query(exact, k=2)
+            spacing = float(np.percentile(nearest[:, 1], 90))
         return cls(points=exact, middle=(exact.min(axis=0) + exact.max(axis=0)) / 2, spacing=spacing)
 
     @property

@@ -147,6 +147,14 @@ def test_a_cloud_is_met_where_its_points_are_and_has_no_holes_between_them() -> 
     assert told(cloud, (2, 0.36, 0), (2, 0, -0.36), (-1, 0, 0)) == [np.inf] * 3
 
 
+def test_between_the_lines_of_a_scanner_one_does_not_see_through_if_their_spacing_is_said() -> None:
+    lines = plate(2.0, 0.3, 0.01)
+    lines = lines[np.abs(np.round(lines[:, 2] / 0.06) * 0.06 - lines[:, 2]) < 1e-6]  # 6 cm from line to line
+    rays = ahead(*[(2.0, 0.0, z) for z in np.linspace(-0.28, 0.28, 57)])
+    assert np.isinf(CloudObject.of(lines).ranges(HERE, rays)).any()
+    assert np.isfinite(CloudObject.of(lines, spacing=0.06).ranges(HERE, rays)).all()
+
+
 def test_what_lies_behind_a_cloud_does_not_shine_through_its_holes() -> None:
     cloud = CloudObject.of(np.concatenate([plate(2.0, 0.3, 0.03), plate(2.4, 0.2, 0.03)]))
     rays = ahead(*[(2.0, y, z) for y in np.linspace(-0.15, 0.15, 41) for z in np.linspace(-0.15, 0.15, 41)])
