@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from rich.console import Group
 from rich.table import Table
+from scipy.spatial import cKDTree
 
 from worker.benchmarks.baselines import CloudToCloudBaseline
 from worker.benchmarks.documents import Document, pose_spread, shown, spread, titled_table
@@ -25,11 +26,13 @@ from worker.benchmarks.trajectory import map_frame, placed_scans, scan_files
 from worker.cloud import npz
 from worker.cloud.poses import transformed
 from worker.cloud.seen import Seen
-from worker.cloud.tiling import TilePairs, pair_tiles
+from worker.cloud.sight import Sights
+from worker.cloud.tiling import TilePairs, TilingSettings, pair_tiles, touched_tiles
 from worker.cloud.types import Arrays, Floats, Matrix4, Points
+from worker.cloud.voxel_keys import packed, unpacked
 from worker.cloud.voxels import Voxels
 from worker.detectors.card import MODEL_STORE
-from worker.detectors.comparison import Comparison
+from worker.detectors.comparison import Comparison, Side
 from worker.detectors.detector import Detector
 from worker.pipeline import archive
 from worker.pipeline.flow import (
@@ -51,8 +54,10 @@ from worker.progress import Progress, no_progress
 from worker.simulation.scenes import corridor
 from worker.simulation.sensor import SimulatedScan
 from worker.simulation.visits import visit
+from worker.threads import query_threads
 
 PAPER_TILES = 172  # of the paper's map; its GTX 1650 takes 22.4 s for them (Table 6)
+COPIES = (1, 3, 10)  #: of the building, for `scaling`
 YARDSTICK = "c2c"  #: what the others are held against: nearest distances by a k-d tree, no training
 
 
@@ -93,11 +98,13 @@ def bench(settings: BenchSettings, progress: Progress = no_progress) -> Document
             for file in (one, replace(one, pose=None))
         )
         pairs = _full_visit(second, built, frame)
+        rows: list[Document] = []
         if seen is None:
             pairs = resized(pairs, settings.tiles)
             runs = ways(pairs, detector)
         else:
-            runs = voxel_ways(pairs, _full_comparison(second, built, frame, seen, pipeline), detector)
+            comparison = _full_comparison(second, built, frame, seen, pipeline)
+            runs, rows = voxel_ways(pairs, comparison, detector), scaling(comparison, detector, progress)
         scoring = scoring_bench(pairs, runs, repeats=settings.repeats, progress=progress)
     errors = [scan.error for scan in placed_scans(built.outcomes, first, frame)]
     return {
@@ -117,6 +124,7 @@ def bench(settings: BenchSettings, progress: Progress = no_progress) -> Document
         "survey_with_prior": with_prior,
         "survey_without_prior": without,
         "network": scoring,
+        "scaling": rows,
         "peak_memory_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024),
     }
 
@@ -262,15 +270,81 @@ def ways(pairs: TilePairs, detector: Detector) -> dict[str, Callable[[], TileSco
 def voxel_ways(
     pairs: TilePairs, comparison: Comparison, detector: Detector
 ) -> dict[str, Callable[[], TileScore]]:
-    """Return the yardstick on the same clouds, and a detector by voxels from what was seen to tiles and objects."""
+    """Return the yardstick on the same clouds, and a detector by voxels from both clouds to tiles and objects."""
 
     def by_voxels() -> TileScore:
-        detection = tile_scores(detector, comparison)
-        if detection.voxels is not None:
-            change_objects(comparison, detection.voxels)
-        return detection.change
+        return _told_by_voxels(_side_by_side(comparison), detector)
 
     return {YARDSTICK: lambda: CloudToCloudBaseline().score(pairs), "voxels": by_voxels}
+
+
+def _side_by_side(comparison: Comparison) -> Comparison:
+    """Cut both clouds along the tiles that either touched, as `compare` does."""
+    reference, current = comparison.reference.points, comparison.current.points
+    tiles = touched_tiles(reference, current, comparison.grid)
+    pairs = pair_tiles(tiles, current, settings=TilingSettings(tiles="touched", min_points=1))
+    return replace(comparison, tile_pairs=pairs)
+
+
+def _told_by_voxels(comparison: Comparison, detector: Detector) -> TileScore:
+    detection = tile_scores(detector, comparison)
+    if detection.voxels is not None:
+        change_objects(comparison, detection.voxels)
+    return detection.change
+
+
+def scaling(comparison: Comparison, detector: Detector, progress: Progress = no_progress) -> list[Document]:
+    """Time a detector by voxels and the yardstick on a map laid side by side with itself so many times; JSON-ready.
+
+    The cost of each voxel should stay as it is while the map grows. Peak memory is of the whole process so far.
+    """
+    rows = []
+    for copies in COPIES:
+        progress(f"scaling, {copies} times the map", 0.0)
+        both = [
+            repeated(side.seen, copies) for side in (comparison.reference, comparison.current) if side.seen
+        ]
+        sides = [Side(points=seen.points, seen=seen) for seen in both]
+        wide = replace(comparison, reference=sides[0], current=sides[1])
+        begun = time.perf_counter()
+        _told_by_voxels(_side_by_side(wide), detector)
+        told = time.perf_counter()
+        for one, other in (both, both[::-1]):
+            cKDTree(one.points).query(other.points, workers=query_threads())
+        ended = time.perf_counter()
+        voxels = sum(len(seen.keys) for seen in both)
+        rows.append(
+            {
+                "copies": copies,
+                "voxels": voxels,
+                "seconds": told - begun,
+                "microseconds_per_voxel": 1e6 * (told - begun) / voxels,
+                "times_c2c": (told - begun) / (ended - told),
+                "peak_memory_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024),
+            }
+        )
+    return rows
+
+
+def repeated(seen: Seen, copies: int) -> Seen:
+    """Return what would be seen in so many equal buildings side by side along x."""
+    apart = int(np.ceil(np.ptp(seen.points[:, 0]) / seen.voxel_size)) + 100  # voxels
+    cells = unpacked(seen.keys)
+    steps = [np.array([number * apart, 0, 0]) for number in range(copies)]
+    sights = seen.sights
+    return Seen(
+        voxel_size=seen.voxel_size,
+        keys=np.concatenate([packed(cells + step) for step in steps]),
+        points=np.concatenate([seen.points + (step * seen.voxel_size).astype(np.float32) for step in steps]),
+        hits=np.tile(seen.hits, copies),
+        sights=None
+        if sights is None
+        else Sights(
+            origins=np.concatenate([sights.origins + step * seen.voxel_size for step in steps]),
+            nearest=np.tile(sights.nearest, (copies, 1)),
+            farthest=np.tile(sights.farthest, (copies, 1)),
+        ),
+    )
 
 
 def resized(pairs: TilePairs, count: int) -> TilePairs:
@@ -290,11 +364,27 @@ def tables(figures: Document) -> Group:
     return Group(
         titled_table(title, head, rows),
         _scoring_table(figures["network"]),
+        *([_scaling_table(figures["scaling"])] if figures["scaling"] else []),
         f"scans placed: {poses['accepted']} of {poses['of']}, off by {poses['centimetres']['median']:.1f} cm "
         f"(most {poses['centimetres']['most']:.1f}) and {poses['degrees']['median']:.2f} degrees "
         f"(most {poses['degrees']['most']:.2f})",
         f"peak memory {figures['peak_memory_mb']} MB",
     )
+
+
+def _scaling_table(rows: Sequence[Document]) -> Table:
+    head = ("voxels of both", "seconds", "microseconds a voxel", "times C2C", "peak memory (MB)")
+    shown_rows = (
+        (
+            f"{row['voxels']:,}",
+            f"{row['seconds']:.2f}",
+            f"{row['microseconds_per_voxel']:.2f}",
+            f"{row['times_c2c']:.2f}",
+            f"{row['peak_memory_mb']}",
+        )
+        for row in rows
+    )
+    return titled_table("the same building side by side, once each", head, shown_rows)
 
 
 def _scoring_table(scoring: Document) -> Table:

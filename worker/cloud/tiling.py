@@ -65,7 +65,9 @@ class TileGrid:
         """Return (T,) the cell of each tile (T, 3); -1 outside the grid."""
         cells = np.zeros(len(indices), np.int64)
         inside = np.ones(len(indices), bool)
-        for axis, (lowest, count) in enumerate(zip(self.lowest, self.shape, strict=True)):  # faster than by rows
+        for axis, (lowest, count) in enumerate(
+            zip(self.lowest, self.shape, strict=True)
+        ):  # faster than by rows
             place = indices[:, axis].astype(np.int64) - lowest
             inside &= (place >= 0) & (place < count)
             cells *= count

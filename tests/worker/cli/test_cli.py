@@ -37,6 +37,12 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.fixture(autouse=True)
+def by_points(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where a test names no model, take the one that `store` has, and not the release's choice."""
+    monkeypatch.setenv("SPICD_MODEL", "spicd-net/1")
+
+
 @pytest.fixture
 def room() -> np.ndarray:
     """(N, 3) floor and walls of 4 x 3 x 2.5 m at 3 cm with a box in a corner; nothing is symmetric."""

@@ -242,7 +242,7 @@ def test_a_short_demo_leaves_its_results_and_no_process(
     monkeypatch.setenv("SPICD_MODEL_STORE", str(tmp_path / "models"))
     (tmp_path / "mine.txt").write_text("kept")
     page = io.StringIO()
-    settings = DemoSettings(stops=(2, 2), prior_error=(0.02, 0.5))
+    settings = DemoSettings(stops=(2, 2), prior_error=(0.02, 0.5), model="spicd-net/1")
     result = run(
         tmp_path, settings, out_console=Console(file=page, width=160), err_console=Console(file=io.StringIO())
     )

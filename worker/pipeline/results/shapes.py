@@ -33,6 +33,7 @@ FRAGMENT = 0.08  #: of the larger of two shapes; a smaller one fits anywhere, an
 _NEAR = (1.5, 1.0)  # times the larger size, or metres, between two places that may overlap
 _COARSE, _FINE, _KEPT = 64, 250, 6  # points a shape, and poses that are refined
 _COARSE_REACHES, _FINE_REACHES = (0.5, 0.3, 0.2), (0.15, 0.1)  # metres to a partner, step by step
+_HOPELESS = 0.3  # of overlap after the coarse steps; with less no fine ones are tried
 _MOST_TURN = 0.15  # radians a step
 _LAST_REACHES = (0.1,) * 10  # sides that slide on each other take many steps
 _SAME_YAW, _SAME_SHIFT = np.radians(20), 0.15  # poses that come to rest at the same
@@ -216,8 +217,11 @@ class Fit:
         is_round = not near and bool(overlaps.min() > overlaps.max() - ROUND)
         best = np.argsort(-overlaps, kind="stable")[:_KEPT]
         fine = _Pair(before=_thinned(before.points, _FINE), now=_thinned(now.points, _FINE), trees=trees)
-        poses = fine.refined(poses.subset(best), _FINE_REACHES)
-        poses = fine.refined(poses.subset(poses.least(fine.overlaps(poses))), _LAST_REACHES)
+        if overlaps.max() < _HOPELESS:
+            poses = poses.subset(best[:1])
+        else:
+            poses = fine.refined(poses.subset(best), _FINE_REACHES)
+            poses = fine.refined(poses.subset(poses.least(fine.overlaps(poses))), _LAST_REACHES)
         first, second = (float(share[0]) for share in fine.shares(poses))
         both = (first + second) / 2
         return cls(

@@ -66,7 +66,7 @@ class Stopped(Exception):
 def test_a_training_learns_and_goes_on_where_it_stopped(
     samples: Sequence[VoxelSample], tmp_path: Path
 ) -> None:
-    def stop(stage: str, share: float) -> None:  # noqa: ARG001 - as progress is told
+    def stop(stage: str, share: float) -> None:
         if share > 0.7:
             raise Stopped
 
