@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -106,6 +106,10 @@ def detected(
     reference, current = comparison.reference.seen, comparison.current.seen
     if reference is None or current is None:
         raise ValueError("a detector by voxels needs what both visits saw")
+    if not free_space(
+        reference, current
+    ):  # what one visit alone saw through is no evidence, and not learned from
+        reference, current = replace(reference, sights=None), replace(current, sights=None)
     with ThreadPoolExecutor(2) as pool:  # NumPy and torch let each other run
         pending = pool.submit(answered, reference, current, scorer, evidence)
         new = answered(current, reference, scorer, evidence)

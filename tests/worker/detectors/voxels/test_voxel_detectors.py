@@ -194,6 +194,19 @@ def test_clouds_without_a_sensors_place_go_without_free_space(story: Story) -> N
     assert (asked[SEEING], asked[BLIND]) == (2, 2)
 
 
+def test_sights_of_one_visit_alone_count_for_nothing(story: Story) -> None:
+    """A phone's walk beside a scan, or two walks of which one looks like a scan."""
+    detector = open_detector(MODEL_STORE, "voxel-net/1")
+    walks = tuple(replace(seen, sights=None) for seen in (story.first, story.second))
+    _, expected = scores(detector, compared(*walks))
+    assert expected.appeared.max() > 0.5
+    for pair in ((walks[0], story.second), (story.first, walks[1])):
+        _, told = scores(detector, compared(*pair))
+        assert np.array_equal(told.appeared, expected.appeared)
+        assert np.array_equal(told.disappeared, expected.disappeared)
+        assert np.array_equal(told.moving, expected.moving)
+
+
 def test_a_visit_that_saw_nothing_gives_an_answer_of_nothing(story: Story) -> None:
     nothing = Seen.of([], voxel_size=0.05)
     comparison = compared(story.first, story.second)
