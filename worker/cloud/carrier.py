@@ -32,7 +32,9 @@ class CarrierSettings(StrictModel):
     )
     cell: float = Field(0.05, gt=0, description="metres, of the places that are compared")
     floor: float = Field(
-        0.1, ge=0, description="metres about the floor's height that are never cut; the floor repeats as well"
+        0.06,
+        ge=0,
+        description="metres about the floor's height that are never cut; the floor repeats as well",
     )
 
 

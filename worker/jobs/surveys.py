@@ -20,7 +20,6 @@ from worker.cloud import npz
 from worker.detectors.card import Card
 from worker.detectors.comparison import Comparison
 from worker.detectors.detector import Detection
-from worker.detectors.voxels.scores import tile_threshold
 from worker.jobs.models import card_of, card_that_fits, kept_detector, pipeline_settings
 from worker.jobs.scans import kept_scans, save_scans, scan_files, scan_outcomes, seen_by
 from worker.jobs.step import Context, load, put, step
@@ -84,7 +83,7 @@ def export_survey(context: Context) -> None:
     detection = load(context, blob_keys.survey_scores(survey_id), functools.partial(npz.load, kind=Detection))
     card = card_of(context, survey.model)
     limit = _least_score(context, version, card, survey.model) if detection.voxels is not None else 0.0
-    threshold = tile_threshold(card, limit) if survey.threshold is None else survey.threshold
+    threshold = card.threshold if survey.threshold is None else survey.threshold
     objects = settings.objects.with_values(min_score=max(limit, settings.objects.min_score))
     changes = concluded(
         comparison, detection, threshold=threshold, settings=settings.with_values(objects=objects)

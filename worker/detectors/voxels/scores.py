@@ -14,7 +14,6 @@ from worker.cloud.settings import StrictModel
 from worker.cloud.tiling import TileGrid
 from worker.cloud.types import Bools, Floats, Indices
 from worker.cloud.voxel_keys import Keys, near, regions, rows_of, union
-from worker.detectors.card import Card
 from worker.detectors.comparison import Comparison
 from worker.detectors.detector import Detection, VoxelScores
 from worker.detectors.voxels.evidence import (
@@ -30,6 +29,7 @@ from worker.detectors.voxels.evidence import (
 #: Of a region's voxels, that blocked the view of a scan. Measured in simulated offices and rooms: 0.6 (a ladder) to 1.0
 #: of what stands, 0.0 to 0.1 of people, up to 0.4 where the region is small.
 STANDING_SHARE = 0.45
+STANDING_SCANS = 1.5  #: scans of the same visit, in the mean over a region, that confirm what stands
 _FEWEST = 10  # voxels of a region of which that can be said
 _FRINGE = 2  # voxels around somebody who walked by, which are no more certain than he is
 _SPOTS = (4, 4, 3)  # places along x, y, z of a tile that free space is asked at
@@ -76,26 +76,52 @@ def answered(own: Seen, other: Seen, scorer: Scorer, settings: EvidenceSettings)
     probabilities = scorer.score(evidence, free_space=free_space(own, other))
     rows = rows_of(evidence.keys, own.keys)
     gated = np.where((rows >= 0) & lacks.judged[rows], probabilities, 0).astype(np.float32)
-    walked = _walked(own, evidence.keys, rows, gated)
-    fringe = near(evidence.keys, evidence.keys[walked], _FRINGE) & (gated <= 0.5)
-    gated[walked | fringe] = 0
+    walked = _walked(own, evidence, rows, gated)
+    closed = walked | _unproven(own, other, evidence, gated, settings)
+    fringe = near(evidence.keys, evidence.keys[closed], _FRINGE) & (gated <= 0.5)
+    gated[closed | fringe] = 0
     moving = walked | (passing(evidence) & (gated < 0.5))
     return Answer(missing=lacks, keys=evidence.keys, probabilities=gated, moving=moving)
 
 
-def _walked(own: Seen, keys: Keys, rows: NDArray[np.int64], probabilities: NDArray[np.float32]) -> Bools:
+def _walked(
+    own: Seen, evidence: Evidence, rows: NDArray[np.int64], probabilities: NDArray[np.float32]
+) -> Bools:
     """Tell (N,) which voxels are of changed regions that stood for no scan of the visit that hit them (`Sights.stands`).
 
-    `rows` (N,) are those of the voxels in what own saw. Without sights, and of regions of a few voxels, nobody knows.
+    What several scans confirm stands as well, also where it can be seen through as a plant can. `rows` (N,) are those
+    of the voxels in what own saw. Without sights, and of regions of a few voxels, nobody knows.
     """
-    answer = np.zeros(len(keys), bool)
+    answer = np.zeros(len(evidence.keys), bool)
     changed = np.flatnonzero(probabilities > 0.5)
     if own.sights is None or not len(changed):
         return answer
-    count, region = regions(keys[changed])
+    count, region = regions(evidence.keys[changed])
     size = np.bincount(region, minlength=count)
     stood = np.bincount(region, weights=own.sights.stands(own.points[rows[changed]]), minlength=count) / size
-    answer[changed] = ((stood < STANDING_SHARE) & (size >= _FEWEST))[region]
+    scans = np.bincount(region, weights=evidence.own.confirmed[changed], minlength=count) / size
+    answer[changed] = ((stood < STANDING_SHARE) & (scans < STANDING_SCANS) & (size >= _FEWEST))[region]
+    return answer
+
+
+def _unproven(
+    own: Seen,
+    other: Seen,
+    evidence: Evidence,
+    probabilities: NDArray[np.float32],
+    settings: EvidenceSettings,
+) -> Bools:
+    """Tell (N,) which voxels are of changed regions of which hardly any was surely seen through.
+
+    Along a wall that a scan only grazes single directions lie beyond its voxels, but not those around them as well.
+    """
+    answer = np.zeros(len(evidence.keys), bool)
+    changed = np.flatnonzero(probabilities > 0.5)
+    if not free_space(own, other) or not len(changed):
+        return answer
+    count, region = regions(evidence.keys[changed])
+    sure = np.bincount(region, weights=evidence.other.surely[changed] > 0, minlength=count)
+    answer[changed] = (sure / np.bincount(region, minlength=count) < settings.min_sure_share)[region]
     return answer
 
 
@@ -132,12 +158,6 @@ def detected(
 def tile_score(sums: Floats, settings: TileScoreSettings) -> Floats:
     """Return the probability of change (T,) of tiles with so many changed voxels to be expected (T,)."""
     return np.asarray(1 / (1 + np.exp(-(settings.slope * np.log1p(sums) + settings.offset))))
-
-
-def tile_threshold(card: Card, least_score: float) -> float:
-    """Return the threshold of the card's tiles, or the score of one with so many expected changed voxels if higher."""
-    settings = TileScoreSettings.model_validate(card.detector_settings.get("tiles", {}))
-    return max(card.threshold, float(tile_score(np.array(least_score), settings)))
 
 
 def observed_share(
