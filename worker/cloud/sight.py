@@ -33,6 +33,8 @@ TOLERANCE = (
 )  #: metres, and times the depth, that a return may lie off and still be the same surface
 BEYOND = 0.3  #: metres behind a place, from which on a return shows that nothing blocked the view for good
 FARTHEST_RESIDUAL = 0.6  #: metres; a residual is no larger
+_FEWEST_AROUND = 3  # of eight directions with a return, for the one in their middle to be filled in
+_SMOOTH = 0.15  # of the nearest of them, that the farthest may lie behind it
 _MILLIMETRE = 0.001  # ranges are kept in these, as uint16: up to 65 m
 _FARTHEST = np.uint16(np.iinfo(np.uint16).max)  # in these
 
@@ -136,7 +138,7 @@ class Sights:
         answer = Verdicts.none(len(points))
         order = np.argsort(points[:, 0], kind="stable")
         ordered = np.ascontiguousarray(points[order], np.float32)
-        _ = self._around  # made once, before several threads ask for it
+        _ = self._images  # made once, before several threads ask for it
         with ThreadPoolExecutor(max(1, query_threads())) as pool:
             for rows, told in pool.map(functools.partial(self._verdicts_of_one, ordered), range(len(self))):
                 there = order[rows]
@@ -173,10 +175,7 @@ class Sights:
             rays = rays[rows]
         cells = _cells_of(rays)
         depth = np.sqrt(np.einsum("ij,ij->i", rays, rays))
-        nearest, farthest, around = (
-            image[scan][cells] * np.float32(_MILLIMETRE)
-            for image in (self.nearest, self.farthest, self._around)
-        )
+        nearest, farthest, around = (image[scan][cells] * np.float32(_MILLIMETRE) for image in self._images)
         tolerance = TOLERANCE[0] + TOLERANCE[1] * depth
         known = farthest > 0
         through = known & (nearest > depth + tolerance)
@@ -191,13 +190,25 @@ class Sights:
         )
 
     @functools.cached_property
-    def _around(self) -> NDArray[np.uint16]:
-        """(S, 6 CELLS^2) millimetres: the nearest return in a direction and in the eight around it, where any is."""
-        known = np.where(self.nearest > 0, self.nearest, _FARTHEST)
-        around = known.copy()
-        for neighbour in _neighbours():
-            np.minimum(around, known[:, neighbour], out=around)
-        return around
+    def _images(self) -> tuple[NDArray[np.uint16], NDArray[np.uint16], NDArray[np.uint16]]:
+        """(S, 6 CELLS^2) millimetres each: nearest, farthest, and the nearest with the eight directions around.
+
+        Scan lines lie apart: a direction without a return takes the nearest and the farthest of those around it where
+        at least three have one, and all of about the same range.
+        """
+        neighbours = _neighbours()
+        unknown = self.nearest == 0
+        least, most = np.where(unknown, _FARTHEST, self.nearest), self.farthest
+        around, beyond = least.copy(), np.zeros_like(most)
+        count = np.zeros(least.shape, np.int8)
+        for neighbour in neighbours:
+            np.minimum(around, least[:, neighbour], out=around)
+            np.maximum(beyond, most[:, neighbour], out=beyond)
+            count += most[:, neighbour] > 0
+        smooth = beyond <= around * (1 + _SMOOTH)
+        filled = unknown & (count >= _FEWEST_AROUND) & smooth
+        nearest = np.where(filled, around, self.nearest)
+        return nearest, np.where(filled, beyond, self.farthest), around
 
 
 def _cells_of(rays: NDArray[np.float32]) -> NDArray[np.int32]:
