@@ -20,7 +20,6 @@ from worker.cloud.voxel_keys import Keys, packed, rows_of
 from worker.cloud.voxels import Voxels, fused
 from worker.detectors.comparison import Comparison
 from worker.detectors.detector import Detector
-from worker.detectors.voxels.scores import tile_threshold
 from worker.pipeline.alarms import calibrated, visits_of
 from worker.pipeline.flow import compare, concluded
 from worker.pipeline.mapping.fusion import CurrentMap, reference_map
@@ -70,7 +69,7 @@ class Answer:
     tiles: Indices  #: (T, 3)
     scores: NDArray[np.float32]  #: (T,) probability of change, NaN where it says nothing
     states: NDArray[np.uint8]  #: (T,) values of TileState
-    threshold: float  #: of tiles
+    threshold: float  #: of tiles, the card's
     least_score: float  #: expected voxels of an object, by the map's own scans and the model's card
     objects: tuple[FoundObject, ...] | None  #: None where it scores tiles alone
     moving: int  #: things that moved during a visit
@@ -105,7 +104,7 @@ def answer_of(detector: Detector, visits: TwoVisits) -> Answer:
     settings = PipelineSettings().for_model(detector.card.preprocessing)
     limit = _least_score(detector, visits.first, settings)
     objects = settings.objects.with_values(min_score=limit)
-    threshold = tile_threshold(detector.card, limit) if limit else detector.card.threshold
+    threshold = detector.card.threshold
     begun = time.perf_counter()
     comparison = comparison_of(visits.first, visits.second, settings)
     detection = detector.detect(comparison)
