@@ -86,7 +86,11 @@ def export_survey(context: Context) -> None:
     threshold = card.threshold if survey.threshold is None else survey.threshold
     objects = settings.objects.with_values(min_score=max(limit, settings.objects.min_score))
     changes = concluded(
-        comparison, detection, threshold=threshold, settings=settings.with_values(objects=objects)
+        comparison,
+        detection,
+        threshold=threshold,
+        settings=settings.with_values(objects=objects),
+        by_objects=survey.threshold is None,
     )
     context.report("exporting", 0.3)
     _put_cloud_and_picture(context, survey, comparison, changes)

@@ -173,12 +173,18 @@ def detect(
     """Score the survey, then decide (stage 3, second half); the threshold is the card's if None is given."""
     settings = settings or PipelineSettings()
     detection = detector.detect(comparison, embedding=embedding, progress=progress)
+    own = threshold is None
     threshold = detector.card.threshold if threshold is None else threshold
-    return concluded(comparison, detection, threshold=threshold, settings=settings)
+    return concluded(comparison, detection, threshold=threshold, settings=settings, by_objects=own)
 
 
 def concluded(
-    comparison: Comparison, detection: Detection, *, threshold: float, settings: PipelineSettings
+    comparison: Comparison,
+    detection: Detection,
+    *,
+    threshold: float,
+    settings: PipelineSettings,
+    by_objects: bool = True,
 ) -> ChangeSet:
     """Make of a detector's scores the states of tiles and, where it scored voxels that both visits saw, objects."""
     least = settings.tiling.min_observed_share
@@ -186,7 +192,8 @@ def concluded(
     if detection.voxels is None or comparison.reference.seen is None or comparison.current.seen is None:
         return changes
     objects = change_objects(comparison, detection.voxels, settings.objects)
-    return replace(changes, voxels=detection.voxels, objects=objects)
+    changes = replace(changes, voxels=detection.voxels, objects=objects)
+    return changes.where_objects_lie(least) if by_objects else changes
 
 
 def accepted_scans(

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
 
-from worker.cloud.tiling import TilePairs
+from worker.cloud.tiling import TilePairs, tile_id
 from worker.cloud.types import Bools
 from worker.detectors.detector import Detection, VoxelScores, change_score
 from worker.pipeline.results.objects import ChangeObjects
@@ -48,6 +48,22 @@ class ChangeSet:
     def scores(self) -> NDArray[np.float32]:
         """(T,) probability that the tile is not as it was, NaN where nothing could be compared."""
         return change_score(self.probabilities)
+
+    def where_objects_lie(self, min_observed_share: float) -> ChangeSet:
+        """Return the same, but tiles whose changed voxels are too few or too weak for any object are not changed.
+
+        An object is what the map's own scans say is no false alarm; a tile should raise none either.
+        """
+        if self.objects is None:
+            return self
+        touched = {index for thing in self.objects.objects for place in thing.places for index in place.tiles}
+        alone = np.array([tile_id(index) not in touched for index in self.pairs.reference.indices], bool)
+        states = self.states.copy()
+        weak = alone & (states == TileState.CHANGED)
+        states[weak] = TileState.UNCHANGED
+        if self.observed_share is not None:
+            states[weak & (self.observed_share < min_observed_share)] = TileState.UNOBSERVED
+        return replace(self, states=states)
 
     def counts(self) -> dict[str, int]:
         """Count the tiles by state, every state named."""
