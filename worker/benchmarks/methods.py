@@ -20,9 +20,16 @@ from worker.benchmarks.baselines import installed_baselines, m3c2_is_installed
 from worker.benchmarks.plots import Log, read_log
 from worker.cloud.tiling import TileChoice, TilePairs, Tiles
 from worker.cloud.types import Arrays
-from worker.detectors.comparison import Comparison, side_of
+from worker.detectors.comparison import Comparison, Side, side_of
 from worker.detectors.detector import Detection, Detector
-from worker.detectors.store import detector_class, open_card, open_detector, resolve_device, sha256_of
+from worker.detectors.store import (
+    detector_class,
+    open_card,
+    open_detector,
+    resolve_device,
+    sha256_of,
+    weights_of,
+)
 from worker.errors import DetectorUnavailable
 from worker.pipeline.settings import PipelineSettings
 from worker.progress import Progress, no_progress
@@ -101,6 +108,33 @@ def revisit_methods(
         if not m3c2_is_installed():
             left_out.append("M3C2: py4dgeo is not installed")
     return tuple(methods), left_out
+
+
+def ablations(model_store: Path, model: str, pipeline: PipelineSettings) -> tuple[RevisitMethod, ...]:
+    """Return a model by voxels without the gate, and without free space: as if nobody knew the sensors' places.
+
+    Raises DetectorUnavailable, and ValueError for a model that knows neither.
+    """
+    whole = open_model(model_store, model)
+    settings = dict(whole.card.detector_settings)
+    if whole.card.preprocessing.tiles != "touched":
+        raise ValueError(f"model {model} compares tiles by their points: it has no gate and no free space")
+    settings["evidence"] = {**settings.get("evidence", {}), "gate": False}
+    card = whole.card.model_copy(update={"detector_settings": settings})
+    weights = weights_of(whole) if whole.card.weights else {}
+    ungated = detector_class(card.detector).load(card, weights, resolve_device("auto"))
+    blind = _of_detector(whole, f"{model} without free space", pipeline)
+    return (
+        replace(blind, detect=lambda comparison: whole.detect(_without_sights(comparison))),
+        _of_detector(ungated, f"{model} without the gate", pipeline),
+    )
+
+
+def _without_sights(comparison: Comparison) -> Comparison:
+    def blinded(side: Side) -> Side:
+        return side if side.seen is None else replace(side, seen=replace(side.seen, sights=None))
+
+    return replace(comparison, reference=blinded(comparison.reference), current=blinded(comparison.current))
 
 
 def stored_models(model_store: Path) -> tuple[str, ...]:

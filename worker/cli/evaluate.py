@@ -154,6 +154,9 @@ def revisit(
     others: Annotated[
         bool, typer.Option(help="Also the other models of the store, and what needs no training.")
     ] = True,
+    ablations: Annotated[
+        bool, typer.Option("--ablations", help="Also the model without its gate, and without free space.")
+    ] = False,
     buildings: Annotated[
         str, typer.Option(help="Of room, office, corridor, loop, with commas; taken in turn.")
     ] = "room,office,corridor,loop",
@@ -184,6 +187,7 @@ def revisit(
         model_store=model_store,
         weights=tuple(weights or ()),
         others=others,
+        ablations=ablations,
         made=RevisitSettings(kinds=kinds_named(buildings)),
     )
     with terminal.progress_bar() as progress:

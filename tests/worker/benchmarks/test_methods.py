@@ -12,8 +12,10 @@ import pytest
 import torch
 
 from tests.support.detectors import CountingDetector
+from tests.support.visits import compared, seen_by
 from worker.benchmarks.methods import (
     CachedDetector,
+    ablations,
     baseline_methods,
     open_model,
     revisit_methods,
@@ -24,9 +26,11 @@ from worker.cloud.tiling import TileGrid, TilePairs, Tiles
 from worker.detectors.card import MODEL_STORE
 from worker.detectors.comparison import Comparison
 from worker.detectors.spicd_net.network import SpicdNetwork
-from worker.detectors.store import WEIGHTS, open_card, read_card, write_card, write_model
+from worker.detectors.store import WEIGHTS, open_card, open_detector, read_card, write_card, write_model
 from worker.errors import DetectorUnavailable
 from worker.pipeline.settings import PipelineSettings
+from worker.simulation.scenes import random_room
+from worker.simulation.visits import visit
 from worker.training.log import LOG
 
 MODEL = "spicd-net/1"
@@ -187,3 +191,24 @@ def test_every_baseline_scores_observed_tiles_and_no_others(pairs: TilePairs) ->
     assert {"C2C (mean)", "M3C2-approx"} <= {method.name for method in methods}
     for method in methods:
         assert np.isnan(method.score(pairs)).tolist() == (~pairs.observed).tolist()
+
+
+def test_ablations_take_the_gate_and_the_free_space_away() -> None:
+    scans = visit(random_room(11), 4, seed=3)
+    comparison = compared(seen_by(scans), seen_by(scans[:1]))
+    whole = open_detector(MODEL_STORE, "voxel-net/1").detect(comparison)
+    blind, ungated = (
+        method.detect(comparison) for method in ablations(MODEL_STORE, "voxel-net/1", PipelineSettings())
+    )
+    assert whole.voxels is not None
+    assert blind.voxels is not None
+    assert ungated.voxels is not None
+    unjudged = ~whole.voxels.judged
+    assert whole.voxels.disappeared[unjudged].max() == 0
+    assert ungated.voxels.disappeared[unjudged].max() > 0
+    assert blind.voxels.judged.sum() > whole.voxels.judged.sum()  # nobody knows where nobody looked
+
+
+def test_only_models_by_voxels_have_something_to_take_away() -> None:
+    with pytest.raises(ValueError, match="no gate"):
+        ablations(MODEL_STORE, "c2c/1", PipelineSettings())

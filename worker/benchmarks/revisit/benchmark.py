@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from worker.benchmarks.documents import Document
-from worker.benchmarks.methods import RevisitMethod, revisit_methods
+from worker.benchmarks.methods import RevisitMethod, ablations, revisit_methods
 from worker.benchmarks.revisit.gallery import draw_gallery
 from worker.benchmarks.revisit.measures import Measured, scores_of, threshold_of
 from worker.benchmarks.revisit.part import RevisitPart, part_of, summary
@@ -38,6 +38,7 @@ class RevisitBenchmarkSettings:
     model_store: Path = MODEL_STORE
     weights: tuple[Path, ...] = ()  #: checkpoints, measured instead of the model's own weights
     others: bool = True  #: also the other models of the store, and the baselines
+    ablations: bool = False  #: also the model without its gate, and without free space
     made: RevisitSettings = field(default_factory=RevisitSettings)
     pictures: bool = True
 
@@ -52,6 +53,8 @@ def evaluate(settings: RevisitBenchmarkSettings, progress: Progress = no_progres
     methods, left_out = revisit_methods(
         settings.model_store, settings.model, settings.weights, made.pipeline, others=settings.others
     )
+    if settings.ablations:
+        methods = (*methods, *ablations(settings.model_store, settings.model, made.pipeline))
     parts = visited(settings, progress)
     document: Document = {
         "settings": made.model_dump(mode="json"),

@@ -31,6 +31,9 @@ class EvidenceSettings(StrictModel):
     context: int = Field(
         2, ge=0, description="blocks of 4 voxels around a candidate that are looked into as well"
     )
+    gate: bool = Field(
+        True, description="off, to see what it does: probabilities of voxels that nobody could judge count"
+    )
     min_sure_share: float = Field(
         0.1, ge=0, le=1, description="of a changed region's voxels, that the other visit surely saw through"
     )

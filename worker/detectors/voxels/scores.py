@@ -75,7 +75,12 @@ def answered(own: Seen, other: Seen, scorer: Scorer, settings: EvidenceSettings)
     evidence = gathered(own, other, lacks.candidates, settings)
     probabilities = scorer.score(evidence, free_space=free_space(own, other))
     rows = rows_of(evidence.keys, own.keys)
-    gated = np.where((rows >= 0) & lacks.judged[rows], probabilities, 0).astype(np.float32)
+    hit = rows >= 0
+    if not settings.gate:
+        moving = np.zeros(len(hit), bool)
+        ungated = np.where(hit, probabilities, 0).astype(np.float32)
+        return Answer(missing=lacks, keys=evidence.keys, probabilities=ungated, moving=moving)
+    gated = np.where(hit & lacks.judged[rows], probabilities, 0).astype(np.float32)
     walked = _walked(own, evidence, rows, gated)
     closed = walked | _unproven(own, other, evidence, gated, settings)
     fringe = near(evidence.keys, evidence.keys[closed], _FRINGE) & (gated <= 0.5)
