@@ -40,10 +40,22 @@ class RegistrationRequest(Request):
     ] = None
 
 
+class CarrierRequest(Request):
+    """What stands in every scan near the sensor, the robot itself, is cut."""
+
+    radius: Annotated[
+        float,
+        Field(
+            ge=0, le=5, description="metres around the sensor, within which it is looked for; 0 cuts nothing"
+        ),
+    ]
+
+
 class MapSettings(Request):
     """What of a map can be set. Voxel and tile size belong to the model, and so to its card."""
 
     registration: RegistrationRequest = RegistrationRequest()
+    carrier: Annotated[CarrierRequest | None, Field(description="left out: 0.7 m")] = None
     alarms_per_survey: Annotated[
         float,
         Field(

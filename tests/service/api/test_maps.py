@@ -12,6 +12,18 @@ from service.catalog import blob_keys
 from service.catalog.catalog import Catalog
 from service.settings import Settings
 from tests.support.samples import MODEL, RememberingQueue, add_map, add_scan, add_survey, ply
+from worker.pipeline.settings import PipelineSettings
+
+
+def test_how_far_the_carrier_is_looked_for_can_be_set(client: TestClient, catalog: Catalog) -> None:
+    scan = add_scan(catalog)
+    asked = {"id": "lobby", "scan_ids": [scan.scan_id], "settings": {"carrier": {"radius": 0}}}
+    assert client.post("/maps", json=asked).status_code == 202
+    settings = client.get("/maps/lobby").json()["settings"]
+    assert settings["carrier"] == {"radius": 0}
+    assert PipelineSettings.model_validate(settings).carrier.radius == 0
+    wrong = client.post("/maps", json={**asked, "id": "hall", "settings": {"carrier": {"radius": -1}}})
+    assert (wrong.status_code, "carrier.radius" in wrong.text) == (422, True)
 
 
 def test_a_map_of_known_scans_is_accepted_and_its_job_submitted(
