@@ -23,7 +23,7 @@ from worker.cloud.poses import difference
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="looks for processes in /proc")
 
-MODEL = "spicd-net/1"
+MODEL = "voxel-net/1"
 STATES = ("unchanged", "changed", "inconsistent", "unobserved")
 
 
@@ -106,19 +106,24 @@ def test_what_nobody_saw_is_unobserved_and_has_no_score(tiles: list[dict[str, An
     assert beyond
     assert {tile["n_current"] for tile in beyond} == {0}
     assert {tile["state"] for tile in beyond} == {"unobserved"}
-    assert all((tile["score"] is None) == (tile["state"] == "unobserved") for tile in tiles)
+    assert all((tile["score"] is None) <= (tile["state"] == "unobserved") for tile in tiles)
+    assert all((tile["score"] is None) <= (tile["observed_share"] == 0) for tile in tiles)
     assert any(tile["state"] != "unobserved" for tile in tiles)
 
 
-def test_a_tile_is_changed_exactly_above_the_threshold(
-    survey: dict[str, Any], tiles: list[dict[str, Any]]
+def test_a_tile_is_changed_only_above_the_threshold_and_where_an_object_lies(
+    service: Service, survey: dict[str, Any], tiles: list[dict[str, Any]]
 ) -> None:
+    things = service.get(f"/surveys/{survey['survey_id']}/objects")["features"]
+    places = [thing["properties"][side] for thing in things for side in ("now", "before")]
+    touched = {tile for place in places if place for tile in place["tiles"]}
     assert survey["model"] == MODEL
     for tile in tiles:
         if tile["state"] != "unobserved":
             assert sum(tile["probabilities"]) == pytest.approx(1, abs=1e-4)
             assert tile["score"] == pytest.approx(1 - tile["probabilities"][0], abs=1e-6)
-            assert (tile["state"] == "changed") == (tile["score"] > survey["threshold"])
+            above = tile["score"] > survey["threshold"]
+            assert (tile["state"] == "changed") == (above and tile["tile_id"] in touched)
 
 
 def test_features_are_prisms_around_their_centres(service: Service, survey: dict[str, Any]) -> None:

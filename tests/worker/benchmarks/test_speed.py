@@ -34,7 +34,7 @@ def model_store(tmp_path: Path) -> Path:
 
 
 def test_bench_times_every_stage_and_finds_the_same_scores_each_way(model_store: Path) -> None:
-    figures = bench(BenchSettings(scans=4, tiles=6, repeats=1, model_store=model_store))
+    figures = bench(BenchSettings(scans=4, tiles=6, repeats=1, model_store=model_store, model="spicd-net/1"))
     assert figures["network"]["tiles"] == 6
     assert figures["network"]["largest_score_difference"] < 1e-4
     assert list(figures["network"]["seconds"]) == ["c2c", "uncached", "cached"]

@@ -23,7 +23,7 @@ SMALL = VoxelSampleSettings(
     buildings={"room": 2}, stops={"room": 3}, edits={"room": 3}, solids={"room": 2}, visits=1, views=6
 )
 QUICK = VoxelTrainSettings(
-    epochs=2, steps=4, crops=2, held_out=2, detector=VoxelNetSettings(widths=(8, 8), head=8)
+    epochs=2, steps=12, crops=2, held_out=2, detector=VoxelNetSettings(widths=(8, 8), head=8)
 )
 
 
