@@ -8,6 +8,7 @@ what changed, or where the two places may overlap on what the other visit could 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -126,12 +127,12 @@ def moved_things(
 
     Each shape is in one thing at most. A pair that has a rival about as good is left out.
     """
-    fits = {
-        (a, b): Fit.of(before, now, visits)
-        for a, before in enumerate(gone)
-        for b, now in enumerate(come)
-        if _alike(before, now, settings)
-    }
+    pairs = [
+        (a, b) for a, before in enumerate(gone) for b, now in enumerate(come) if _alike(before, now, settings)
+    ]
+    with ThreadPoolExecutor(2) as pool:  # the trees let each other run
+        laid = pool.map(lambda pair: Fit.of(gone[pair[0]], come[pair[1]], visits), pairs)
+    fits = dict(zip(pairs, laid, strict=True))
     fits = {pair: fit for pair, fit in fits.items() if fit.merit >= settings.min_overlap}
     things: list[Moved] = []
     taken_gone: set[int] = set()
