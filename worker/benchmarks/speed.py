@@ -38,13 +38,12 @@ from worker.pipeline import archive
 from worker.pipeline.flow import (
     BuiltMap,
     NoScanAccepted,
-    accepted_scans,
     build_map,
     compare,
     locate_survey,
 )
 from worker.pipeline.mapping.fusion import CurrentMap
-from worker.pipeline.registration.results import ScanFile, ScanResult, with_carrier
+from worker.pipeline.registration.results import ScanFile
 from worker.pipeline.results.changes import decide
 from worker.pipeline.results.export import tile_results, write_coloured_cloud
 from worker.pipeline.results.objects import change_objects
@@ -88,7 +87,7 @@ def bench(settings: BenchSettings, progress: Progress = no_progress) -> Document
         built = build_map(files, settings=pipeline, progress=clock)
         clock("encode", 0.0)
         embedding = encode_reference(detector, built.tiles)
-        seen = _seen(files, built.outcomes, pipeline) if by_voxels else None
+        seen = built.seen if by_voxels else None
         map_seconds = clock.seconds()
         frame = map_frame(built.outcomes, first)
         progress("one-scan survey", 0.0)
@@ -160,10 +159,8 @@ def _survey(
         return {"rejected": str(refused), **clock.seconds()}
     comparison = survey.comparison
     if seen is not None:
-        clock("what was seen", 0.0)
-        current = _seen([file], survey.outcomes, settings)
         comparison = compare(
-            reference, survey.current, settings=settings, reference_seen=seen, current_seen=current
+            reference, survey.current, settings=settings, reference_seen=seen, current_seen=survey.seen
         )
     clock("score", 0.0)
     scores = tile_scores(detector, comparison, embedding)
@@ -177,13 +174,6 @@ def _survey(
     clock("picture", 0.0)
     draw_picture(folder / "picture.png", reference.points, survey.current.points, changes, title="bench")
     return {"observed_tiles": int(comparison.observed.sum()), **clock.seconds()}
-
-
-def _seen(files: Sequence[ScanFile], outcomes: Sequence[ScanResult], settings: PipelineSettings) -> Seen:
-    """Return what the accepted scans saw."""
-    files = with_carrier(files, settings.carrier, max_points=settings.max_scan_points)
-    scans = accepted_scans(files, outcomes, settings)
-    return Seen.of(scans, voxel_size=settings.registration.voxel_size)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)

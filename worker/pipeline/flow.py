@@ -117,7 +117,8 @@ def locate_survey(
 ) -> LocatedSurvey:
     """Register the scans to the map, fuse those accepted, set both side by side (stage 3, first half).
 
-    `reference_seen` is what the map's scans saw; detectors by voxels need it. Raises ScanError where no file can be read, NoScanAccepted where none is left to compare.
+    `reference_seen` is what the map's scans saw; detectors by voxels need it. Raises ScanError where no
+    file can be read, NoScanAccepted where none is left to compare.
     """
     files = with_carrier(files, settings.carrier, max_points=settings.max_scan_points)
     outcomes = register_survey_scans(

@@ -11,15 +11,10 @@ from pydantic import Field
 from torch import Tensor
 
 from worker.cloud.settings import StrictModel
-from worker.cloud.tiling import Tiles
-from worker.cloud.types import Arrays
 from worker.detectors.card import Card
-from worker.detectors.comparison import Comparison, Side
-from worker.detectors.detector import Detection
 from worker.detectors.voxel_net.network import WIDTHS, VoxelNetwork, probabilities
 from worker.detectors.voxels.evidence import Evidence, EvidenceSettings
-from worker.detectors.voxels.scores import Scorer, TileScoreSettings, detected
-from worker.progress import Progress, no_progress
+from worker.detectors.voxels.scores import Scorer, TileScoreSettings
 
 Weights = dict[str, Tensor]
 
@@ -46,8 +41,8 @@ class VoxelNet(Scorer):
     settings_class = VoxelNetSettings
 
     def __init__(self, card: Card, networks: dict[str, VoxelNetwork], device: torch.device) -> None:
-        self.card = card
-        self._settings = card.settings_as(VoxelNetSettings)
+        settings = card.settings_as(VoxelNetSettings)
+        super().__init__(card, settings.evidence, settings.tiles)
         self._networks = {name: network.to(device).eval() for name, network in networks.items()}
         self._device = device
 
@@ -63,30 +58,6 @@ class VoxelNet(Scorer):
     def weights(self) -> Weights:
         """Return what `load` takes."""
         return joined({name: network.state_dict() for name, network in self._networks.items()})
-
-    def encode_reference(
-        self,
-        reference: Side,  # noqa: ARG002
-        tiles: Tiles,  # noqa: ARG002
-        *,
-        progress: Progress = no_progress,
-    ) -> Arrays:
-        """Return nothing: what the map's scans saw is kept with the map."""
-        progress("encoding", 1.0)
-        return {}
-
-    def detect(
-        self,
-        comparison: Comparison,
-        *,
-        embedding: Arrays | None = None,  # noqa: ARG002
-        progress: Progress = no_progress,
-    ) -> Detection:
-        """Score every voxel and tile. Raises ValueError where a side's `seen` is not there."""
-        progress("scoring", 0.0)
-        detection = detected(comparison, self, self._settings.evidence, self._settings.tiles)
-        progress("scoring", 1.0)
-        return detection
 
     def score(self, evidence: Evidence, *, free_space: bool) -> NDArray[np.float32]:
         """Return (N,) the network's probabilities."""

@@ -9,15 +9,10 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from worker.cloud.settings import StrictModel
-from worker.cloud.tiling import Tiles
-from worker.cloud.types import Arrays
 from worker.cloud.voxel_keys import regions
 from worker.detectors.card import Card
-from worker.detectors.comparison import Comparison, Side
-from worker.detectors.detector import Detection
 from worker.detectors.voxels.evidence import Evidence, EvidenceSettings, passing
-from worker.detectors.voxels.scores import Scorer, TileScoreSettings, detected
-from worker.progress import Progress, no_progress
+from worker.detectors.voxels.scores import Scorer, TileScoreSettings
 
 
 class VoxelRuleSettings(StrictModel):
@@ -42,37 +37,13 @@ class VoxelRule(Scorer):
     settings_class = VoxelRuleSettings
 
     def __init__(self, card: Card) -> None:
-        self.card = card
         self._settings = card.settings_as(VoxelRuleSettings)
+        super().__init__(card, self._settings.evidence, self._settings.tiles)
 
     @classmethod
     def load(cls, card: Card, weights: Mapping[str, object], device: object) -> VoxelRule:  # noqa: ARG003
         """Open a model; it has no weights and runs on the CPU. Raises ValueError for unsound settings."""
         return cls(card)
-
-    def encode_reference(
-        self,
-        reference: Side,  # noqa: ARG002
-        tiles: Tiles,  # noqa: ARG002
-        *,
-        progress: Progress = no_progress,
-    ) -> Arrays:
-        """Return nothing: what the map's scans saw is kept with the map."""
-        progress("encoding", 1.0)
-        return {}
-
-    def detect(
-        self,
-        comparison: Comparison,
-        *,
-        embedding: Arrays | None = None,  # noqa: ARG002
-        progress: Progress = no_progress,
-    ) -> Detection:
-        """Score every voxel and tile. Raises ValueError where a side's `seen` is not there."""
-        progress("scoring", 0.0)
-        detection = detected(comparison, self, self._settings.evidence, self._settings.tiles)
-        progress("scoring", 1.0)
-        return detection
 
     def score(self, evidence: Evidence, *, free_space: bool) -> NDArray[np.float32]:
         """Return (N,) the share of scans that saw through each voxel of a region that is large and sure enough.

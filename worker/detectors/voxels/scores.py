@@ -11,10 +11,11 @@ from pydantic import Field
 
 from worker.cloud.seen import Seen
 from worker.cloud.settings import StrictModel
-from worker.cloud.tiling import TileGrid
-from worker.cloud.types import Bools, Floats, Indices
+from worker.cloud.tiling import TileGrid, Tiles
+from worker.cloud.types import Arrays, Bools, Floats, Indices
 from worker.cloud.voxel_keys import Keys, near, regions, rows_of, union
-from worker.detectors.comparison import Comparison
+from worker.detectors.card import Card
+from worker.detectors.comparison import Comparison, Side
 from worker.detectors.detector import Detection, VoxelScores
 from worker.detectors.voxels.evidence import (
     Evidence,
@@ -25,6 +26,7 @@ from worker.detectors.voxels.evidence import (
     missing,
     passing,
 )
+from worker.progress import Progress, no_progress
 
 #: Of a region's voxels, that blocked the view of a scan. Measured in simulated offices and rooms: 0.6 (a ladder) to 1.0
 #: of what stands, 0.0 to 0.1 of people, up to 0.4 where the region is small.
@@ -54,7 +56,35 @@ class Answer:
 
 
 class Scorer:
-    """Answers one direction by evidence; a rule or a network."""
+    """Detector (worker.detectors.detector) by voxels; a rule or a network answers one direction by its evidence."""
+
+    def __init__(self, card: Card, evidence: EvidenceSettings, tiles: TileScoreSettings) -> None:
+        self.card = card
+        self._evidence, self._tiles = evidence, tiles
+
+    def encode_reference(
+        self,
+        reference: Side,  # noqa: ARG002
+        tiles: Tiles,  # noqa: ARG002
+        *,
+        progress: Progress = no_progress,
+    ) -> Arrays:
+        """Return nothing: what the map's scans saw is kept with the map."""
+        progress("encoding", 1.0)
+        return {}
+
+    def detect(
+        self,
+        comparison: Comparison,
+        *,
+        embedding: Arrays | None = None,  # noqa: ARG002
+        progress: Progress = no_progress,
+    ) -> Detection:
+        """Score every voxel and tile. Raises ValueError where a side's `seen` is not there."""
+        progress("scoring", 0.0)
+        detection = detected(comparison, self, self._evidence, self._tiles)
+        progress("scoring", 1.0)
+        return detection
 
     def score(self, evidence: Evidence, *, free_space: bool) -> NDArray[np.float32]:
         """Return (N,) the probability of each voxel that what own hit there is missing from other."""
