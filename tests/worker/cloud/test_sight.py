@@ -140,3 +140,18 @@ def test_what_stands_blocks_the_view_and_what_walked_by_does_not() -> None:
     assert sights.stands(ORIGIN + inner).tolist() == [True, True, False, False, True]
     nowhere = np.array([[2.0, -0.5, 0.5], [-2.0, 0.0, 0.0]])
     assert not sights.stands(ORIGIN + nowhere).any()
+
+
+def test_a_direction_between_scan_lines_takes_the_ranges_around_it_where_they_agree() -> None:
+    gap = wall(hole=0.125)  # wider than the cell in its middle
+    assert counts(told(Sights.of([(gap, ORIGIN)]), (2.0, 0.0, 0.0))) == (1, 1, 0, 0)
+    lone = np.array([[4.0, 0.3, 0.3]]) + ORIGIN
+    assert counts(told(Sights.of([(lone, ORIGIN)]), (2.0, 0.0, 0.0))) == (0, 0, 0, 0)
+    near, behind = wall(2.0, hole=0.06), gap
+    sides = np.concatenate([near[near[:, 1] < ORIGIN[1]], behind[behind[:, 1] >= ORIGIN[1]]])
+    assert counts(told(Sights.of([(sides, ORIGIN)]), (1.0, 0.0, 0.0))) == (
+        0,
+        0,
+        0,
+        0,
+    )  # an edge: nobody knows

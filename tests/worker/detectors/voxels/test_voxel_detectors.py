@@ -11,13 +11,13 @@ import torch
 from tests.support.visits import compared, seen_by, swapped
 from worker.cloud.seen import Seen
 from worker.cloud.tiling import Tiles
-from worker.cloud.voxel_keys import rows_of
+from worker.cloud.voxel_keys import Keys, rows_of
 from worker.detectors.card import MODEL_STORE, Card
 from worker.detectors.comparison import Comparison
 from worker.detectors.detector import Detection, Detector, VoxelScores
 from worker.detectors.store import make_detector, open_detector
 from worker.detectors.voxel_net.detector import BLIND, SEEING, VoxelNet, VoxelNetSettings
-from worker.detectors.voxels.evidence import EvidenceSettings, gathered, missing
+from worker.detectors.voxels.evidence import Evidence, EvidenceSettings, gathered, missing
 from worker.pipeline.results.objects import ObjectSettings, regions_of
 from worker.simulation.scenes import Scene, random_room
 from worker.simulation.scenes.mesh import box
@@ -258,3 +258,18 @@ def test_unsound_settings_are_named() -> None:
     card: Card = open_detector(MODEL_STORE, "voxel-rule/1").card
     with pytest.raises(ValueError, match="min_region"):
         card.model_copy(update={"detector_settings": {"min_region": 0}}).settings_as(rule().settings_class)  # type: ignore[attr-defined]
+
+
+def test_a_region_that_was_hardly_surely_seen_through_is_no_proof(
+    story: Story, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def unsure(own: Seen, other: Seen, candidates: Keys, settings: EvidenceSettings) -> Evidence:
+        evidence = gathered(own, other, candidates, settings)
+        nowhere = np.zeros(len(evidence.keys), np.int16)
+        return replace(evidence, other=replace(evidence.other, surely=nowhere))
+
+    comparison = compared(story.first, story.second)
+    detector = rule(min_sure_share=0.0)  # its own limit is off
+    assert (scores(detector, comparison)[1].disappeared > 0.5).sum() > 100
+    monkeypatch.setattr("worker.detectors.voxels.scores.gathered", unsure)
+    assert (scores(detector, comparison)[1].disappeared > 0.5).sum() == 0
