@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -7,6 +9,7 @@ from tests.support.rooms import scores_of
 from tests.support.tilings import row_of
 from worker.detectors.detector import Detection
 from worker.pipeline.results.changes import ChangeSet, TileState, decide
+from worker.pipeline.results.objects import ChangeObjects
 
 NAN = (float("nan"),) * 3
 
@@ -145,3 +148,21 @@ def test_with_voxels_shares_and_counts_go_on() -> None:
     assert changes.observed_share.tolist() == [0.25, 0.75]
     assert changes.appeared.tolist() == [0, 1]
     assert changes.disappeared.tolist() == [0, 2]
+
+
+def test_with_objects_a_tile_that_none_lies_in_is_not_changed() -> None:
+    """Two loud tiles of which one was hardly looked at, no object; without objects they stay changed."""
+    loud = (0.1, 0.9, 0.0)
+    changes = _by_voxels(loud, loud, shares=[1.0, 0.2])
+    nothing = ChangeObjects(
+        objects=(),
+        moving=0,
+        voxel_size=0.05,
+        keys=np.empty(0, np.int64),
+        now=np.empty(0, np.int32),
+        before=np.empty(0, np.int32),
+    )
+    with_objects = replace(changes, objects=nothing).where_objects_lie(0.5)
+    assert [TileState(state).label for state in with_objects.states] == ["unchanged", "unobserved"]
+    without = changes.where_objects_lie(0.5)
+    assert [TileState(state).label for state in without.states] == ["changed", "changed"]
