@@ -33,10 +33,11 @@ def register(
 
     from worker.cloud.formats.scan import read_scan  # noqa: PLC0415
     from worker.cloud.poses import difference  # noqa: PLC0415
+    from worker.errors import RegistrationFailed  # noqa: PLC0415
     from worker.pipeline.mapping.settings import JointRegistrationSettings, MappingSettings  # noqa: PLC0415
     from worker.pipeline.mapping.survey_registration import register_survey_scans  # noqa: PLC0415
     from worker.pipeline.registration.preprocessing import prepare  # noqa: PLC0415
-    from worker.pipeline.registration.results import ScanFile, ScanRejected  # noqa: PLC0415
+    from worker.pipeline.registration.results import ScanFile  # noqa: PLC0415
     from worker.pipeline.registration.settings import RegistrationSettings  # noqa: PLC0415
 
     settings = JointRegistrationSettings(
@@ -49,7 +50,7 @@ def register(
     seconds = time.perf_counter() - begun
     registration = outcome.registration
     if registration is None:
-        raise ScanRejected(str(outcome.reason))
+        raise RegistrationFailed(str(outcome.reason))
     result = document(registration, seconds)
     if truth is not None:
         metres, radians = difference(np.loadtxt(truth), registration.map_from_scan)

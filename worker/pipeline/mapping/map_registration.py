@@ -284,10 +284,10 @@ class _Build:
             elif late is not None and late.pose is None:
                 results.append(late.result)
             else:
-                reason = (
+                detail = (
                     f"scan {name}: it contradicts what its neighbours saw as free space; scan there again"
                 )
-                results.append(ScanResult.rejected(name, ScanRejected(reason)))
+                results.append(ScanResult.rejected(name, ScanRejected.because("disagrees", detail)))
         return tuple(results)
 
     def _registration(

@@ -114,6 +114,7 @@ def _require_free_space(
         raise rejected(
             scan.name,
             hypothesis,
+            "other_place",
             f"{violation:.1%} of its points stand where its neighbours saw free space (at most {limit:.1%} is "
             f"accepted); {advice}, or scan there again",
         )

@@ -180,6 +180,7 @@ class _Visit:
         return rejected(
             self.files[index].name,
             hypothesis,
+            "disagrees",
             f"it disagrees with the other scans, which would have it {apart * 100:.0f} cm from where "
             f"it fits the map and see through {refined.free_space_violation[index]:.1%} of it; scan there again",
         )

@@ -70,15 +70,19 @@ def prepare(scan: Scan, settings: RegistrationSettings) -> PreparedScan:
     voxels = Voxels.of(scan.points, size=settings.voxel_size, origin=origin if trusted else None)
     points = voxels.points
     if len(points) < settings.min_points:
-        raise ScanRejected(
+        raise ScanRejected.because(
+            "too_few_points",
             f"scan {scan.name}: {len(points)} voxels of {settings.voxel_size:g} m are left, "
-            f"{settings.min_points} are needed; scan for longer"
+            f"{settings.min_points} are needed; scan for longer",
+            voxels=len(points),
         )
     eigenvalue = least_eigenvalue(points)
     if eigenvalue < settings.min_eigenvalue:
-        raise ScanRejected(
+        raise ScanRejected.because(
+            "degenerate",
             f"scan {scan.name}: its surfaces leave a motion free (least eigenvalue {eigenvalue:.4f}, at least "
-            f"{settings.min_eigenvalue:g} is needed), as a bare plane does; scan a place with more structure"
+            f"{settings.min_eigenvalue:g} is needed), as a bare plane does; scan a place with more structure",
+            least_eigenvalue=eigenvalue,
         )
     return PreparedScan(
         name=scan.name,

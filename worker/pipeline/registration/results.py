@@ -19,6 +19,7 @@ from worker.cloud.poses import inverse, transformed
 from worker.cloud.types import Colors, Floats, Matrix4, Points
 from worker.cloud.voxels import Voxels
 from worker.errors import RegistrationFailed, ScanError
+from worker.pipeline.registration.diagnosis import Diagnosis, Reason
 
 _SAMPLED = 20  # scans of a visit that its carrier is looked for in
 
@@ -96,14 +97,23 @@ class RegistrationResult:
 
 
 class ScanRejected(RegistrationFailed):
-    """One scan found no place; the best numbers that were reached stand beside the reason, None before ICP."""
+    """One scan found no place; the best numbers that were reached stand beside the diagnosis, None before ICP."""
 
     def __init__(
-        self, reason: str, *, fitness: float | None = None, inlier_rmse: float | None = None
+        self, diagnosis: Diagnosis, *, fitness: float | None = None, inlier_rmse: float | None = None
     ) -> None:
-        super().__init__(reason)
+        super().__init__(diagnosis)  # its only argument, so that it travels between processes
+        self.diagnosis = diagnosis
         self.fitness = fitness  #: 0..1
         self.inlier_rmse = inlier_rmse  #: metres
+
+    def __str__(self) -> str:
+        return self.diagnosis.detail
+
+    @classmethod
+    def because(cls, reason: Reason, detail: str, **numbers: float) -> Self:
+        """Reject before anything was fitted."""
+        return cls(Diagnosis(reason=reason, detail=detail, numbers=numbers))
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -112,16 +122,32 @@ class ScanResult:
 
     name: str
     registration: RegistrationResult | None
-    reason: str | None = None  #: why it was left out
+    diagnosis: Diagnosis | None = None  #: why it was left out
+    warnings: tuple[Diagnosis, ...] = ()  #: what is odd about it though it was accepted
+    confidence: float | None = None  #: 0..1, that its pose is right; None where that was not asked
     fitness: float | None = None  #: 0..1, the best reached; None where there was nothing to fit to
     inlier_rmse: float | None = None  #: metres
 
+    @property
+    def reason(self) -> str | None:
+        """Why it was left out, in a sentence."""
+        return self.diagnosis and self.diagnosis.detail
+
     @classmethod
-    def accepted(cls, name: str, registration: RegistrationResult) -> Self:
+    def accepted(
+        cls,
+        name: str,
+        registration: RegistrationResult,
+        *,
+        warnings: tuple[Diagnosis, ...] = (),
+        confidence: float | None = None,
+    ) -> Self:
         """Return the result of a scan that was registered."""
         return cls(
             name=name,
             registration=registration,
+            warnings=warnings,
+            confidence=confidence,
             fitness=registration.fitness,
             inlier_rmse=registration.inlier_rmse,
         )
@@ -132,10 +158,18 @@ class ScanResult:
         return cls(
             name=name,
             registration=None,
-            reason=str(error),
+            diagnosis=getattr(error, "diagnosis", None) or Diagnosis(reason="unreadable", detail=str(error)),
             fitness=getattr(error, "fitness", None),
             inlier_rmse=getattr(error, "inlier_rmse", None),
         )
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class SurveyPlacement:
+    """How sure it is that the accepted scans of a survey stand where they were taken."""
+
+    confidence: float  #: 0..1, calibrated on the placement benchmark
+    in_doubt: bool  #: too little to believe it: no tile of the survey is `unchanged` then
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -16,6 +16,7 @@ import numpy as np
 from worker.cloud.poses import difference, inverse, transformed
 from worker.cloud.types import Matrix4
 from worker.cloud.visibility import RangeImage
+from worker.pipeline.registration.diagnosis import Diagnosis, Reason
 from worker.pipeline.registration.hypothesis import Hypothesis
 from worker.pipeline.registration.preprocessing import PreparedScan
 from worker.pipeline.registration.results import ScanRejected
@@ -108,7 +109,9 @@ def require_accepted(name: str, hypothesis: Hypothesis, settings: RegistrationSe
     """Raise ScanRejected with all numbers where the best hypothesis is not accepted."""
     if hypothesis.is_accepted(settings):
         return
+    reason: Reason = "no_fit"
     if hypothesis.contradicts_prior:
+        reason = "wrong_prior"
         advice = "it ends far from the pose prior that was given; check the prior, or leave it out"
     elif hypothesis.consistent_with_prior:
         advice = "check the pose prior that was given, and that the place is in the map"
@@ -117,6 +120,7 @@ def require_accepted(name: str, hypothesis: Hypothesis, settings: RegistrationSe
     raise rejected(
         name,
         hypothesis,
+        reason,
         f"fitness {hypothesis.fitness:.2f} (over {settings.min_fitness:g} is accepted), "
         f"inlier RMSE {hypothesis.inlier_rmse * 100:.1f} cm, inlier ratio {hypothesis.two_way_inlier_ratio:.2f} "
         f"(at least {hypothesis.required_inlier_ratio(settings):g}) over {hypothesis.overlap:.0%} of the scan; "
@@ -135,6 +139,7 @@ def require_constrained(
         raise rejected(
             name,
             hypothesis,
+            "degenerate",
             f"what it shares with the map leaves a motion free (least eigenvalue {eigenvalue:.4f}, at least "
             f"{settings.min_eigenvalue:g} is needed); scan more of the mapped place",
         )
@@ -160,17 +165,20 @@ def require_unambiguous(
             raise rejected(
                 name,
                 best,
+                "ambiguous",
                 f"it fits as well {apart * 100:.0f} cm away (inlier ratio {other.two_way_inlier_ratio:.2f} there, "
                 f"{best.two_way_inlier_ratio:.2f} here, over {best.overlap:.0%} of the scan); "
                 "scan more of the mapped place",
             )
 
 
-def rejected(name: str, hypothesis: Hypothesis, reason: str) -> ScanRejected:
+def rejected(
+    name: str, hypothesis: Hypothesis, reason: Reason, detail: str, **numbers: float
+) -> ScanRejected:
     """Make the error of a scan with the numbers of its best hypothesis."""
     rmse = hypothesis.inlier_rmse
     return ScanRejected(
-        f"scan {name}: {reason}",
+        Diagnosis(reason=reason, detail=f"scan {name}: {detail}", numbers=numbers),
         fitness=hypothesis.fitness,
         inlier_rmse=rmse if np.isfinite(rmse) else None,
     )
