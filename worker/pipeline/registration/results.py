@@ -131,7 +131,7 @@ class ScanResult:
     @property
     def reason(self) -> str | None:
         """Why it was left out, in a sentence."""
-        return self.diagnosis and self.diagnosis.detail
+        return None if self.diagnosis is None else self.diagnosis.detail
 
     @classmethod
     def accepted(

@@ -16,7 +16,7 @@ WALK = [rigid(2.0 * step, 0.1 * step**2, 0.35, yaw=15.0 * step) for step in rang
 
 def outcome(name: str, pose: Matrix4 | None, sigma: float | None = 0.01) -> ScanResult:
     if pose is None:
-        return ScanResult(name=name, registration=None, reason="fits nothing")
+        return ScanResult(name=name, registration=None, diagnosis=None)
     uncertainty = None if sigma is None else Uncertainty(translation=sigma, rotation=np.radians(0.1))
     registration = RegistrationResult(
         map_from_scan=pose,
