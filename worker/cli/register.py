@@ -43,10 +43,11 @@ def register(
     settings = JointRegistrationSettings(
         registration=RegistrationSettings(), mapping=MappingSettings(), max_points=50_000_000
     )
-    target = prepare(read_scan(reference), settings.registration).surface
+    target = prepare(read_scan(reference), settings.registration, with_sights=True)
     file = ScanFile(name=current.name, path=current, pose=None if start is None else np.loadtxt(start))
     begun = time.perf_counter()
-    (outcome,) = register_survey_scans([file], target, settings=settings)
+    registered = register_survey_scans([file], target.surface, sights=target.sights, settings=settings)
+    (outcome,) = registered.outcomes
     seconds = time.perf_counter() - begun
     registration = outcome.registration
     if registration is None:

@@ -117,13 +117,18 @@ def locate_survey(
 ) -> LocatedSurvey:
     """Register the scans to the map, fuse those accepted, set both side by side (stage 3, first half).
 
-    `reference_seen` is what the map's scans saw; detectors by voxels need it. Raises ScanError where no
+    `reference_seen` is what the map's scans saw: poses are held against it, and detectors by voxels need it. Raises ScanError where no
     file can be read, NoScanAccepted where none is left to compare.
     """
     files = with_carrier(files, settings.carrier, max_points=settings.max_scan_points)
-    outcomes = register_survey_scans(
-        files, reference.surface(), settings=settings.joint_registration, progress=progress
+    registered = register_survey_scans(
+        files,
+        reference.surface(),
+        settings=settings.joint_registration,
+        sights=None if reference_seen is None else reference_seen.sights,
+        progress=progress,
     )
+    outcomes = registered.outcomes
     if not any(outcome.registration for outcome in outcomes):
         raise NoScanAccepted(outcomes)
     progress("tiling", 0.0)
