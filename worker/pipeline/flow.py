@@ -21,6 +21,7 @@ from worker.pipeline.registration.results import (
     RegisteredScan,
     ScanFile,
     ScanResult,
+    SurveyPlacement,
     read_registered,
     with_carrier,
 )
@@ -53,6 +54,7 @@ class LocatedSurvey:
     current: CurrentMap
     comparison: Comparison
     outcomes: tuple[ScanResult, ...]
+    placement: SurveyPlacement
     seen: Seen  #: what its scans saw
 
 
@@ -61,7 +63,8 @@ class NoScanAccepted(RegistrationFailed):
 
     def __init__(self, outcomes: Sequence[ScanResult]) -> None:
         self.outcomes = tuple(outcomes)
-        reasons = "; ".join(str(outcome.reason) for outcome in outcomes)
+        told = [outcome.diagnosis for outcome in outcomes if outcome.diagnosis is not None]
+        reasons = "; ".join(f"{diagnosis.detail} [{diagnosis.reason}]" for diagnosis in told)
         super().__init__(f"no scan could be registered to the map: {reasons}")
 
 
@@ -131,6 +134,7 @@ def locate_survey(
     outcomes = registered.outcomes
     if not any(outcome.registration for outcome in outcomes):
         raise NoScanAccepted(outcomes)
+    placement = SurveyPlacement(confidence=1.0, in_doubt=False)
     progress("tiling", 0.0)
     sights: list[Sights | None] = []
     accepted = watched(accepted_scans(files, outcomes, settings), sights)
@@ -140,7 +144,9 @@ def locate_survey(
         reference, current, settings=settings, reference_seen=reference_seen, current_seen=seen
     )
     progress("tiling", 1.0)
-    return LocatedSurvey(current=current, comparison=comparison, outcomes=outcomes, seen=seen)
+    return LocatedSurvey(
+        current=current, comparison=comparison, outcomes=outcomes, placement=placement, seen=seen
+    )
 
 
 def compare(
@@ -174,14 +180,20 @@ def detect(
     embedding: Arrays | None = None,
     threshold: float | None = None,
     settings: PipelineSettings | None = None,
+    placement: SurveyPlacement | None = None,
     progress: Progress = no_progress,
 ) -> ChangeSet:
-    """Score the survey, then decide (stage 3, second half); the threshold is the card's if None is given."""
+    """Score the survey, then decide (stage 3, second half); the threshold is the card's if None is given.
+
+    `placement` is what `locate_survey` says of it; None where it is known.
+    """
     settings = settings or PipelineSettings()
     detection = detector.detect(comparison, embedding=embedding, progress=progress)
     own = threshold is None
     threshold = detector.card.threshold if threshold is None else threshold
-    return concluded(comparison, detection, threshold=threshold, settings=settings, by_objects=own)
+    return concluded(
+        comparison, detection, threshold=threshold, settings=settings, placement=placement, by_objects=own
+    )
 
 
 def concluded(
@@ -190,11 +202,17 @@ def concluded(
     *,
     threshold: float,
     settings: PipelineSettings,
+    placement: SurveyPlacement | None = None,
     by_objects: bool = True,
 ) -> ChangeSet:
-    """Make of a detector's scores the states of tiles and, where it scored voxels that both visits saw, objects."""
+    """Make of a detector's scores the states of tiles and, where it scored voxels that both visits saw, objects.
+
+    Where the placement is in doubt, scores prove nothing: no tile is unchanged or changed, and there are no objects.
+    """
     least = settings.tiling.min_observed_share
     changes = decide(comparison.tile_pairs, detection, threshold=threshold, min_observed_share=least)
+    if placement is not None and placement.in_doubt:
+        return changes.in_doubt(placement.confidence)
     if detection.voxels is None or comparison.reference.seen is None or comparison.current.seen is None:
         return changes
     objects = change_objects(comparison, detection.voxels, settings.objects)
