@@ -85,6 +85,51 @@ def registration(
     terminal.show(result, tables, as_json=as_json)
 
 
+def placement(
+    context: typer.Context,
+    part: Annotated[
+        Literal["calibration", "validation", "figures"],
+        typer.Option(help="Which places: limits are chosen on the first two, figures taken on the last."),
+    ] = "figures",
+    trials: Annotated[
+        int | None, typer.Option(min=1, help="Of each row of the table at most; left out: all.")
+    ] = None,
+    only: Annotated[
+        str | None, typer.Option(help="Kinds of trials, with commas; left out: all. See docs/placement.md.")
+    ] = None,
+    sites: Annotated[int, typer.Option(min=1, max=999, help="Places that are mapped.")] = 25,
+    processes: Annotated[int, typer.Option(min=1, max=2, help="That register side by side.")] = 2,
+    real: Annotated[Path | None, typer.Option(help="Folder of real scans: see docs/test-data.md.")] = None,
+    out: Annotated[
+        Path, typer.Option(help="Folder for placement.json, pictures, and maps and answers, which are kept.")
+    ] = Path("bench/placement"),
+    as_json: AsJson = False,
+) -> None:
+    """Send surveys of a map's place, of places like it, and spoilt ones; count what is believed at a wrong pose.
+
+    Maps and answers are kept: what was begun goes on where it ended, and is done anew where the pipeline's code is
+    another one.
+    """
+    from worker.benchmarks.documents import write_json  # noqa: PLC0415
+    from worker.benchmarks.placement.benchmark import PlacementBenchmarkSettings, evaluate  # noqa: PLC0415
+    from worker.benchmarks.placement.plan import KINDS, PlacementSettings, kinds_named  # noqa: PLC0415
+    from worker.benchmarks.placement.report import tables  # noqa: PLC0415
+
+    settings = PlacementBenchmarkSettings(
+        out=out,
+        part=part,
+        only=KINDS if only is None else kinds_named(only),
+        trials=trials,
+        processes=processes,
+        real=real,
+        made=PlacementSettings(sites=sites),
+    )
+    with terminal.progress_bar() as progress:
+        result = {"command": command_line(context), **evaluate(settings, progress)}
+    write_json(out / "placement.json", result)
+    terminal.show(result, tables, f"saved in {out}", as_json=as_json)
+
+
 def paper(
     context: typer.Context,
     model: Model = PAPER_MODEL,

@@ -41,7 +41,14 @@ def _commands() -> typer.Typer:
     for command in (detect, register, with_training_options(train), train_voxels, demo, evaluate.bench):
         commands.command()(command)
     measuring = typer.Typer(no_args_is_help=True, help="How good it is, measured where the truth is known.")
-    for command in (evaluate.registration, evaluate.paper, evaluate.revisit, evaluate.real, evaluate.record):
+    for command in (
+        evaluate.registration,
+        evaluate.placement,
+        evaluate.paper,
+        evaluate.revisit,
+        evaluate.real,
+        evaluate.record,
+    ):
         measuring.command()(command)
     commands.add_typer(measuring, name="evaluate")
     return commands

@@ -13,6 +13,7 @@ from worker.simulation.scenes.scene import Room, Scene
 Place = tuple[float, float]
 
 INNER = 0.12  #: metres, thickness of walls between rooms
+PIECES = (6, 15)  #: of furniture in a room by itself, the last one excluded
 
 
 def small_office(seed: int) -> Scene:
@@ -48,15 +49,16 @@ def small_office(seed: int) -> Scene:
     return draft.finish(rooms=(*rooms, corridor), route=_round(rooms, doors, (south + north) / 2))
 
 
-def random_room(seed: int) -> Scene:
-    """Build one room of 4-8 x 3.2-6.5 x 2.4-3.2 m with 6 to 14 pieces of furniture."""
+def random_room(seed: int, *, size: tuple[float, float, float] | None = None) -> Scene:
+    """Build one room of 4-8 x 3.2-6.5 x 2.4-3.2 m, or of a given size, with 6 to 14 pieces of furniture."""
     rng = np.random.default_rng(seed)
     draft = Draft(f"room-{seed}", rng)
-    (x, y, height) = rng.uniform((4.0, 3.2, 2.4), (8.0, 6.5, 3.2)).tolist()
+    drawn: tuple[float, float, float] = tuple(rng.uniform((4.0, 3.2, 2.4), (8.0, 6.5, 3.2)).tolist())
+    x, y, height = size or drawn
     room = Room(low=(0.0, 0.0), high=(x, y), height=height)
     fittings.shell(draft, (room,))
     _outer_walls(draft, x, y, height, doors=fittings.openings(rng, x))
-    _fit_out(draft, room, 1, pieces=int(rng.integers(6, 15)))
+    _fit_out(draft, room, 1, pieces=int(rng.integers(*PIECES)))
     corners = [(0.3 * x, 0.3 * y), (0.7 * x, 0.3 * y), (0.7 * x, 0.7 * y), (0.3 * x, 0.7 * y)]
     return draft.finish(rooms=(room,), route=(*corners, corners[0]))
 
@@ -81,12 +83,18 @@ def _inner_wall(y: float, doors: list[float], height: float) -> Mesh:
 
 
 def _fit_out(draft: Draft, room: Room, number: int, *, pieces: int = 8) -> None:
-    """Put in lamps, a radiator, a pillar, pictures, then furniture, more of it along the walls than in the middle."""
+    """Put in lamps, a radiator, a pillar, then furniture."""
     rng = draft.rng
     fittings.hang_lamps(draft, room, f"lamps-{number}")
     draft.against_wall(room, "radiator", fittings.radiator(), z=0.12, fixed=True)
     if rng.random() < 0.5:
         draft.against_wall(room, "pillar", fittings.pillar(height=room.height), fixed=True)
+    furnish(draft, room, pieces=pieces)
+
+
+def furnish(draft: Draft, room: Room, *, pieces: int = 8) -> None:
+    """Put in so many pieces of furniture, half of them along the walls, and a picture."""
+    rng = draft.rng
     standing = [str(kind) for kind in rng.permutation(list(furniture.WALL_PIECES))]
     free = [str(kind) for kind in rng.permutation(list(furniture.FREE_PIECES))]
     for count in range(pieces):

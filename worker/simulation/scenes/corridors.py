@@ -109,20 +109,22 @@ def _furnished(draft: Draft, spans: list[Span], walls: list[Wall], height: float
         for order, (radius, z) in enumerate(((0.06, height - 0.3), (0.04, height - 0.5)), start=1):
             pipe = fittings.pipe_along(room, radius=radius, inset=0.12, z=z)
             draft.building(f"pipe-{number}-{order}", pipe)
-        _line(draft, room)
+        line(draft, room)
     return rooms
 
 
-def _line(draft: Draft, room: Room) -> None:
-    """Put in what stands along a corridor, leaving the middle free."""
+def line(draft: Draft, room: Room, *, fixed: bool = True) -> None:
+    """Put in what stands along a corridor, leaving the middle free; without what is fixed where that is there."""
     span = max(room.high[0] - room.low[0], room.high[1] - room.low[1])
     for _ in range(max(1, int(span / 7))):
-        draft.against_wall(room, "pillar", fittings.pillar(height=room.height - 0.7), fixed=True)
+        if fixed:
+            draft.against_wall(room, "pillar", fittings.pillar(height=room.height - 0.7), fixed=True)
         draft.against_wall(room, "cabinet", furniture.cabinet(0.8, 0.4, float(draft.rng.uniform(0.9, 1.9))))
         draft.against_wall(room, "bench", furniture.bench())
         draft.against_wall(room, "plant", furniture.plant())
         draft.against_wall(room, "crate", furniture.crate())
         draft.against_wall(room, "bin", furniture.bin_())
         draft.against_wall(room, "extinguisher", furniture.extinguisher(), z=0.9)
-        draft.against_wall(room, "radiator", fittings.radiator(), z=0.12, fixed=True)
+        if fixed:
+            draft.against_wall(room, "radiator", fittings.radiator(), z=0.12, fixed=True)
         draft.against_wall(room, "picture", fittings.picture(), z=1.4)

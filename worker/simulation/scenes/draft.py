@@ -22,6 +22,13 @@ class Draft:
         self._scene = Scene(name=name, objects=())
         self._doorways: list[Floats] = []
 
+    @classmethod
+    def in_shell(cls, scene: Scene, name: str, rng: np.random.Generator) -> Draft:
+        """Begin with what is fixed in a scene, and nothing else."""
+        draft = cls(name, rng)
+        draft._scene = Scene(name=name, objects=tuple(item for item in scene.objects if item.fixed))
+        return draft
+
     def building(self, name: str, mesh: Mesh) -> None:
         """Add a part of the building itself."""
         self._put(name, mesh, fixed=True)
@@ -64,6 +71,25 @@ class Draft:
                     return True
         return False
 
+    def stand(
+        self,
+        room: Room,
+        kind: str,
+        mesh: Mesh,
+        where: tuple[float, float, float],
+        *,
+        sigma: tuple[float, float],
+    ) -> bool:
+        """Stand a piece at x, y (metres) and yaw (degrees), off by chance; False where it fits nowhere there."""
+        for _ in range(TRIES):
+            (dx, dy), turn = self.rng.normal(0.0, sigma[0], 2), self.rng.normal(0.0, sigma[1])
+            placed = mesh.at(where[0] + dx, where[1] + dy, yaw=where[2] + float(turn))
+            low, high = placed.bounds[:, :2]
+            inside = bool(np.all(low > room.low) and np.all(high < room.high))
+            if inside and self._try(kind, placed):
+                return True
+        return False
+
     def finish(self, *, rooms: tuple[Room, ...], route: tuple[tuple[float, float], ...]) -> Scene:
         """Return the scene as it stands."""
         return Scene(name=self.name, objects=self._scene.objects, rooms=rooms, route=route)
@@ -77,7 +103,8 @@ class Draft:
         return True
 
     def _put(self, name: str, mesh: Mesh, *, fixed: bool) -> None:
-        item = SceneObject(name=name, object_id=1 + len(self._scene.objects), mesh=mesh, fixed=fixed)
+        highest = max((item.object_id for item in self._scene.objects), default=0)
+        item = SceneObject(name=name, object_id=1 + highest, mesh=mesh, fixed=fixed)
         self._scene = Scene(name=self.name, objects=(*self._scene.objects, item))
 
 

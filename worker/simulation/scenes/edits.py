@@ -46,6 +46,42 @@ def random_edits(
     return scene, tuple(changes)
 
 
+def changed(scene: Scene, share: float, *, seed: int) -> Scene:
+    """Return the scene with a share (0 to 1) of its movable standing furniture edited, as between two visits.
+
+    In turn a piece is moved, taken away while another one comes elsewhere, or exchanged for another kind in its place.
+    What finds no place is left as it was, or left out.
+    """
+    rng = np.random.default_rng([seed, 16])
+    standing = [item for item in scene.movable if _stands(item)]
+    count = int(share * len(standing) + rng.random())
+    first = int(rng.integers(3))
+    for number, chosen in enumerate(rng.permutation(len(standing))[:count].tolist()):
+        item, way = standing[chosen], (first + number) % 3
+        if way == 0:
+            moved = _move(scene, item, rng)
+            scene = scene if moved is None else moved[0]
+            continue
+        without, _ = scene.without(item.name)
+        added = _exchanged(without, item, f"new-{number}", rng) if way == 2 else None
+        added = added or _add(without, f"new-{number}", rng)
+        scene = without if added is None else added[0]
+    return scene
+
+
+def _exchanged(
+    scene: Scene, gone: SceneObject, prefix: str, rng: np.random.Generator
+) -> tuple[Scene, Change] | None:
+    """Stand a piece of another kind where one was taken away, turned at random; None where none fits."""
+    pieces = {**WALL_PIECES, **FREE_PIECES}
+    x, y = gone.mesh.bounds.mean(axis=0)[:2].tolist()
+    for kind in rng.permutation([kind for kind in pieces if not gone.name.startswith(kind)]).tolist():
+        mesh = pieces[kind]().at(x, y, yaw=float(rng.choice([0, 90, 180, 270])))
+        if any(_within(room, mesh.bounds) for room in scene.rooms) and scene.is_free(mesh.bounds):
+            return scene.with_added(f"{prefix}-{kind}", mesh)
+    return None
+
+
 def edit_kinds(count: int) -> tuple[ChangeKind, ...]:
     """Return `count` kinds of edits in turn: add, remove, move, add, ..."""
     kinds: tuple[ChangeKind, ...] = get_args(ChangeKind)

@@ -70,6 +70,13 @@ def sofa(width: float = 1.8, depth: float = 0.8) -> Mesh:
     return union(box(width - 0.3, depth - 0.05, 0.42), *arms, back)
 
 
+def bed(width: float = 1.4, length: float = 2.0) -> Mesh:
+    """Build a mattress on a box, a headboard at its back, and two pillows."""
+    board = box(width + 0.1, 0.06, 1.0).at(y=-length / 2 - 0.03)
+    pillows = [box(0.55, 0.35, 0.12).at(sign * width / 4, -length / 2 + 0.25, 0.5) for sign in (-1, 1)]
+    return union(box(width - 0.1, length - 0.1, 0.28), box(width, length, 0.22).at(z=0.28), board, *pillows)
+
+
 def plant(height: float = 1.3) -> Mesh:
     """Build a conical pot, a stem and three balls of leaves."""
     pot = turned([(0.0, 0.0), (0.14, 0.0), (0.19, 0.32), (0.0, 0.32)])
