@@ -120,8 +120,8 @@ def locate_survey(
 ) -> LocatedSurvey:
     """Register the scans to the map, fuse those accepted, set both side by side (stage 3, first half).
 
-    `reference_seen` is what the map's scans saw: poses are held against it, and detectors by voxels need it. Raises ScanError where no
-    file can be read, NoScanAccepted where none is left to compare.
+    `reference_seen` is what the map's scans saw: poses are held against it, and detectors by voxels need it. Raises
+    ScanError where no file can be read, NoScanAccepted where none is left to compare.
     """
     files = with_carrier(files, settings.carrier, max_points=settings.max_scan_points)
     registered = register_survey_scans(
@@ -134,7 +134,6 @@ def locate_survey(
     outcomes = registered.outcomes
     if not any(outcome.registration for outcome in outcomes):
         raise NoScanAccepted(outcomes)
-    placement = SurveyPlacement(confidence=1.0, in_doubt=False)
     progress("tiling", 0.0)
     sights: list[Sights | None] = []
     accepted = watched(accepted_scans(files, outcomes, settings), sights)
@@ -145,7 +144,11 @@ def locate_survey(
     )
     progress("tiling", 1.0)
     return LocatedSurvey(
-        current=current, comparison=comparison, outcomes=outcomes, placement=placement, seen=seen
+        current=current,
+        comparison=comparison,
+        outcomes=outcomes,
+        placement=registered.placement,
+        seen=seen,
     )
 
 
