@@ -149,7 +149,7 @@ class _Search:
                 quarter_turns(self.scan.surface, best.pose), least=_RIVAL * best.hypothesis.score
             )
         if not self._is_clear():
-            self._refine_features()
+            self._refine_features(thoroughly=not any(map(self._is_accepted, self.found)))
 
     def _refine_best(self, starts: Iterator[Matrix4] | list[Matrix4], *, least: float = 0.0) -> None:
         """Refine the best starts; once a pose is clear, only those that come near it in coarse alignment."""
@@ -162,9 +162,10 @@ class _Search:
     def _coarse(self, starts: Iterator[Matrix4] | list[Matrix4]) -> list[CoarsePose]:
         return by_score(coarse_alignment(self.scan.surface, self.place.surface, start) for start in starts)
 
-    def _refine_features(self) -> None:
-        seeds = self.registration.search_seeds if self.prior is None else 1
-        resolutions = self.registration.search_resolutions
+    def _refine_features(self, *, thoroughly: bool) -> None:
+        """Try what local features name: one draw, or many where surfaces bear out nothing that was found so far."""
+        resolutions = self.registration.search_resolutions[: None if thoroughly else 1]
+        seeds = self.registration.search_seeds if thoroughly and self.prior is None else 1
         for pose in fpfh_candidates(
             self.scan.surface, self.place.surface, resolutions=resolutions, seeds=seeds
         ):
