@@ -215,7 +215,7 @@ def concluded(
     least = settings.tiling.min_observed_share
     changes = decide(comparison.tile_pairs, detection, threshold=threshold, min_observed_share=least)
     if placement is not None and placement.in_doubt:
-        return changes.in_doubt(placement.confidence)
+        return changes.in_doubt(placement.confidence or 0.0)
     if detection.voxels is None or comparison.reference.seen is None or comparison.current.seen is None:
         return changes
     objects = change_objects(comparison, detection.voxels, settings.objects)
