@@ -68,9 +68,9 @@ def recorded_placement(placement: SurveyPlacement) -> Placement:
 
 def kept_placement(placement: Placement | None) -> SurveyPlacement | None:
     """Return what was recorded of a survey of accepted scans; None where it was registered by an earlier release."""
-    if placement is None or placement.confidence is None:
+    if placement is None or placement.state == "refused":
         return None
-    return SurveyPlacement(confidence=placement.confidence, in_doubt=placement.state == "in_doubt")
+    return SurveyPlacement(confidence=placement.confidence or 0.0, in_doubt=placement.state == "in_doubt")
 
 
 def save_scans(
