@@ -65,6 +65,8 @@ def summary(result: dict[str, Any]) -> Group:
 
 
 def _placement(placement: dict[str, Any]) -> str:
+    if placement["confidence"] is None:
+        return "placement by surfaces alone: it is not known from where the points were seen"
     confidence = f"(confidence {placement['confidence']:.2f})"
     if placement["state"] == "in_doubt":
         return f"placement in doubt {confidence}: no tile counts as unchanged or changed"

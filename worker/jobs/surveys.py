@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import asdict
 
 from service.catalog import blob_keys
@@ -22,7 +22,7 @@ from worker.cloud import npz
 from worker.detectors.card import Card
 from worker.detectors.comparison import Comparison
 from worker.detectors.detector import Detection
-from worker.errors import ScanError
+from worker.errors import MapFailed, ScanError
 from worker.jobs.models import card_of, card_that_fits, kept_detector, pipeline_settings
 from worker.jobs.scans import (
     kept_placement,
@@ -55,10 +55,15 @@ def register_survey(context: Context) -> None:
     """Fuse the scans to one cloud in the map's frame; a survey with no accepted scan fails here."""
     survey, version, settings = _asked(context)
     reference = kept_reference(context, version)
+    seen = None
+    with suppress(MapFailed):  # without what the map's scans saw, poses are judged by surfaces alone
+        seen = kept_seen(context, version, voxel_size=settings.registration.voxel_size)
     with ExitStack() as stack:
         files = scan_files(context, survey.scans, stack, settings)
         try:
-            located = locate_survey(files, reference, settings=settings, progress=context.report)
+            located = locate_survey(
+                files, reference, settings=settings, reference_seen=seen, progress=context.report
+            )
         except NoScanAccepted as error:
             _refuse(context, survey, error.outcomes, reference)
             raise

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from worker.cloud.seen import Seen
 from worker.cloud.sight import Sights
 from worker.cloud.tiling import TileGrid, Tiles, grid_over, grown, pair_tiles, touched_tiles
@@ -17,6 +19,7 @@ from worker.pipeline.mapping.fusion import CurrentMap, ReferenceMap, current_map
 from worker.pipeline.mapping.map_registration import MapReport, register_map_scans
 from worker.pipeline.mapping.pair_registration import PairCache
 from worker.pipeline.mapping.survey_registration import register_survey_scans
+from worker.pipeline.placement.displacement import displaced_tiles
 from worker.pipeline.registration.results import (
     RegisteredScan,
     ScanFile,
@@ -138,7 +141,8 @@ def locate_survey(
     sights: list[Sights | None] = []
     accepted = watched(accepted_scans(files, outcomes, settings), sights)
     fused = fuse(accepted, voxel_size=reference.voxel_size)
-    current, seen = current_map(fused), Seen.of_voxels(fused, sights)
+    displaced = displaced_tiles(registered.held, reference.grid)
+    current, seen = replace(current_map(fused), displaced=displaced), Seen.of_voxels(fused, sights)
     comparison = compare(
         reference, current, settings=settings, reference_seen=reference_seen, current_seen=seen
     )
@@ -173,6 +177,7 @@ def compare(
         ),
         current=Side(points=current.points, scans=current_scans, seen=current_seen),
         tile_pairs=pair_tiles(tiles, current.points, settings=settings.tiling),
+        displaced=current.displaced,
     )
 
 
@@ -211,16 +216,19 @@ def concluded(
     """Make of a detector's scores the states of tiles and, where it scored voxels that both visits saw, objects.
 
     Where the placement is in doubt, scores prove nothing: no tile is unchanged or changed, and there are no objects.
+    The same is said of single tiles in which walls, floor or ceiling do not lie on the map's.
     """
     least = settings.tiling.min_observed_share
     changes = decide(comparison.tile_pairs, detection, threshold=threshold, min_observed_share=least)
     if placement is not None and placement.in_doubt:
         return changes.in_doubt(placement.confidence or 0.0)
+    displaced = np.empty((0, 3), np.int32) if comparison.displaced is None else comparison.displaced
     if detection.voxels is None or comparison.reference.seen is None or comparison.current.seen is None:
-        return changes
+        return changes.with_displaced(displaced)
     objects = change_objects(comparison, detection.voxels, settings.objects)
     changes = replace(changes, voxels=detection.voxels, objects=objects)
-    return changes.where_objects_lie(least) if by_objects else changes
+    changes = changes.where_objects_lie(least) if by_objects else changes
+    return changes.with_displaced(displaced)
 
 
 def accepted_scans(

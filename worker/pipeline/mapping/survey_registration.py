@@ -31,7 +31,7 @@ from worker.pipeline.mapping.tasks import (
     read_and_prepare,
 )
 from worker.pipeline.placement.belief import confidence, log_odds
-from worker.pipeline.placement.contradictions import Place
+from worker.pipeline.placement.contradictions import Held, Place
 from worker.pipeline.placement.scan_placement import PlacedScan, other_place, place_scan
 from worker.pipeline.registration.hypothesis import Hypothesis
 from worker.pipeline.registration.icp import normal_equations
@@ -64,6 +64,9 @@ class SurveyRegistration:
 
     outcomes: tuple[ScanResult, ...]
     placement: SurveyPlacement
+    held: tuple[
+        tuple[Held, Held], ...
+    ]  #: of accepted scans, their points against the map's and the other way
 
 
 def register_survey_scans(
@@ -156,7 +159,8 @@ class _Visit:
             for index, file in enumerate(self.files)
         )
         kept = [scan for index, scan in placed.items() if index in refined.poses]
-        return SurveyRegistration(outcomes=outcomes, placement=self._whole(kept))
+        held = tuple(scan.held for scan in kept if scan.held is not None)
+        return SurveyRegistration(outcomes=outcomes, placement=self._whole(kept), held=held)
 
     def _prepare(self) -> dict[int, Matrix4 | None]:
         """Read every file; return the priors of those that can hold a pose. Raises ScanError where none can be read."""

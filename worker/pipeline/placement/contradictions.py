@@ -110,8 +110,12 @@ def contradictions(
     scan: PreparedScan, place: Place, map_from_scan: Matrix4, *, sample: int = _SAMPLE
 ) -> Contradictions:
     """Count what both visits say of each other's points under a pose; the scan's frame may have any origin."""
-    both = [held.counts() for held in held_both_ways(scan, place, map_from_scan, sample=sample)]
-    judged, through, near, off, things = np.stack(both, axis=1)
+    return counted(held_both_ways(scan, place, map_from_scan, sample=sample))
+
+
+def counted(held: tuple[Held, Held]) -> Contradictions:
+    """Count what `held_both_ways` found."""
+    judged, through, near, off, things = np.stack([one.counts() for one in held], axis=1)
     return Contradictions(judged=judged, through=through, near=near, off=off, things=things)
 
 

@@ -15,7 +15,15 @@ import numpy as np
 from worker.cloud.poses import difference, skew
 from worker.cloud.types import Floats, Matrix4
 from worker.pipeline.placement.belief import confidence, log_odds, odds_of
-from worker.pipeline.placement.contradictions import BUILDING, THINGS, Contradictions, Place, contradictions
+from worker.pipeline.placement.contradictions import (
+    BUILDING,
+    THINGS,
+    Contradictions,
+    Held,
+    Place,
+    counted,
+    held_both_ways,
+)
 from worker.pipeline.placement.settings import PlacementSettings
 from worker.pipeline.registration.bev_correlation import bev_candidates
 from worker.pipeline.registration.diagnosis import Diagnosis
@@ -55,6 +63,7 @@ class PlacedScan:
     hypothesis: Hypothesis
     told: Contradictions | None  #: None where no rays are known, of the scan or of the map
     log_odds: float | None  #: None where both visits saw too little of each other
+    held: tuple[Held, Held] | None = None  #: the points behind it, both ways
     warnings: tuple[Diagnosis, ...] = ()
 
     @property
@@ -182,8 +191,9 @@ class _Search:
             self.found[:] = [other for other in self.found if other not in doubles] + [placed]
 
     def _told(self, hypothesis: Hypothesis) -> PlacedScan:
-        told = contradictions(self.scan, self.place, hypothesis.target_from_source)
-        return PlacedScan(hypothesis=hypothesis, told=told, log_odds=log_odds(told))
+        held = held_both_ways(self.scan, self.place, hypothesis.target_from_source)
+        told = counted(held)
+        return PlacedScan(hypothesis=hypothesis, told=told, log_odds=log_odds(told), held=held)
 
     # --- deciding between them
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from worker.cloud.tiling import TilePairs, tile_id
-from worker.cloud.types import Bools
+from worker.cloud.types import Bools, Indices
 from worker.detectors.detector import Detection, VoxelScores, change_score
 from worker.pipeline.results.objects import ChangeObjects
 
@@ -75,6 +75,17 @@ class ChangeSet:
         states = self.states.copy()
         states[states != TileState.UNOBSERVED] = TileState.INCONSISTENT
         return replace(self, states=states, voxels=None, objects=None, doubtful_placement=confidence)
+
+    def with_displaced(self, displaced: Indices) -> ChangeSet:
+        """Call tiles (D, 3) inconsistent in which the building itself is off; objects that lie in such alone go."""
+        if not len(displaced):
+            return self
+        ids = {tile_id(index) for index in displaced}
+        inside = np.array([tile_id(index) in ids for index in self.pairs.reference.indices], bool)
+        states = self.states.copy()
+        states[inside & (states != TileState.UNOBSERVED)] = TileState.INCONSISTENT
+        objects = None if self.objects is None else self.objects.outside(ids)
+        return replace(self, states=states, objects=objects)
 
     def counts(self) -> dict[str, int]:
         """Count the tiles by state, every state named."""
