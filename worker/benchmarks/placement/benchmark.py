@@ -40,7 +40,13 @@ def evaluate(settings: PlacementBenchmarkSettings, progress: Progress = no_progr
         **document(answered),
     }
     if settings.real is not None:
-        result["real"] = evaluate_real(settings.real, settings.made.pipeline, progress)
+        result["real"] = evaluate_real(
+            settings.real,
+            settings.made.pipeline,
+            settings.out,
+            processes=settings.processes,
+            progress=progress,
+        )
     draw(settings.out, result)
     return result
 
