@@ -26,6 +26,7 @@ SLOW = (
     "worker/benchmarks/paper/test_benchmark.py",
     "worker/benchmarks/paper/test_report.py",
     "worker/benchmarks/placement/test_answers.py",
+    "worker/benchmarks/placement/test_pictures.py",
     "worker/benchmarks/placement/test_placement_benchmark.py",
     "worker/benchmarks/placement/test_surveys.py",
     "worker/benchmarks/registration/test_benchmark.py",

@@ -64,7 +64,7 @@ def test_a_row_counts_each_verdict_of_all_its_scans():
     assert counts == [1, 1, 1, 1, 2]
     assert row["wrong_rate"]["rate"] == pytest.approx(1 / 6)
     assert row["right_rate"]["rate"] == pytest.approx(1 / 3)
-    assert row["reasons"] == {"other_place": 1}
+    assert (row["reasons"], row["named"]) == ({"other_place": 1}, 1)
     assert row["centimetres"]["median"] == pytest.approx(1.0)
 
 

@@ -67,6 +67,17 @@ def test_right_scans_of_places_that_repeat_have_a_row_of_their_own():
     assert rows == {"right, hotel corridor", "right, hotel corridor, prior"}
 
 
+def test_mirrored_rooms_of_a_hotel_have_a_row_of_their_own():
+    planned = trials(SETTINGS, "figures", only=("hotel",))
+    assert {trial.row.removesuffix(", prior") for trial in planned} == {
+        "hotel room, mirrored",
+        "hotel room, same plan",
+        "hotel corridor",
+    }
+    mirrored = [trial for trial in planned if "mirrored" in trial.row]
+    assert all(trial.other_number % 2 for trial in mirrored)
+
+
 def test_kinds_are_named_with_commas():
     assert kinds_named("twin, mixed-1+1") == ("twin", "mixed-1+1")
     with pytest.raises(ValueError, match="no kind of trial foreign; there are right"):
