@@ -100,6 +100,7 @@ def placement(
     sites: Annotated[int, typer.Option(min=1, max=999, help="Places that are mapped.")] = 25,
     processes: Annotated[int, typer.Option(min=1, max=2, help="That register side by side.")] = 2,
     real: Annotated[Path | None, typer.Option(help="Folder of real scans: see docs/test-data.md.")] = None,
+    pictures: Annotated[int, typer.Option(min=0, help="Of impostors, with what contradicts them.")] = 0,
     out: Annotated[
         Path, typer.Option(help="Folder for placement.json, pictures, and maps and answers, which are kept.")
     ] = Path("bench/placement"),
@@ -122,6 +123,7 @@ def placement(
         trials=trials,
         processes=processes,
         real=real,
+        pictures=pictures,
         made=PlacementSettings(sites=sites),
     )
     with terminal.progress_bar() as progress:

@@ -96,17 +96,13 @@ class TrialAnswer:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Task:
+class _Task:
     """One trial for a process to answer."""
 
     trial: Trial
     settings: PlacementSettings
-    folder: Path
-
-    @property
-    def path(self) -> Path:
-        """Of the answer."""
-        return answers_folder(self.settings, self.folder) / f"{self.trial.name}.json"
+    folder: Path  #: of maps and answers
+    kept: Path  #: file of the answer
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -129,8 +125,12 @@ def answers_of(
     An answer is kept for the code that gave it: with other code in the pipeline all are asked for anew. Raises
     MapFailed where a place makes no map, OSError for the folder.
     """
-    tasks = [Task(trial=trial, settings=settings, folder=folder) for trial in trials]
-    missing = [task for task in tasks if not task.path.exists()]
+    place = answers_folder(settings, folder)
+    tasks = [
+        _Task(trial=trial, settings=settings, folder=folder, kept=place / f"{trial.name}.json")
+        for trial in trials
+    ]
+    missing = [task for task in tasks if not task.kept.exists()]
     sites = [
         _SiteTask(plan=plan, settings=settings, folder=folder)
         for plan in dict.fromkeys(task.trial.site for task in missing)
@@ -140,10 +140,10 @@ def answers_of(
             progress("mapping", done / len(sites))
         for done, _ in enumerate(pool.map_unordered(_answer_and_keep, missing)):
             progress("registering", done / len(missing))
-    return tuple(TrialAnswer.read(task.path) for task in tasks)
+    return tuple(TrialAnswer.read(task.kept) for task in tasks)
 
 
-def answer(trial: Trial, survey: Survey, site: PlacementSite, settings: PipelineSettings) -> TrialAnswer:
+def answer(name: str, survey: Survey, site: PlacementSite, settings: PipelineSettings) -> TrialAnswer:
     """Register a survey as the product does, and hold what it says against the truth."""
     begun = time.perf_counter()
     placement = None
@@ -157,7 +157,7 @@ def answer(trial: Trial, survey: Survey, site: PlacementSite, settings: Pipeline
     seconds = time.perf_counter() - begun
     in_doubt = placement is not None and placement.in_doubt
     return TrialAnswer(
-        name=trial.name,
+        name=name,
         scans=tuple(
             scan_answer(outcome, true, in_doubt=in_doubt)
             for outcome, true in zip(outcomes, survey.true, strict=True)
@@ -224,12 +224,12 @@ def _make_site(task: _SiteTask) -> None:
     make_site(task.plan, task.settings, task.folder)
 
 
-def _answer_and_keep(task: Task) -> None:
+def _answer_and_keep(task: _Task) -> None:
     """Simulate one trial, answer it and keep the answer; the scans themselves are thrown away."""
     site = load_site(task.trial.site, task.settings, task.folder)
     with TemporaryDirectory(prefix="spicd-placement-") as scratch:
         survey = simulate(task.trial, site, task.settings, Path(scratch))
-        answer(task.trial, survey, site, task.settings.pipeline).keep(task.path)
+        answer(task.trial.name, survey, site, task.settings.pipeline).keep(task.kept)
 
 
 def _scan_answer(kept: dict[str, Any]) -> ScanAnswer:

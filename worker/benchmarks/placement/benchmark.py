@@ -9,6 +9,7 @@ from pathlib import Path
 from worker.benchmarks.documents import Document
 from worker.benchmarks.placement.answers import PROCESSES, answers_of
 from worker.benchmarks.placement.measures import Answered, document
+from worker.benchmarks.placement.pictures import draw_impostors
 from worker.benchmarks.placement.plan import FIRST_SEED, KINDS, Kind, Part, PlacementSettings, trials
 from worker.benchmarks.placement.real import evaluate_real
 from worker.benchmarks.placement.report import draw
@@ -26,6 +27,7 @@ class PlacementBenchmarkSettings:
     trials: int | None = None  #: of each row of the table at most; None: all
     processes: int = PROCESSES
     real: Path | None = None  #: folder of real scans
+    pictures: int = 0  #: of impostors, at most
     made: PlacementSettings = field(default_factory=PlacementSettings)
 
 
@@ -40,7 +42,16 @@ def evaluate(settings: PlacementBenchmarkSettings, progress: Progress = no_progr
         **document(answered),
     }
     if settings.real is not None:
-        result["real"] = evaluate_real(settings.real, settings.made.pipeline, progress)
+        result["real"] = evaluate_real(
+            settings.real,
+            settings.made.pipeline,
+            settings.out,
+            processes=settings.processes,
+            progress=progress,
+        )
+    if settings.pictures:
+        progress("drawing", 0.0)
+        result["pictures"] = draw_impostors(answered, settings.made, settings.out, settings.pictures)
     draw(settings.out, result)
     return result
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from worker.benchmarks.documents import Document, spread
 from worker.benchmarks.placement.answers import ScanAnswer, TrialAnswer, Verdict
-from worker.benchmarks.placement.plan import KINDS, Kind, Trial
+from worker.benchmarks.placement.plan import EXPECTED, KINDS, Kind, Trial
 from worker.cloud.types import Floats
 
 VERDICTS: tuple[Verdict, ...] = get_args(Verdict)
@@ -67,6 +67,7 @@ def figures(answered: Sequence[Answered]) -> Document:
         "centimetres": spread([100 * (scan.metres or 0.0) for scan in near], "median", "95%", "worst"),
         "degrees": spread([scan.degrees or 0.0 for scan in near], "median", "95%", "worst"),
         "reasons": dict(Counter(name for scan in scans for name in scan.named).most_common()),
+        "named": sum(_named(one) for one in answered),
         "seconds": spread([one.answer.seconds for one in answered], "median", "95%"),
     }
 
@@ -153,6 +154,12 @@ def _at_least(scores: Floats, bars: Floats) -> Floats:
 def _spoilt(one: Answered) -> list[ScanAnswer]:
     """Return the scans that are mirrored, or off in scale by 2% and more."""
     return [s for s in one.answer.scans if one.trial.kind in ("mirrored", "scaled") and not s.here]
+
+
+def _named(one: Answered) -> int:
+    """Count the scans of which the reason was told that the kind is about."""
+    expected = EXPECTED.get(one.trial.kind, ())
+    return sum(any(reason in expected for reason in scan.named) for scan in one.answer.scans)
 
 
 def _fair(trial: Trial) -> bool:

@@ -12,6 +12,7 @@ from pydantic import Field
 
 from worker.benchmarks.documents import names_among
 from worker.cloud.settings import StrictModel
+from worker.pipeline.registration.diagnosis import Reason
 from worker.pipeline.settings import PipelineSettings
 from worker.simulation.scenes import Scene, corridor, hotel_corridor, hotel_room, random_room, small_office
 from worker.simulation.visits import DRIFT
@@ -39,6 +40,20 @@ Part = Literal["calibration", "validation", "figures"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
 #: Surveys of another place that looks like the map's; each of them may only be refused.
 IMPOSTORS: tuple[Kind, ...] = ("other", "same-size", "twin", "hotel")
+
+#: The reasons that name what is odd about the scans of a kind, where the product names anything.
+EXPECTED: Mapping[Kind, tuple[Reason, ...]] = {
+    **dict.fromkeys(IMPOSTORS, ("other_place",)),
+    "prior-off": ("wrong_prior",),
+    "prior-turned": ("wrong_prior",),
+    "mirrored": ("mirrored",),
+    "scaled": ("wrong_scale",),
+    "tilted": ("other_up_axis",),
+    "moving": ("moved_while_scanning",),
+    "low-overlap": ("too_little_overlap",),
+    "mixed-1+1": ("other_place", "disagrees"),
+    "mixed-3+1": ("other_place", "disagrees"),
+}
 
 #: Of the first place of each part. Other benchmarks use seeds up to 2,000,000 (training sets) and 1,900,000.
 FIRST_SEED: Mapping[Part, int] = {"calibration": 2_100_000, "validation": 2_300_000, "figures": 2_500_000}
@@ -137,11 +152,19 @@ class Trial:
         return self.site.seed + NEXT_TRIAL * (1 + self.number)
 
     @property
+    def other_number(self) -> int:
+        """Which other room or floor of the same hotel a trial of kind `hotel` is of; odd rooms are mirrored."""
+        return 1 + self.number
+
+    @property
     def row(self) -> str:
         """The row of the table that it counts in."""
         with_prior = ", prior" if self.prior else ""
         if self.kind == "right" and self.site.repeats:
             return f"right, hotel corridor{with_prior}"
+        if self.kind == "hotel":
+            room = "room, mirrored" if self.other_number % 2 else "room, same plan"
+            return f"hotel {'corridor' if self.site.repeats else room}{with_prior}"
         detail = {
             "right": f" {self.amount:.0%} changed",
             "prior-off": f" by {self.amount:g} m",

@@ -6,8 +6,9 @@ poses were found by other registration programs, those of the Kinect's frames by
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -16,11 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from worker.benchmarks.documents import Document
-from worker.benchmarks.placement.answers import answer
-from worker.benchmarks.placement.plan import SitePlan, Trial
+from worker.benchmarks.placement.answers import PROCESSES, TrialAnswer, answer, code_fingerprint
 from worker.benchmarks.placement.sites import PlacementSite
 from worker.benchmarks.placement.surveys import Survey
 from worker.benchmarks.registration.real import FRAMES, PAIRS
+from worker.cloud import npz
 from worker.cloud.formats.pcd import write_pcd
 from worker.cloud.formats.scan import read_scan
 from worker.cloud.poses import inverse
@@ -28,9 +29,11 @@ from worker.cloud.types import Matrix4
 from worker.pipeline.flow import build_map
 from worker.pipeline.registration.results import ScanFile
 from worker.pipeline.settings import PipelineSettings
+from worker.processes import open_processes
 from worker.progress import Progress, no_progress
 from worker.simulation.scenes import rigid
 
+REAL = "real"  #: folder of what was said of real scans
 SCALES = (0.95, 0.98, 1.02, 1.05)
 METRES_OFF, DEGREES_OFF = (1.0, 2.0, 5.0), (90.0, 180.0)
 FAR = (4000.0, -3000.0, 100.0)  #: metres that a file is shifted by
@@ -47,29 +50,59 @@ class RealPlace:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
-class _Sent:
-    """A scan as it is sent."""
+class RealTrial:
+    """A scan as it is sent to a map."""
 
     name: str
+    site: Path  #: file of the map
     path: Path
     true: Matrix4 | None  #: map_from_scan; None where it has none
     prior: Matrix4 | None = None  #: map_from_scan as it is given
 
 
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class _Task:
+    trial: RealTrial
+    settings: PipelineSettings
+    kept: Path
+
+
 def evaluate_real(
-    folder: Path, settings: PipelineSettings, progress: Progress = no_progress
+    folder: Path,
+    settings: PipelineSettings,
+    out: Path,
+    *,
+    processes: int = PROCESSES,
+    progress: Progress = no_progress,
 ) -> list[Document]:
-    """Send every scan to every map; JSON-ready. Raises OSError where a file is missing, MapFailed."""
-    places = real_places(folder, settings)
-    rows = []
+    """Send every scan to every map; JSON-ready. Answers are kept under `out`, for the code that gave them.
+
+    Raises OSError where a file is missing, MapFailed.
+    """
     with TemporaryDirectory(prefix="spicd-placement-") as scratch:
-        for number, place in enumerate(places):
-            progress(f"real scans: {place.name}", number / len(places))
-            site = _site(place, settings)
-            for sent in _sent(place, places, site.map_from_world, Path(scratch), settings):
-                rows.append(_told(sent, site, settings))
-                progress(f"real scans: {sent.name}", number / len(places))
-    return rows
+        progress("real scans: maps", 0.0)
+        trials = real_trials(folder, settings, Path(scratch))
+        kept = out / REAL / code_fingerprint()
+        tasks = [
+            _Task(trial=trial, settings=settings, kept=kept / f"{_file_name(trial.name)}.json")
+            for trial in trials
+        ]
+        missing = [task for task in tasks if not task.kept.exists()]
+        with open_processes(min(processes, PROCESSES, len(missing))) as pool:
+            for done, _ in enumerate(pool.map_unordered(_answer_and_keep, missing)):
+                progress("real scans", done / len(missing))
+        return [_row(task.trial, TrialAnswer.read(task.kept)) for task in tasks]
+
+
+def real_trials(folder: Path, settings: PipelineSettings, scratch: Path) -> tuple[RealTrial, ...]:
+    """List what is sent to the map of every place; maps and spoilt files are written into `scratch`."""
+    places = real_places(folder, settings)
+    trials: list[RealTrial] = []
+    for place in places:
+        site = scratch / f"{_file_name(place.name)}.npz"
+        npz.save(site, real_site(place, settings))
+        trials += _trials(place, places, site, scratch, settings)
+    return tuple(trials)
 
 
 def real_places(folder: Path, settings: PipelineSettings) -> tuple[RealPlace, ...]:
@@ -93,68 +126,75 @@ def real_places(folder: Path, settings: PipelineSettings) -> tuple[RealPlace, ..
     return (*pairs, RealPlace(name="kinect", first=frames[0], others=others))
 
 
-def _site(place: RealPlace, settings: PipelineSettings) -> PlacementSite:
-    """Build the map of one file; the world is that file's frame."""
+def real_site(place: RealPlace, settings: PipelineSettings) -> PlacementSite:
+    """Build the map of a place's first file; the world is that file's frame. Raises MapFailed."""
     built = build_map([ScanFile(name=place.first.stem, path=place.first)], settings=settings)
     (outcome,) = built.outcomes
     assert outcome.registration is not None  # build_map raises where no scan holds a pose
-    map_from_first = outcome.registration.map_from_scan
     return PlacementSite(
         name=place.name,
         reference=built.reference,
         seen=built.seen,
-        map_from_world=map_from_first,
+        map_from_world=outcome.registration.map_from_scan,
         stops=np.eye(4)[None],
     )
 
 
-def _sent(
-    place: RealPlace,
-    places: tuple[RealPlace, ...],
-    map_from_first: Matrix4,
-    scratch: Path,
-    settings: PipelineSettings,
-) -> Iterator[_Sent]:
-    """List what is sent to the map of a place."""
-    for path, first_from_other in place.others.items():
+def _trials(
+    place: RealPlace, places: Sequence[RealPlace], site: Path, scratch: Path, settings: PipelineSettings
+) -> Iterator[RealTrial]:
+    """List what is sent to the map of one place: its first other file is spoilt too."""
+    map_from_first = _loaded(site).map_from_world
+    for number, (path, first_from_other) in enumerate(place.others.items()):
         true = map_from_first @ first_from_other
         name = f"{place.name}: {path.stem}"
-        yield _Sent(name=f"{name}, right", path=path, true=true)
-        yield _Sent(name=f"{name}, right, prior", path=path, true=true, prior=true)
-        yield from _with_wrong_priors(name, path, true)
-        yield from _spoilt(name, path, true, scratch, settings, shifted=place.name == SHIFTED)
+        yield RealTrial(name=f"{name}, right", site=site, path=path, true=true)
+        yield RealTrial(name=f"{name}, right, prior", site=site, path=path, true=true, prior=true)
+        if number == 0:
+            yield from _with_wrong_priors(name, site, path, true)
+            yield from _spoilt(name, site, path, true, scratch, settings, shifted=place.name == SHIFTED)
     for other in places:
         if other is not place:
             for path in (other.first, *other.others):
-                yield _Sent(name=f"{place.name}: {path.stem} of {other.name}", path=path, true=None)
+                name = f"{place.name}: {path.stem} of {other.name}"
+                yield RealTrial(name=name, site=site, path=path, true=None)
 
 
-def _with_wrong_priors(name: str, path: Path, true: Matrix4) -> Iterator[_Sent]:
+def _with_wrong_priors(name: str, site: Path, path: Path, true: Matrix4) -> Iterator[RealTrial]:
     for metres in METRES_OFF:
         off = true.copy()
         off[0, 3] += metres
-        yield _Sent(name=f"{name}, prior off by {metres:g} m", path=path, true=true, prior=off)
+        named = f"{name}, prior off by {metres:g} m"
+        yield RealTrial(name=named, site=site, path=path, true=true, prior=off)
     for degrees in DEGREES_OFF:
         off = true.copy()
         off[:3, :3] = rigid(yaw=degrees)[:3, :3] @ off[:3, :3]
-        yield _Sent(name=f"{name}, prior turned by {degrees:g} degrees", path=path, true=true, prior=off)
+        named = f"{name}, prior turned by {degrees:g} degrees"
+        yield RealTrial(name=named, site=site, path=path, true=true, prior=off)
 
 
 def _spoilt(
-    name: str, path: Path, true: Matrix4, scratch: Path, settings: PipelineSettings, *, shifted: bool
-) -> Iterator[_Sent]:
+    name: str,
+    site: Path,
+    path: Path,
+    true: Matrix4,
+    scratch: Path,
+    settings: PipelineSettings,
+    *,
+    shifted: bool,
+) -> Iterator[RealTrial]:
     """Mirror, scale and shift a file; one that is only shifted still has its place."""
-    scan = read_scan(path, name=path.name, max_points=settings.max_scan_points)
-    mirrored = _written(scan.points * np.array([-1.0, 1.0, 1.0]), scratch / "mirrored.pcd")
-    yield _Sent(name=f"{name}, mirrored", path=mirrored, true=None)
-    yield _Sent(name=f"{name}, mirrored, prior", path=mirrored, true=None, prior=true)
+    points = read_scan(path, name=path.name, max_points=settings.max_scan_points).points
+    mirrored = _written(points * np.array([-1.0, 1.0, 1.0]), scratch / f"{path.stem}-mirrored.pcd")
+    yield RealTrial(name=f"{name}, mirrored", site=site, path=mirrored, true=None)
+    yield RealTrial(name=f"{name}, mirrored, prior", site=site, path=mirrored, true=None, prior=true)
     for scale in SCALES:
-        scaled = _written(scan.points * scale, scratch / "scaled.pcd")
-        yield _Sent(name=f"{name}, scaled by {scale:g}", path=scaled, true=None)
+        scaled = _written(points * scale, scratch / f"{path.stem}-{scale:g}.pcd")
+        yield RealTrial(name=f"{name}, scaled by {scale:g}", site=site, path=scaled, true=None)
     if shifted:
-        far = _written(scan.points + np.array(FAR), scratch / "shifted.pcd")
+        far = _written(points + np.array(FAR), scratch / f"{path.stem}-shifted.pcd")
         name = f"{name}, shifted by {np.linalg.norm(FAR) / 1000:.0f} km"
-        yield _Sent(name=name, path=far, true=true @ inverse(rigid(*FAR)))
+        yield RealTrial(name=name, site=site, path=far, true=true @ inverse(rigid(*FAR)))
 
 
 def _written(points: NDArray[Any], path: Path) -> Path:
@@ -162,16 +202,25 @@ def _written(points: NDArray[Any], path: Path) -> Path:
     return path
 
 
-def _told(sent: _Sent, site: PlacementSite, settings: PipelineSettings) -> Document:
-    """Send one scan, and say what was told of it."""
-    trial = Trial(site=SitePlan(kind="room", seed=0), number=0, kind="right")
-    scan = read_scan(sent.path, name=sent.path.name, max_points=settings.max_scan_points)
+def _answer_and_keep(task: _Task) -> None:
+    """Send one scan to its map, and keep what was said."""
+    sent = task.trial
+    scan = read_scan(sent.path, name=sent.path.name, max_points=task.settings.max_scan_points)
     pose = None if sent.prior is None else sent.prior @ scan.sensor_pose
     file = ScanFile(name=sent.path.stem, path=sent.path, pose=pose)
-    said = answer(trial, Survey(files=(file,), true=(sent.true,)), site, settings)
+    survey = Survey(files=(file,), true=(sent.true,))
+    answer(sent.name, survey, _loaded(sent.site), task.settings).keep(task.kept)
+
+
+@lru_cache(maxsize=2)
+def _loaded(site: Path) -> PlacementSite:
+    return npz.load(site, PlacementSite)
+
+
+def _row(trial: RealTrial, said: TrialAnswer) -> Document:
     (told,) = said.scans
     return {
-        "name": sent.name,
+        "name": trial.name,
         "verdict": told.verdict,
         "here": told.here,
         "centimetres": None if told.metres is None else 100 * told.metres,
@@ -181,3 +230,7 @@ def _told(sent: _Sent, site: PlacementSite, settings: PipelineSettings) -> Docum
         "confidence": said.confidence,
         "seconds": said.seconds,
     }
+
+
+def _file_name(name: str) -> str:
+    return "".join(letter if letter.isalnum() or letter in ".-" else "_" for letter in name)

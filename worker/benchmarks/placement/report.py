@@ -82,9 +82,14 @@ def _reasons(rows: list[Document]) -> Table:
     names = sorted({reason for row in rows for reason in row["reasons"]})
     return titled_table(
         "reasons told, of refusals and in warnings",
-        ("trials", "scans", *names),
+        ("trials", "scans", "as it should be", *names),
         [
-            (row["name"], str(row["scans"]), *(str(row["reasons"].get(name, "")) for name in names))
+            (
+                row["name"],
+                str(row["scans"]),
+                str(row["named"] or ""),
+                *(str(row["reasons"].get(name, "")) for name in names),
+            )
             for row in rows
         ],
     )

@@ -87,7 +87,7 @@ def other_scene(trial: Trial) -> Scene:
     if trial.kind == "twin":
         return edited_by(lambda draw: refurnished(site.scene(), draw), seed, STOPS)[0]
     if trial.kind == "hotel":
-        number = 1 + trial.number
+        number = trial.other_number
         corridors = site.kind == "hotel-corridor"
         return hotel_corridor(site.seed, floor=number) if corridors else hotel_room(site.seed, number=number)
     if trial.kind == "same-size":
