@@ -15,7 +15,7 @@ from typing import Any, Literal
 import numpy as np
 
 from worker import files
-from worker.benchmarks.placement.plan import PlacementSettings, SitePlan, Trial
+from worker.benchmarks.placement.plan import SURVEY_RECIPE, PlacementSettings, SitePlan, Trial
 from worker.benchmarks.placement.sites import PlacementSite, load_site, make_site
 from worker.benchmarks.placement.surveys import Survey, simulate
 from worker.cloud.poses import difference
@@ -202,7 +202,7 @@ def scan_answer(outcome: ScanResult, true: Matrix4 | None, *, in_doubt: bool = F
 
 def answers_folder(settings: PlacementSettings, folder: Path) -> Path:
     """Return where the answers of the code as it stands are kept."""
-    return folder / settings.fingerprint / ANSWERS / code_fingerprint()
+    return folder / settings.fingerprint / ANSWERS / f"{code_fingerprint()}-{SURVEY_RECIPE}"
 
 
 @cache

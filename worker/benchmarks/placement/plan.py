@@ -58,7 +58,8 @@ EXPECTED: Mapping[Kind, tuple[Reason, ...]] = {
 #: Of the first place of each part. Other benchmarks use seeds up to 2,000,000 (training sets) and 1,900,000.
 FIRST_SEED: Mapping[Part, int] = {"calibration": 2_100_000, "validation": 2_300_000, "figures": 2_500_000}
 NEXT_TRIAL = 1000  #: between the seeds of two trials on one map; there are fewer maps than that
-RECIPE = 1  #: raised when the same settings begin to give other trials: kept ones are then made anew
+#: Raised when the same settings begin to give other maps, or other surveys: kept maps, or answers, are made anew then.
+MAP_RECIPE, SURVEY_RECIPE = 1, 2
 
 BUILDERS: Mapping[SiteKind, Callable[[int], Scene]] = {
     "room": random_room,
@@ -102,9 +103,9 @@ class PlacementSettings(StrictModel):
 
     @property
     def fingerprint(self) -> str:
-        """Equal for maps and trials made alike."""
+        """Equal for maps made alike."""
         chosen = {"sites", "shares", "scales", "metres_off", "degrees_off"}
-        text = f"{RECIPE} {self.model_dump_json(exclude=chosen)}"
+        text = f"{MAP_RECIPE} {self.model_dump_json(exclude=chosen)}"
         return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 
