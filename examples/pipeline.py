@@ -27,7 +27,7 @@ def changed_tiles(before: list[ScanFile], after: list[ScanFile], cloud: Path) ->
     settings = PipelineSettings().for_model(detector.card.preprocessing)
     built = build_map(before, settings=settings)
     survey = locate_survey(after, built.reference, settings=settings, reference_seen=built.seen)
-    changes = detect(survey.comparison, detector)
+    changes = detect(survey.comparison, detector, placement=survey.placement)
     write_coloured_cloud(cloud, built.reference.points, survey.current.points, changes)
     return [tile for tile in tile_results(changes) if tile.state == "changed"]
 

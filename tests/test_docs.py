@@ -18,6 +18,7 @@ from service.errors import ServiceError
 from service.settings import Settings
 from worker import rq_workers
 from worker.errors import Cancelled, PipelineError
+from worker.pipeline.registration.diagnosis import MEANING
 from worker.rq_jobs import FunctionRefused
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -44,6 +45,12 @@ def test_every_problem_code_is_explained() -> None:
         ServiceError.code,  # of the base alone; what carries it is `internal`
         Cancelled.code,  # never recorded
     }
+
+
+def test_every_reason_of_a_scan_is_explained_in_the_words_of_the_code() -> None:
+    page = (ROOT / "docs/reasons.md").read_text()
+    _, _, reasons = page.partition("## Reasons")
+    assert dict(ROW.findall(reasons.partition("## The placement")[0])) == MEANING
 
 
 @pytest.mark.parametrize("code", PROBLEMS)

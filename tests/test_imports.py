@@ -76,7 +76,14 @@ ROOMS: dict[str, tuple[str, ...]] = {
         "worker.progress",
         "worker.threads",
     ),
+    "worker.pipeline.placement": (
+        "worker.pipeline.registration",
+        "worker.cloud",
+        "worker.errors",
+        "worker.threads",
+    ),
     "worker.pipeline.mapping": (
+        "worker.pipeline.placement",
         "worker.pipeline.registration",
         "worker.cloud",
         "worker.errors",

@@ -25,8 +25,9 @@ Result = TypeVar("Result")
 class Processes:
     """Runs a function on many tasks; `open_processes` makes and ends it."""
 
-    def __init__(self, pool: ProcessPoolExecutor | None) -> None:
+    def __init__(self, pool: ProcessPoolExecutor | None, *, count: int = 1) -> None:
         self._pool = pool
+        self.count = count  #: of processes at work; 1: this one alone
 
     def map_unordered(self, run: Callable[[Task], Result], tasks: Sequence[Task]) -> Iterator[Result]:
         """Yield results as they come, in no order; function, tasks and results have to be picklable.
@@ -58,7 +59,7 @@ def open_processes(count: int) -> Iterator[Processes]:
         return
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(count, mp_context=context, initializer=_begin) as pool:
-        yield Processes(pool)
+        yield Processes(pool, count=count)
 
 
 def default_processes() -> int:

@@ -75,7 +75,7 @@ class TileProperties(Document):
     center: Vector3 = Field(description="metres, map frame", examples=[[6.75, 3.75, 0.5]])
     state: TileState = Field(
         description="`unobserved`: the visit could not judge enough of it; `inconsistent`: no change is proved, but the "
-        "registration there is in doubt",
+        "registration there is in doubt; so is every observed tile of a survey whose placement is in doubt",
         examples=["changed"],
     )
     score: float | None = Field(

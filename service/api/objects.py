@@ -265,14 +265,16 @@ def get_survey_objects(
 ) -> FeatureResponse:
     """Things that appeared, disappeared or moved, by their number in the coloured cloud.
 
-    A survey of a model that tells tiles alone has none to tell, which is not the same as none found: that is a 404.
+    A survey of a model that tells tiles alone has none to tell, nor has one whose placement is in doubt, which is not
+    the same as none found: that is a 404.
     """
     catalog = services.catalog
     survey = catalog.surveys.ready(survey_id)
     if survey.objects is None:
+        in_doubt = survey.placement is not None and survey.placement.state == "in_doubt"
+        why = "its placement is in doubt" if in_doubt else f"{survey.model} tells tiles alone"
         raise NotFound(
-            f"survey {survey_id!r} tells no objects, for {survey.model} tells tiles alone; "
-            f"GET /surveys/{survey_id}/tiles has those"
+            f"survey {survey_id!r} tells no objects, for {why}; GET /surveys/{survey_id}/tiles has those"
         )
     convert = _converter(catalog.maps.get(survey.map_id).anchor)
     wanted = SightingFilter(survey_id=survey_id, kind=asked.kind, min_probability=asked.min_probability)

@@ -104,7 +104,7 @@ def list_surveys(
 
 @router.get("/surveys/{survey_id}", summary="Look at a survey", responses=NAMED)
 def get_survey(request: HttpRequest, services: Provided, survey_id: SurveyId) -> SurveyDocument:
-    """Its state, what became of each scan, and once it is ready the tiles in each state and the objects of each kind."""
+    """Its state, what became of each scan, how sure their placement is, and once it is ready tiles and objects counted."""
     return survey_document(services.catalog.surveys.get(survey_id), request)
 
 
@@ -163,9 +163,16 @@ def get_survey_cloud(services: Provided, survey_id: SurveyId) -> Response:
     responses=files.documented("image/png", "Top view of the map, tiles by state") | MADE,
 )
 def get_picture(services: Provided, survey_id: SurveyId) -> Response:
-    """Top view of the map with the tiles by state."""
-    services.catalog.surveys.ready(survey_id)
+    """Top view of the map with objects and tiles by state; where every scan was refused, the map and why."""
+    if not _refused(services.catalog.surveys.get(survey_id)):
+        services.catalog.surveys.ready(survey_id)
     return blob_response(services.catalog.blobs, blob_keys.survey_picture(survey_id), media_type="image/png")
+
+
+def _refused(survey: SurveyRecord) -> bool:
+    """Whether a survey failed because no scan of it was accepted, which has a picture."""
+    placement = survey.placement
+    return survey.status == "failed" and placement is not None and placement.state == "refused"
 
 
 def _create(
@@ -200,6 +207,8 @@ def survey_document(record: SurveyRecord, request: HttpRequest) -> SurveyDocumen
             link(request, f"{here}/cloud.ply", "cloud", bodies.RAW),
             link(request, f"{here}/picture.png", "preview", "image/png"),
         ]
+    if _refused(record):
+        links.append(link(request, f"{here}/picture.png", "preview", "image/png"))
     if record.status == "ready" and record.objects is not None:
         links.append(link(request, f"{here}/objects", "objects", features.MEDIA_TYPE))
     return SurveyDocument(**dict(record), links=links)

@@ -67,8 +67,8 @@ async def create_version(
 ) -> AcceptedVersion:
     """From the version in use and further scans (`scan_ids`, or files in `scans`), or an accepted survey (`survey_id`).
 
-    Of a survey the tiles that it found changed are taken over. The frame and the ids of tiles stay. The version in use
-    stays in use until the new one is ready; one version builds at a time.
+    Of a survey the tiles that it found changed are taken over; one whose placement is in doubt is a conflict. The frame
+    and the ids of tiles stay. The version in use stays in use until the new one is ready; one version builds at a time.
     """
     await run_in_threadpool(services.catalog.maps.ready, map_id)  # before a long upload
     async with bodies.received(request, services.settings) as body:

@@ -7,7 +7,15 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Annotated, Any, Generic, Literal, Self, TypeVar
 
-from pydantic import AfterValidator, AwareDatetime, BaseModel, ConfigDict, Field, model_validator
+from pydantic import (
+    AfterValidator,
+    AwareDatetime,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    model_validator,
+)
 
 from service.catalog.steps import JobKind
 
@@ -18,6 +26,24 @@ SurveyStatus = Literal["running", "ready", "failed"]
 TileState = Literal["unchanged", "changed", "inconsistent", "unobserved"]
 ObjectKind = Literal["appeared", "disappeared", "moved"]
 ObjectStatus = Literal["new", "still_there", "gone_again", "unknown", "accepted"]
+PlacementState = Literal["confirmed", "in_doubt", "refused"]
+#: Why a scan was left out, or what is odd about it; `worker/pipeline/registration/diagnosis.py` says what each means.
+ScanReason = Literal[
+    "unreadable",
+    "damaged",
+    "too_few_points",
+    "degenerate",
+    "too_little_overlap",
+    "no_fit",
+    "other_place",
+    "ambiguous",
+    "mirrored",
+    "wrong_scale",
+    "other_up_axis",
+    "wrong_prior",
+    "moved_while_scanning",
+    "disagrees",
+]
 ScanFormat = Literal["ply", "pcd"]
 Vector2 = tuple[float, float]
 Vector3 = tuple[float, float, float]
@@ -90,8 +116,21 @@ class ScanRecord(Record):
     created: Utc
 
 
+class ScanWarning(Record):
+    """What is odd about a scan that was accepted."""
+
+    reason: ScanReason = Field(examples=["wrong_scale"])
+    detail: str = Field(description="a sentence for people; it may change")
+    numbers: dict[str, float] = Field(
+        default_factory=dict, description="metres, degrees, shares", examples=[{"scale": 1.012}]
+    )
+
+
 class ScanOutcome(Record):
-    """What became of one scan in a map or a survey; all but the id is None until registration has run."""
+    """What became of one scan in a map or a survey; all but the id is None until registration has run.
+
+    A scan that a release before the list of reasons left out has its `detail` alone.
+    """
 
     scan_id: str
     accepted: bool | None = None
@@ -107,7 +146,24 @@ class ScanOutcome(Record):
         description="scan ids from the map's reference scan to this one, by the registrations that placed it; null in "
         "surveys and for scans that joined the map later",
     )
-    reason: str | None = None  #: why it was left out
+    confidence: float | None = Field(
+        None, ge=0, le=1, description="that it stands where it was taken; null where that was not asked"
+    )
+    reason: ScanReason | None = Field(None, description="why it was left out")
+    detail: str | None = Field(
+        None, description="the same in a sentence for people, with what to do; it may change"
+    )
+    numbers: dict[str, float] | None = Field(
+        None,
+        description="what the reason rests on: metres, degrees, shares; null where there is no reason",
+        examples=[{"scale": 1.012}],
+    )
+    candidates: tuple[Matrix, ...] | None = Field(
+        None, description="`ambiguous` alone: each map_from_scan that nothing tells from the others"
+    )
+    warnings: Annotated[tuple[ScanWarning, ...], BeforeValidator(lambda given: given or ())] = Field(
+        (), description="what is odd about it though it was accepted"
+    )
 
 
 class Bounds(Record):
@@ -259,6 +315,18 @@ class VersionRecord(Built):
     survey_id: str | None = Field(description="the survey it takes over; null where it is made of scans")
 
 
+class Placement(Record):
+    """How sure it is that the scans of a survey stand where they were taken."""
+
+    state: PlacementState = Field(
+        description="`in_doubt`: no tile counts as unchanged or changed, and the survey tells no objects; `refused`: no "
+        "scan was accepted"
+    )
+    confidence: float | None = Field(
+        ge=0, le=1, description="of the accepted scans together; null where none was", examples=[0.98]
+    )
+
+
 class SurveyRecord(Record):
     """A later visit compared with a map; `counts` is empty until it is done."""
 
@@ -271,11 +339,15 @@ class SurveyRecord(Record):
     device_id: str | None
     captured_at: Utc  #: given, else the latest of its scans, else the time of the request
     scans: tuple[ScanOutcome, ...]  #: in the order of the request
+    placement: Placement | None = Field(
+        description="null until its scans are registered, and in surveys of releases that did not judge it"
+    )
     counts: dict[str, int] = Field(
         examples=[{"tiles": 172, "unchanged": 150, "changed": 9, "inconsistent": 1, "unobserved": 12}]
     )
     objects: dict[str, int] | None = Field(
-        description="things found, by kind; null until it is done and where the model tells tiles alone",
+        description="things found, by kind; null until it is done, where the model tells tiles alone, and where the "
+        "placement is in doubt",
         examples=[{"appeared": 2, "disappeared": 1, "moved": 1}],
     )
     moving: int | None = Field(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from datetime import datetime
 from typing import get_args
 
@@ -19,6 +19,7 @@ from service.catalog.records import (
     ObjectKind,
     ObjectRecord,
     Page,
+    Placement,
     Position,
     ScanOutcome,
     SurveyRecord,
@@ -99,11 +100,17 @@ class Surveys:
         created, key = Survey.created, Survey.survey_id
         return self._database.page(query, created, key, SurveyRecord.of_row, after=after, limit=limit)
 
-    def save_outcomes(self, survey_id: str, outcomes: Iterable[ScanOutcome]) -> None:
-        """Record what became of the scans, also when the survey then fails. Raises NotFound."""
+    def save_outcomes(
+        self, survey_id: str, outcomes: Iterable[ScanOutcome], *, placement: Placement | None = None
+    ) -> None:
+        """Record what became of the scans, also when the survey then fails. Raises NotFound.
+
+        `placement` is None where nobody judged it.
+        """
         with self._database.write() as session:
             row = _row(session, survey_id)
             write_outcomes(row.scans, outcomes)
+            row.placement = None if placement is None else placement.model_dump()
             row.updated = now()
 
     def save_result(
@@ -119,7 +126,8 @@ class Surveys:
 
         `threshold` is the one that was used. `objects` is None where the detector tells tiles alone; such a survey has
         no say in what became of the objects of the map. `moving` counts what moved while the visit lasted. Tiles by
-        state and objects by kind are counted here. Raises NotFound, and ValueError for a number that is given twice.
+        state and objects by kind are counted here. Raises NotFound, and ValueError for a number that is given twice, and
+        for an unchanged or changed tile or an object of a survey whose placement is in doubt.
         """
         tiles, things = tuple(tiles), tuple(objects or ())
         _check_numbers(things)
@@ -130,6 +138,7 @@ class Surveys:
         by_kind = Counter(thing.kind for thing in things)
         with self._database.write() as session:
             row = _locked(session, survey_id)
+            _check_doubt(row, by_state, told=told)
             _replace_tiles(session, survey_id, tiles)
             _replace_objects(session, survey_id, things)
             row.threshold = threshold
@@ -183,6 +192,17 @@ def _check_numbers(objects: Sequence[ObjectRecord]) -> None:
     """Raise ValueError where two objects of a survey have one number."""
     if len({thing.number for thing in objects}) < len(objects):
         raise ValueError(f"objects have one number each, these have {[thing.number for thing in objects]}")
+
+
+def _check_doubt(row: Survey, by_state: Mapping[TileState, int], *, told: bool) -> None:
+    """Raise ValueError where a survey whose placement is in doubt says that something is so, or is not."""
+    if row.placement is None or row.placement["state"] != "in_doubt":
+        return
+    if told or by_state["unchanged"] or by_state["changed"]:
+        raise ValueError(
+            f"the placement of survey {row.survey_id!r} is in doubt, and yet it tells objects, unchanged or changed "
+            f"tiles: {dict(by_state)}"
+        )
 
 
 def _replace_tiles(session: Session, survey_id: str, tiles: Iterable[TileRecord]) -> None:

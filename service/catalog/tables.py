@@ -73,6 +73,7 @@ class Base(DeclarativeBase):
         dict[str, int]: JSON(none_as_null=True),
         dict[str, float]: JSON(none_as_null=True),
         list[list[float]]: JSON(none_as_null=True),
+        list[list[list[float]]]: JSON(none_as_null=True),
         list[str]: JSON(none_as_null=True),
         list[dict[str, Any]]: JSON(none_as_null=True),
         str: String(),
@@ -110,7 +111,12 @@ class Outcome:
     translation_sigma: Mapped[float | None]
     rotation_sigma: Mapped[float | None]
     path: Mapped[list[str] | None]
+    confidence: Mapped[float | None]
     reason: Mapped[str | None]
+    detail: Mapped[str | None]
+    numbers: Mapped[dict[str, float] | None]
+    candidates: Mapped[list[list[list[float]]] | None]
+    warnings: Mapped[list[dict[str, Any]] | None]
 
 
 class VersionScan(Outcome, Base):
@@ -194,6 +200,7 @@ class Survey(Base):
     threshold: Mapped[float | None]
     device_id: Mapped[str | None]
     captured_at: Mapped[datetime]
+    placement: Mapped[dict[str, Any] | None]
     counts: Mapped[dict[str, int]]
     objects: Mapped[dict[str, int] | None]
     moving: Mapped[int | None]

@@ -232,13 +232,15 @@ def _further_scans(session: Session, scan_ids: Sequence[str], base: MapVersion) 
 def _survey_scans(session: Session, survey_id: str, base: MapVersion) -> list[ScanOutcome]:
     """Return the accepted scans of a survey, which stays until the session ends.
 
-    Raises NotFound, also for a survey of another map, NotReady, and Conflict where `base` has taken it over.
+    Raises NotFound, also for a survey of another map, NotReady, and Conflict where its placement is in doubt or `base`
+    has taken it over.
     """
     survey = session.get(tables.Survey, survey_id, with_for_update=True)
     if survey is None or survey.map_id != base.map_id:
         raise NotFound(f"no survey {survey_id!r} of map {base.map_id!r}")
     if survey.status != "ready":
         raise NotReady(f"survey {survey_id!r} is {survey.status}; look at job {survey.job_id}")
+    _check_placed(survey)
     scans = _accepted(survey.scans)
     known = _shared(base, [scan.scan_id for scan in scans])
     if known:
@@ -246,6 +248,18 @@ def _survey_scans(session: Session, survey_id: str, base: MapVersion) -> list[Sc
             f"version {base.version} of the map holds scan {known} of survey {survey_id!r} already"
         )
     return scans
+
+
+def _check_placed(survey: tables.Survey) -> None:
+    """Raise Conflict where the placement of a survey is in doubt; what it saw may be another place."""
+    placement = survey.placement
+    if placement is None or placement["state"] != "in_doubt":
+        return
+    raise Conflict(
+        f"the placement of survey {survey.survey_id!r} is in doubt (confidence {placement['confidence']:.2f}), so the "
+        "map does not take it over; visit the place again, with pose priors or with scans that show more of what the map "
+        "holds"
+    )
 
 
 def _accepted(rows: Iterable[tables.VersionScan | tables.SurveyScan]) -> list[ScanOutcome]:

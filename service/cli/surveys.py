@@ -9,7 +9,7 @@ import typer
 from rich.console import Group
 from rich.table import Table
 
-from service.cli.tables import columns, counts, facts, number, point, scan_table
+from service.cli.tables import columns, counts, facts, number, placement, point, scan_table
 from service.cli.terminal import Captured, Device, Model, Scans, Terminal, Wait
 from service.client import Document
 
@@ -48,7 +48,7 @@ def list_(ctx: typer.Context, map_id: str) -> None:
 
 
 def show(ctx: typer.Context, survey_id: str) -> None:
-    """One survey with its scans and counts."""
+    """One survey with its placement, its scans and counts."""
     terminal: Terminal = ctx.obj
     terminal.ask(lambda client: client.survey(survey_id), _whole(terminal.url))
 
@@ -72,10 +72,12 @@ def changes(
 
 
 def _table(surveys: list[Document]) -> Table:
-    table = columns("survey", "status", "captured", "scans", "counts")
+    table = columns("survey", "status", "captured", "scans", "placement", "counts")
     for one in surveys:
         scans = str(len(one.get("scans", [])))
-        table.add_row(one["survey_id"], one["status"], one.get("captured_at"), scans, counts(one))
+        table.add_row(
+            one["survey_id"], one["status"], one.get("captured_at"), scans, placement(one), counts(one)
+        )
     return table
 
 
@@ -90,6 +92,7 @@ def _whole(url: str) -> Callable[[Document], Group]:
         }
         here = f"{url}/surveys/{survey['survey_id']}"
         rows = {
+            "placement": placement(survey),
             "tiles": counts(survey),
             "objects": counts(survey, "objects"),
             "moving": survey.get("moving"),
@@ -102,6 +105,8 @@ def _whole(url: str) -> Callable[[Document], Group]:
             }
             if survey.get("objects") is not None:
                 rows["things"] = f"{here}/objects"
+        elif (survey.get("placement") or {}).get("state") == "refused":
+            rows["picture"] = f"{here}/picture.png"
         names = ("survey", "map", "status", "captured", "model", "threshold")
         return Group(facts(survey | about, *names, **rows), scan_table(survey))
 

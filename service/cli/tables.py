@@ -38,18 +38,37 @@ def counts(document: Document, member: str = "counts") -> str:
 
 
 def scan_table(document: Document) -> Table:
-    """Return how each scan of a map, version or survey was registered."""
-    table = columns("scan", "accepted", "fitness", "rmse (m)", "sigma (m)", "reason")
+    """Return how each scan of a map, version or survey was registered, why it was left out, and what is odd about it."""
+    table = columns(
+        "scan", "accepted", "fitness", "rmse (m)", "sigma (m)", "confidence", "reason", "detail, warnings"
+    )
     for scan in document.get("scans", []):
+        warnings = [f"{words(one['reason'])}: {one['detail']}" for one in scan.get("warnings") or ()]
         table.add_row(
             scan["scan_id"],
             _ACCEPTED.get(scan.get("accepted"), Text()),
             number(scan.get("fitness"), 2),
             number(scan.get("rmse"), 3),
             number(scan.get("translation_sigma"), 3),
-            scan.get("reason"),
+            number(scan.get("confidence"), 2),
+            words(scan.get("reason") or ""),
+            "\n".join([*filter(None, [scan.get("detail")]), *warnings]),
         )
     return table
+
+
+def placement(survey: Document) -> str:
+    """Write how sure the placement of a survey is; nothing where nobody judged it."""
+    told = survey.get("placement")
+    if told is None:
+        return ""
+    confidence = told.get("confidence")
+    return words(told["state"]) + ("" if confidence is None else f" (confidence {confidence:.2f})")
+
+
+def words(name: str) -> str:
+    """Write a value of a list as words: `in_doubt` as `in doubt`."""
+    return name.replace("_", " ")
 
 
 def number(value: Any, digits: int) -> str:

@@ -216,7 +216,10 @@ def test_a_survey_of_a_foreign_place_fails_with_its_numbers(
     survey = service.get(f"/surveys/{accepted['survey_id']}")
     assert survey["status"] == "failed"
     assert not survey["scans"][0]["accepted"]
-    assert survey["scans"][0]["reason"] in job["problem"]["detail"]
+    (scan,) = survey["scans"]
+    assert f"{scan['detail']} [{scan['reason']}]" in job["problem"]["detail"]
+    assert survey["placement"] == {"state": "refused", "confidence": None}
+    assert service.http.get(f"/surveys/{accepted['survey_id']}/picture.png").content.startswith(b"\x89PNG")
     assert service.http.get(f"/surveys/{accepted['survey_id']}/tiles").status_code == 409
 
 

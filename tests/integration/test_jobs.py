@@ -12,7 +12,7 @@ import pytest
 
 from service.catalog import blob_keys
 from service.catalog.jobs import Jobs
-from service.catalog.records import JobRecord, ScanRecord
+from service.catalog.records import JobRecord, Placement, ScanRecord
 from service.catalog.steps import STEPS, JobKind
 from service.settings import Settings
 from tests.support.house import MAP, MODEL, OTHER_CUT, SAME_CUT, SEEN_TO, House, Material, run
@@ -24,6 +24,7 @@ from worker.detectors.store import open_card
 from worker.errors import DetectorUnavailable, MapFailed, ScanError
 from worker.jobs.surveys import scoring
 from worker.pipeline.flow import NoScanAccepted
+from worker.pipeline.registration.diagnosis import REASONS
 
 
 @pytest.fixture
@@ -239,6 +240,11 @@ def test_a_job_whose_only_scan_is_broken_fails_and_names_it(house: House, kind: 
     assert failed(house, job, "scan_unreadable").startswith("cut short.pcd: ")
     status = house.catalog.maps.get("hall").status if kind == "map" else house.survey(job).status
     assert status == "failed"
+    if kind == "survey":
+        (scan,) = house.survey(job).scans
+        assert (scan.accepted, scan.reason) == (False, "unreadable")
+        assert scan.detail == failed(house, job, "scan_unreadable")
+        assert house.survey(job).placement == Placement(state="refused", confidence=None)
     run(job)  # what still stood in the queue
     failed(house, job, "scan_unreadable")
 
@@ -251,7 +257,8 @@ def test_a_broken_scan_beside_a_whole_one_is_left_out_and_named(house: House, ki
     run(job, "register")
     scans = house.catalog.maps.get("hall").scans if kind == "map" else house.survey(job).scans
     assert [scan.accepted for scan in scans] == [True, False]
-    assert str(scans[1].reason).startswith("cut short.pcd: ")
+    assert str(scans[1].detail).startswith("cut short.pcd: ")
+    assert scans[1].reason == "unreadable"
 
 
 def test_a_survey_of_another_place_fails_and_lists_each_scans_numbers(house: House) -> None:
@@ -263,8 +270,12 @@ def test_a_survey_of_another_place_fails_and_lists_each_scans_numbers(house: Hou
     assert survey.status == "failed"
     (outcome,) = survey.scans
     assert outcome.accepted is False
-    assert outcome.reason is not None
-    assert "foreign.pcd" in outcome.reason
+    assert outcome.reason in REASONS
+    assert "foreign.pcd" in str(outcome.detail)
+    assert f"{outcome.detail} [{outcome.reason}]" in failed(house, job, "registration_failed")
+    assert survey.placement == Placement(state="refused", confidence=None)
+    picture = house.catalog.blobs.get_bytes(blob_keys.survey_picture(survey.survey_id))
+    assert picture.startswith(b"\x89PNG")
     assert outcome.fitness is not None
     assert outcome.map_from_scan is None
     assert house.tiles(survey.survey_id) == []  # never "no change"

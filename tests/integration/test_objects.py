@@ -6,14 +6,17 @@ import json
 import shutil
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import open3d as o3d
 import pytest
 
 from service.catalog import blob_keys
+from service.catalog.changes import ChangeFilter
 from service.catalog.objects import SightingFilter
-from service.catalog.records import JobRecord, ObjectRecord, ScanRecord, SurveyRecord
+from service.catalog.records import JobRecord, ObjectRecord, Placement, ScanRecord, SurveyRecord
+from service.errors import Conflict
 from tests.support.house import MAP, House, run
 from tests.support.release_0_1 import scan_of_0_1
 from tests.support.two_visits import free_place
@@ -22,6 +25,8 @@ from worker.cloud.seen import Seen
 from worker.detectors.card import MODEL_STORE
 from worker.errors import MapFailed
 from worker.pipeline import archive
+from worker.pipeline.flow import LocatedSurvey, locate_survey
+from worker.pipeline.registration.results import SurveyPlacement
 from worker.pipeline.results.export import PointKind
 from worker.simulation.scenes import Change, random_room
 from worker.simulation.scenes.furniture import crate
@@ -146,6 +151,33 @@ def test_a_map_of_voxels_lists_all_tiles_with_a_point_and_is_scored_by_either_mo
     assert any(put.is_told_by(thing) for thing in things(seeing, by_voxels))
     assert by_points.objects is None
     assert by_points.counts["tiles"] < counts["tiles"] <= by_voxels.counts["tiles"]
+
+
+def test_a_survey_whose_placement_is_in_doubt_tells_neither_tiles_nor_objects(
+    seeing: House, put: Crate, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def doubting(*given: Any, **named: Any) -> LocatedSurvey:
+        found = locate_survey(*given, **named)
+        return replace(found, placement=SurveyPlacement(confidence=0.71, in_doubt=True))
+
+    sure = compared(seeing, put.scan)
+    assert sure.placement is not None
+    assert sure.placement.state == "confirmed"
+    monkeypatch.setattr("worker.jobs.surveys.locate_survey", doubting)
+    survey = compared(seeing, put.scan)
+    assert survey.status == "ready"
+    assert survey.placement == Placement(state="in_doubt", confidence=0.71)
+    assert (survey.objects, survey.moving) == (None, None)
+    assert survey.counts["unchanged"] == survey.counts["changed"] == 0
+    assert survey.counts["inconsistent"] > 0 < survey.counts["unobserved"]
+    assert survey.counts["unobserved"] == sure.counts["unobserved"]
+    told = seeing.catalog.changes.page(ChangeFilter(map_id=MAP, repeats=True), limit=1000).items
+    assert survey.survey_id not in {change.survey_id for change in told}
+    assert sure.survey_id in {change.survey_id for change in told}
+    assert seeing.catalog.blobs.exists(blob_keys.survey_picture(survey.survey_id))
+    assert seeing.catalog.blobs.exists(blob_keys.survey_cloud(survey.survey_id))
+    with pytest.raises(Conflict, match="in doubt"):
+        seeing.catalog.versions.create(MAP, survey_id=survey.survey_id)
 
 
 def test_what_a_map_saw_is_made_on_first_use_where_release_0_1_kept_nothing_of_it(

@@ -202,7 +202,7 @@ def test_a_version_of_a_foreign_scan_fails_lists_it_and_leaves_the_map_in_use(ho
     assert failed.problem.code == "registration_failed"
     assert failed.scans[:2] == before.scans
     assert failed.scans[2].accepted is False
-    assert "foreign.pcd" in str(failed.scans[2].reason)
+    assert "foreign.pcd" in str(failed.scans[2].detail)
     assert house.catalog.maps.get(MAP) == before
 
 

@@ -10,6 +10,7 @@ from typing import Any
 
 from service.object_features import object_collection, sighting_feature
 from service.tile_features import tile_collection, tile_feature
+from worker.cli.scan_results import placement_document, verdict
 from worker.detectors.detector import Detector
 from worker.pipeline import (
     BuiltMap,
@@ -24,6 +25,7 @@ from worker.pipeline.registration.results import ScanResult
 from worker.pipeline.results.changes import ChangeSet
 from worker.pipeline.results.export import tile_results, write_coloured_cloud
 from worker.pipeline.results.picture import draw_picture
+from worker.pipeline.results.sheet import LeftOut
 from worker.progress import Progress, no_progress
 
 
@@ -54,7 +56,14 @@ def compare(
     located = locate_survey(
         later, built.reference, settings=settings, reference_seen=built.seen, progress=on_survey
     )
-    changes = detect(located.comparison, detector, threshold=threshold, settings=settings, progress=on_survey)
+    changes = detect(
+        located.comparison,
+        detector,
+        threshold=threshold,
+        settings=settings,
+        placement=located.placement,
+        progress=on_survey,
+    )
     return TwoVisits(built=built, located=located, changes=changes)
 
 
@@ -79,7 +88,12 @@ def write_results(
     clouds = visits.built.reference.points, visits.located.current.points
     write_coloured_cloud(files["cloud"], *clouds, visits.changes)
     title = f"{survey_id} compared with {map_id}"
-    draw_picture(files["picture"], *clouds, visits.changes, title=title)
+    left_out = [
+        LeftOut(name=Path(one.name).name, reason=one.diagnosis.reason, detail=one.diagnosis.detail)
+        for one in visits.located.outcomes
+        if one.diagnosis is not None
+    ]
+    draw_picture(files["picture"], *clouds, visits.changes, title=title, left_out=left_out)
     return files
 
 
@@ -91,13 +105,14 @@ def _written(path: Path, collection: dict[str, Any]) -> Path:
 def document(visits: TwoVisits, files: dict[str, Path], *, model: str) -> dict[str, Any]:
     """Return the comparison, JSON-ready; changed tiles most certain first, metres, frame of the first reference.
 
-    `objects` is null where the detector scores tiles alone.
+    `objects` is null where the detector scores tiles alone, and where the placement of the later visit is in doubt.
     """
     changed = [tile for tile in tile_results(visits.changes) if tile.state == "changed"]
     found = visits.changes.objects
     return {
         "model": model,
         "threshold": visits.changes.threshold,
+        "placement": placement_document(visits.located.placement),
         "counts": {"tiles": len(visits.changes.states), **visits.changes.counts()},
         "objects": None if found is None else [asdict(thing) for thing in found.objects],
         "moving": None if found is None else found.moving,
@@ -117,11 +132,10 @@ def _registration(outcome: ScanResult) -> dict[str, Any]:
     sigma = None if registration is None else registration.uncertainty
     return {
         "name": outcome.name,
-        "accepted": registration is not None,
+        **verdict(outcome),
         "fitness": outcome.fitness,
         "rmse": outcome.inlier_rmse,
         "map_from_scan": None if registration is None else registration.map_from_scan.tolist(),
         "translation_sigma": None if sigma is None else sigma.translation,
         "rotation_sigma": None if sigma is None else sigma.rotation,
-        "reason": outcome.reason,
     }

@@ -14,6 +14,7 @@ from rich.table import Table
 
 from worker.cli import terminal
 from worker.cli.options import DEFAULT_MODEL, AsJson, Device, Model, ModelStore
+from worker.cli.scan_results import told_warnings
 from worker.detectors.card import MODEL_STORE
 
 MOST_ROWS = 20  #: objects, or changed tiles, in the table; the file has all
@@ -56,10 +57,20 @@ def summary(result: dict[str, Any]) -> Group:
     counts = ", ".join(f"{count} {state}" for state, count in result["counts"].items())
     return Group(
         _scan_table(result),
+        _placement(result["placement"]),
         *(_tiles(result["changed"]) if result["objects"] is None else _objects(result)),
         f"{counts}; changed is a score above {result['threshold']:.2f} ({result['model']})",
         *(f"{what:<8} {path}" for what, path in result["files"].items()),
     )
+
+
+def _placement(placement: dict[str, Any]) -> str:
+    if placement["confidence"] is None:
+        return "placement by surfaces alone: it is not known from where the points were seen"
+    confidence = f"(confidence {placement['confidence']:.2f})"
+    if placement["state"] == "in_doubt":
+        return f"placement in doubt {confidence}: no tile counts as unchanged or changed"
+    return f"placement {placement['state']} {confidence}"
 
 
 def _objects(result: dict[str, Any]) -> list[Table | str]:
@@ -83,7 +94,7 @@ def _shortened(
 
 
 def _scan_table(result: dict[str, Any]) -> Table:
-    table = Table("visit", "scan", "placed", "fitness", "RMSE (cm)", "why not")
+    table = Table("visit", "scan", "placed", "fitness", "RMSE (cm)", "reason", "detail, warnings")
     for visit in ("reference", "current"):
         for scan in result[visit]:
             fitness, rmse = scan["fitness"], scan["rmse"]
@@ -93,7 +104,8 @@ def _scan_table(result: dict[str, Any]) -> Table:
                 "yes" if scan["accepted"] else "no",
                 "" if fitness is None else f"{fitness:.2f}",
                 "" if rmse is None else f"{rmse * 100:.1f}",
-                scan["reason"] or "",
+                (scan["reason"] or "").replace("_", " "),
+                "\n".join(filter(None, [scan["detail"], told_warnings(scan["warnings"])])),
             )
     return table
 

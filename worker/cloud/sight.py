@@ -23,7 +23,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from worker.cloud.types import Floats
+from worker.cloud.types import Floats, Matrix4
 from worker.threads import query_threads
 
 CELLS = 96  #: along a face of the cube: 1.2 degrees in its middle, 0.6 at its edge
@@ -115,6 +115,18 @@ class Sights:
         """Return the images of these scans (s,) alone."""
         return Sights(
             origins=self.origins[chosen], nearest=self.nearest[chosen], farthest=self.farthest[chosen]
+        )
+
+    def placed(self, target_from_source: Matrix4) -> Sights:
+        """Return the images in another frame; each cell keeps the ranges seen through the middle of it."""
+        rays = (_middles() @ target_from_source[:3, :3]).astype(
+            np.float32
+        )  # of each new cell, in the old frame
+        cells = _cells_of(rays)
+        return Sights(
+            origins=self.origins @ target_from_source[:3, :3].T + target_from_source[:3, 3],
+            nearest=self.nearest[:, cells],
+            farthest=self.farthest[:, cells],
         )
 
     def blinded(self, low: Floats, high: Floats) -> Sights:

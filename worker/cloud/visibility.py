@@ -19,7 +19,14 @@ from worker.cloud.types import Bools, Floats
 #: 0.87 to 0.89; scans assembled on the way 0.70 to 0.85, merged maps 0.17 to 0.34.
 ENOUGH = 0.85
 CELLS = 45  #: along a face of the cube: 2 degrees
-_DEPTH = (1.1, 0.2)  # times the nearest range, plus metres: still the same surface
+_DEPTH = (
+    0.1,
+    0.2,
+)  # of the nearest range, plus metres, that a point may lie behind it: still the same surface
+_DEEPEST = 2.0  # metres; from far away one direction holds a whole room, and a tenth of the range as much
+#: times the points' RMS distance from their middle that half of them may be away: 0.7 to 1.5 for standing scanners,
+#: 2.6 for Kinect frames; what sees a cloud from farther away sees it all in one direction
+_FARTHEST = 6.0
 #: times the range, plus metres, that a point must stand nearer than what was seen behind it
 MARGIN = (0.05, 0.3)
 
@@ -49,10 +56,20 @@ class RangeImage:
 def share_in_front(points: NDArray[Any], origin: NDArray[Any]) -> float:
     """Return the share (0..1) of points (N, 3), metres, with nothing much nearer to `origin` (3,) in their direction.
 
-    From `ENOUGH` on the points can have been seen from there.
+    From `ENOUGH` on the points can have been seen from there. 0 for an origin far outside the cloud, as of a file whose
+    points were moved into a map's grid while its viewpoint was not: from there nothing stands behind anything.
     """
     ranges, cell, nearest = _returns(points, origin)
-    return float(np.mean(ranges < nearest[cell] * _DEPTH[0] + _DEPTH[1])) if len(ranges) else 0.0
+    if not len(ranges) or _far_outside(points, ranges):
+        return 0.0
+    before = nearest[cell]
+    return float(np.mean(ranges < before + np.minimum(_DEPTH[0] * before, _DEEPEST) + _DEPTH[1]))
+
+
+def _far_outside(points: NDArray[Any], ranges: Floats) -> bool:
+    """Tell whether points (N, 3), at ranges (K,) from an origin, are much farther from it than from each other."""
+    spread = float(np.sqrt(np.var(points, axis=0, dtype=np.float64).sum()))
+    return bool(np.median(ranges) > _FARTHEST * spread)
 
 
 def _returns(points: NDArray[Any], origin: NDArray[Any]) -> tuple[Floats, NDArray[np.int64], Floats]:

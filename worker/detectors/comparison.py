@@ -48,6 +48,7 @@ class Comparison:
     reference: Side
     current: Side
     tile_pairs: TilePairs  #: both clouds cut along the map's tiles
+    displaced: Indices | None = None  #: (D, 3) tiles in which the building itself does not lie on the map's
 
     @property
     def grid(self) -> TileGrid:

@@ -3,20 +3,25 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
+from typing import Any
 
 import numpy as np
 
-from service.catalog.records import ScanOutcome
+from service.catalog.records import Placement, PlacementState, ScanOutcome, ScanWarning
 from worker.cloud import npz
 from worker.cloud.seen import Seen
+from worker.errors import ScanError
 from worker.jobs.step import Context, load, put
 from worker.pipeline import archive
+from worker.pipeline.registration.diagnosis import Diagnosis
 from worker.pipeline.registration.results import (
     RegisteredScan,
     ScanFile,
     ScanResult,
+    SurveyPlacement,
     read_registered,
     with_carrier,
 )
@@ -40,6 +45,32 @@ def scan_outcomes(scans: Sequence[ScanOutcome], outcomes: Sequence[ScanResult]) 
     """Return what became of each scan, as it is recorded."""
     ids = [scan.scan_id for scan in scans]
     return tuple(_recorded(scan_id, outcome, ids) for scan_id, outcome in zip(ids, outcomes, strict=True))
+
+
+def unread(files: Sequence[ScanFile], error: ScanError, *, max_points: int) -> tuple[ScanResult, ...]:
+    """Return why each file of a visit was left out, of which none could be read; `error` is that of one of them."""
+    results = []
+    for file in files:
+        why = error
+        try:
+            file.read(max_points=max_points)
+        except ScanError as own:
+            why = own
+        results.append(ScanResult.rejected(file.name, why))
+    return tuple(results)
+
+
+def recorded_placement(placement: SurveyPlacement) -> Placement:
+    """Return the placement of a survey of accepted scans, as it is recorded."""
+    state: PlacementState = "in_doubt" if placement.in_doubt else "confirmed"
+    return Placement(state=state, confidence=placement.confidence)
+
+
+def kept_placement(placement: Placement | None) -> SurveyPlacement | None:
+    """Return what was recorded of a survey of accepted scans; None where it was registered by an earlier release."""
+    if placement is None or placement.state == "refused":
+        return None
+    return SurveyPlacement(confidence=placement.confidence or 0.0, in_doubt=placement.state == "in_doubt")
 
 
 def save_scans(
@@ -84,16 +115,47 @@ def seen_by(
 
 
 def _recorded(scan_id: str, outcome: ScanResult, ids: Sequence[str]) -> ScanOutcome:
-    registration = outcome.registration
-    sigma = None if registration is None else registration.uncertainty
     return ScanOutcome(
         scan_id=scan_id,
-        accepted=registration is not None,
+        accepted=outcome.registration is not None,
         fitness=outcome.fitness,
         rmse=outcome.inlier_rmse,
-        map_from_scan=None if registration is None else registration.map_from_scan.tolist(),
-        translation_sigma=None if sigma is None else sigma.translation,
-        rotation_sigma=None if sigma is None else sigma.rotation,
-        path=None if registration is None else tuple(ids[index] for index in registration.path) or None,
-        reason=outcome.reason,
+        confidence=outcome.confidence,
+        **_pose(outcome, ids),
+        **_why(outcome.diagnosis),
+        warnings=tuple(
+            ScanWarning(reason=one.reason, detail=one.detail, numbers=_finite(one.numbers))
+            for one in outcome.warnings
+        ),
     )
+
+
+def _pose(outcome: ScanResult, ids: Sequence[str]) -> dict[str, Any]:
+    """Return where an accepted scan stands and how sure that is; `ids` are those of all scans."""
+    registration = outcome.registration
+    if registration is None:
+        return {}
+    sigma = registration.uncertainty
+    return {
+        "map_from_scan": registration.map_from_scan.tolist(),
+        "translation_sigma": None if sigma is None else sigma.translation,
+        "rotation_sigma": None if sigma is None else sigma.rotation,
+        "path": tuple(ids[index] for index in registration.path) or None,
+    }
+
+
+def _why(diagnosis: Diagnosis | None) -> dict[str, Any]:
+    """Return why a scan was left out."""
+    if diagnosis is None:
+        return {}
+    return {
+        "reason": diagnosis.reason,
+        "detail": diagnosis.detail,
+        "numbers": _finite(diagnosis.numbers),
+        "candidates": [pose.tolist() for pose in diagnosis.poses] or None,
+    }
+
+
+def _finite(numbers: Mapping[str, float]) -> dict[str, float]:
+    """Return the numbers as JSON has them; one that could not be measured is not there."""
+    return {name: float(value) for name, value in numbers.items() if math.isfinite(value)}

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import functools
-from contextlib import ExitStack
+from collections.abc import Sequence
+from contextlib import ExitStack, suppress
 from dataclasses import asdict
 
 from service.catalog import blob_keys
@@ -12,6 +13,7 @@ from service.catalog.records import (
     Motion,
     ObjectRecord,
     Place,
+    Placement,
     SurveyRecord,
     TileRecord,
     VersionRecord,
@@ -20,17 +22,30 @@ from worker.cloud import npz
 from worker.detectors.card import Card
 from worker.detectors.comparison import Comparison
 from worker.detectors.detector import Detection
+from worker.errors import MapFailed, ScanError
 from worker.jobs.models import card_of, card_that_fits, kept_detector, pipeline_settings
-from worker.jobs.scans import kept_scans, save_scans, scan_files, scan_outcomes, seen_by
+from worker.jobs.scans import (
+    kept_placement,
+    kept_scans,
+    recorded_placement,
+    save_scans,
+    scan_files,
+    scan_outcomes,
+    seen_by,
+    unread,
+)
 from worker.jobs.step import Context, load, put, step
 from worker.jobs.versions import kept_alarms, kept_reference, kept_seen
 from worker.pipeline.alarms import AlarmCalibration
 from worker.pipeline.flow import NoScanAccepted, compare, concluded, locate_survey
-from worker.pipeline.mapping.fusion import CurrentMap
+from worker.pipeline.mapping.fusion import CurrentMap, ReferenceMap
+from worker.pipeline.registration.results import ScanResult
 from worker.pipeline.results.changes import ChangeSet
 from worker.pipeline.results.export import TileResult, tile_results, write_coloured_cloud
 from worker.pipeline.results.objects import ChangeObject
 from worker.pipeline.results.picture import draw_picture
+from worker.pipeline.results.refusal import draw_refusal
+from worker.pipeline.results.sheet import LeftOut
 from worker.pipeline.settings import PipelineSettings
 from worker.progress import Progress
 
@@ -40,18 +55,29 @@ def register_survey(context: Context) -> None:
     """Fuse the scans to one cloud in the map's frame; a survey with no accepted scan fails here."""
     survey, version, settings = _asked(context)
     reference = kept_reference(context, version)
+    seen = None
+    with suppress(MapFailed):  # without what the map's scans saw, poses are judged by surfaces alone
+        seen = kept_seen(context, version, voxel_size=settings.registration.voxel_size)
     with ExitStack() as stack:
         files = scan_files(context, survey.scans, stack, settings)
         try:
-            located = locate_survey(files, reference, settings=settings, progress=context.report)
-        except NoScanAccepted as error:
-            context.catalog.surveys.save_outcomes(
-                survey.survey_id, scan_outcomes(survey.scans, error.outcomes)
+            located = locate_survey(
+                files, reference, settings=settings, reference_seen=seen, progress=context.report
             )
+        except NoScanAccepted as error:
+            _refuse(context, survey, error.outcomes, reference)
+            raise
+        except ScanError as error:
+            left_out = unread(files, error, max_points=settings.max_scan_points)
+            _refuse(context, survey, left_out, reference)
             raise
         key_of = functools.partial(blob_keys.survey_scan, survey.survey_id)
         save_scans(context, survey.scans, files, located.outcomes, key_of)
-    context.catalog.surveys.save_outcomes(survey.survey_id, scan_outcomes(survey.scans, located.outcomes))
+    context.catalog.surveys.save_outcomes(
+        survey.survey_id,
+        scan_outcomes(survey.scans, located.outcomes),
+        placement=recorded_placement(located.placement),
+    )
     put(context, blob_keys.survey_current(survey.survey_id), lambda path: npz.save(path, located.current))
     put(context, blob_keys.survey_seen(survey.survey_id), lambda path: npz.save(path, located.seen))
 
@@ -90,6 +116,7 @@ def export_survey(context: Context) -> None:
         detection,
         threshold=threshold,
         settings=settings.with_values(objects=objects),
+        placement=kept_placement(survey.placement),
         by_objects=survey.threshold is None,
     )
     context.report("exporting", 0.3)
@@ -105,6 +132,44 @@ def export_survey(context: Context) -> None:
     context.catalog.jobs.succeed(context.job.job_id)
 
 
+def _refuse(
+    context: Context, survey: SurveyRecord, outcomes: Sequence[ScanResult], reference: ReferenceMap
+) -> None:
+    """Record that no scan of a survey was accepted, and why; keep a picture that says so."""
+    context.catalog.surveys.save_outcomes(
+        survey.survey_id,
+        scan_outcomes(survey.scans, outcomes),
+        placement=Placement(state="refused", confidence=None),
+    )
+    left_out = [
+        LeftOut(name=one.name, reason=one.diagnosis.reason, detail=one.diagnosis.detail)
+        for one in outcomes
+        if one.diagnosis is not None
+    ]
+    put(
+        context,
+        blob_keys.survey_picture(survey.survey_id),
+        lambda path: draw_refusal(path, reference.points, left_out, title=_title(survey)),
+    )
+
+
+def _title(survey: SurveyRecord) -> str:
+    return f"Map {survey.map_id}: survey of {survey.captured_at:%Y-%m-%d %H:%M} UTC"
+
+
+def _left_out(context: Context, survey: SurveyRecord) -> list[LeftOut]:
+    """Return the scans that were left out, by the names of their files."""
+    return [
+        LeftOut(
+            name=context.catalog.scans.get(scan.scan_id).filename,
+            reason=scan.reason or "",
+            detail=scan.detail or "",
+        )
+        for scan in survey.scans
+        if scan.accepted is False
+    ]
+
+
 def _least_score(context: Context, version: VersionRecord, card: Card, model: str) -> float:
     """Return the limit on a region's score that the step before has kept with the map."""
     key = blob_keys.map_alarms(version.job_id, model, card.fingerprint)
@@ -115,7 +180,7 @@ def _put_cloud_and_picture(
     context: Context, survey: SurveyRecord, comparison: Comparison, changes: ChangeSet
 ) -> None:
     reference, current = comparison.reference.points, comparison.current.points
-    title = f"Map {survey.map_id}: survey of {survey.captured_at:%Y-%m-%d %H:%M} UTC"
+    left_out = _left_out(context, survey)
     put(
         context,
         blob_keys.survey_cloud(survey.survey_id),
@@ -125,7 +190,7 @@ def _put_cloud_and_picture(
     put(
         context,
         blob_keys.survey_picture(survey.survey_id),
-        lambda path: draw_picture(path, reference, current, changes, title=title),
+        lambda path: draw_picture(path, reference, current, changes, title=_title(survey), left_out=left_out),
     )
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from worker.cloud.seen import Seen
 from worker.cloud.sight import Sights
 from worker.cloud.tiling import TileGrid, Tiles, grid_over, grown, pair_tiles, touched_tiles
@@ -17,10 +19,12 @@ from worker.pipeline.mapping.fusion import CurrentMap, ReferenceMap, current_map
 from worker.pipeline.mapping.map_registration import MapReport, register_map_scans
 from worker.pipeline.mapping.pair_registration import PairCache
 from worker.pipeline.mapping.survey_registration import register_survey_scans
+from worker.pipeline.placement.displacement import displaced_tiles
 from worker.pipeline.registration.results import (
     RegisteredScan,
     ScanFile,
     ScanResult,
+    SurveyPlacement,
     read_registered,
     with_carrier,
 )
@@ -53,6 +57,7 @@ class LocatedSurvey:
     current: CurrentMap
     comparison: Comparison
     outcomes: tuple[ScanResult, ...]
+    placement: SurveyPlacement
     seen: Seen  #: what its scans saw
 
 
@@ -61,7 +66,8 @@ class NoScanAccepted(RegistrationFailed):
 
     def __init__(self, outcomes: Sequence[ScanResult]) -> None:
         self.outcomes = tuple(outcomes)
-        reasons = "; ".join(str(outcome.reason) for outcome in outcomes)
+        told = [outcome.diagnosis for outcome in outcomes if outcome.diagnosis is not None]
+        reasons = "; ".join(f"{diagnosis.detail} [{diagnosis.reason}]" for diagnosis in told)
         super().__init__(f"no scan could be registered to the map: {reasons}")
 
 
@@ -117,25 +123,37 @@ def locate_survey(
 ) -> LocatedSurvey:
     """Register the scans to the map, fuse those accepted, set both side by side (stage 3, first half).
 
-    `reference_seen` is what the map's scans saw; detectors by voxels need it. Raises ScanError where no
-    file can be read, NoScanAccepted where none is left to compare.
+    `reference_seen` is what the map's scans saw: poses are held against it, and detectors by voxels need it. Raises
+    ScanError where no file can be read, NoScanAccepted where none is left to compare.
     """
     files = with_carrier(files, settings.carrier, max_points=settings.max_scan_points)
-    outcomes = register_survey_scans(
-        files, reference.surface(), settings=settings.joint_registration, progress=progress
+    registered = register_survey_scans(
+        files,
+        reference.surface(),
+        settings=settings.joint_registration,
+        sights=None if reference_seen is None else reference_seen.sights,
+        progress=progress,
     )
+    outcomes = registered.outcomes
     if not any(outcome.registration for outcome in outcomes):
         raise NoScanAccepted(outcomes)
     progress("tiling", 0.0)
     sights: list[Sights | None] = []
     accepted = watched(accepted_scans(files, outcomes, settings), sights)
     fused = fuse(accepted, voxel_size=reference.voxel_size)
-    current, seen = current_map(fused), Seen.of_voxels(fused, sights)
+    displaced = displaced_tiles(registered.held, reference.grid)
+    current, seen = replace(current_map(fused), displaced=displaced), Seen.of_voxels(fused, sights)
     comparison = compare(
         reference, current, settings=settings, reference_seen=reference_seen, current_seen=seen
     )
     progress("tiling", 1.0)
-    return LocatedSurvey(current=current, comparison=comparison, outcomes=outcomes, seen=seen)
+    return LocatedSurvey(
+        current=current,
+        comparison=comparison,
+        outcomes=outcomes,
+        placement=registered.placement,
+        seen=seen,
+    )
 
 
 def compare(
@@ -159,6 +177,7 @@ def compare(
         ),
         current=Side(points=current.points, scans=current_scans, seen=current_seen),
         tile_pairs=pair_tiles(tiles, current.points, settings=settings.tiling),
+        displaced=current.displaced,
     )
 
 
@@ -169,14 +188,20 @@ def detect(
     embedding: Arrays | None = None,
     threshold: float | None = None,
     settings: PipelineSettings | None = None,
+    placement: SurveyPlacement | None = None,
     progress: Progress = no_progress,
 ) -> ChangeSet:
-    """Score the survey, then decide (stage 3, second half); the threshold is the card's if None is given."""
+    """Score the survey, then decide (stage 3, second half); the threshold is the card's if None is given.
+
+    `placement` is what `locate_survey` says of it; None where it is known.
+    """
     settings = settings or PipelineSettings()
     detection = detector.detect(comparison, embedding=embedding, progress=progress)
     own = threshold is None
     threshold = detector.card.threshold if threshold is None else threshold
-    return concluded(comparison, detection, threshold=threshold, settings=settings, by_objects=own)
+    return concluded(
+        comparison, detection, threshold=threshold, settings=settings, placement=placement, by_objects=own
+    )
 
 
 def concluded(
@@ -185,16 +210,25 @@ def concluded(
     *,
     threshold: float,
     settings: PipelineSettings,
+    placement: SurveyPlacement | None = None,
     by_objects: bool = True,
 ) -> ChangeSet:
-    """Make of a detector's scores the states of tiles and, where it scored voxels that both visits saw, objects."""
+    """Make of a detector's scores the states of tiles and, where it scored voxels that both visits saw, objects.
+
+    Where the placement is in doubt, scores prove nothing: no tile is unchanged or changed, and there are no objects.
+    The same is said of single tiles in which walls, floor or ceiling do not lie on the map's.
+    """
     least = settings.tiling.min_observed_share
     changes = decide(comparison.tile_pairs, detection, threshold=threshold, min_observed_share=least)
+    if placement is not None and placement.in_doubt:
+        return changes.in_doubt(placement.confidence or 0.0)
+    displaced = np.empty((0, 3), np.int32) if comparison.displaced is None else comparison.displaced
     if detection.voxels is None or comparison.reference.seen is None or comparison.current.seen is None:
-        return changes
+        return changes.with_displaced(displaced)
     objects = change_objects(comparison, detection.voxels, settings.objects)
     changes = replace(changes, voxels=detection.voxels, objects=objects)
-    return changes.where_objects_lie(least) if by_objects else changes
+    changes = changes.where_objects_lie(least) if by_objects else changes
+    return changes.with_displaced(displaced)
 
 
 def accepted_scans(

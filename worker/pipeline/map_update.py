@@ -44,8 +44,13 @@ def extend_map(
     """
     files = with_carrier(files, settings.carrier, max_points=settings.max_scan_points)
     outcomes = register_survey_scans(
-        files, base.reference.surface(), settings=settings.joint_registration, growing=True, progress=progress
-    )
+        files,
+        base.reference.surface(),
+        settings=settings.joint_registration,
+        sights=base.seen.sights,
+        growing=True,
+        progress=progress,
+    ).outcomes
     if not any(outcome.registration for outcome in outcomes):
         raise NoScanAccepted(outcomes)
     sights = [base.seen.sights]

@@ -9,6 +9,7 @@ from worker.cloud.settings import StrictModel
 from worker.cloud.tiling import TilingSettings
 from worker.detectors.card import Preprocessing
 from worker.pipeline.mapping.settings import JointRegistrationSettings, MappingSettings
+from worker.pipeline.placement.settings import PlacementSettings
 from worker.pipeline.registration.settings import RegistrationSettings
 from worker.pipeline.results.objects import ObjectSettings
 
@@ -18,6 +19,7 @@ class PipelineSettings(StrictModel):
 
     carrier: CarrierSettings = CarrierSettings.model_validate({})
     registration: RegistrationSettings = Field(default_factory=RegistrationSettings)
+    placement: PlacementSettings = PlacementSettings.model_validate({})
     mapping: MappingSettings = Field(default_factory=MappingSettings)
     tiling: TilingSettings = Field(default_factory=TilingSettings)
     objects: ObjectSettings = Field(default_factory=ObjectSettings)
@@ -38,5 +40,8 @@ class PipelineSettings(StrictModel):
     def joint_registration(self) -> JointRegistrationSettings:
         """What the registration of many scans needs of these."""
         return JointRegistrationSettings(
-            registration=self.registration, mapping=self.mapping, max_points=self.max_scan_points
+            registration=self.registration,
+            mapping=self.mapping,
+            max_points=self.max_scan_points,
+            placement=self.placement,
         )

@@ -55,7 +55,12 @@ def test_a_map_of_known_scans_is_accepted_and_its_job_submitted(
             "translation_sigma": None,
             "rotation_sigma": None,
             "path": None,
+            "confidence": None,
             "reason": None,
+            "detail": None,
+            "numbers": None,
+            "candidates": None,
+            "warnings": [],
         }
     ]
     assert client.get(answer.headers["location"]).json()["map_id"] == "lobby"

@@ -9,6 +9,7 @@ from fastapi.testclient import TestClient
 
 from service.catalog import blob_keys
 from service.catalog.catalog import Catalog
+from service.catalog.records import Placement, Problem
 from service.settings import Settings
 from tests.support.samples import NOON, RememberingQueue, add_map, add_scan, add_survey, ply, tile
 
@@ -152,3 +153,62 @@ def test_deleting_a_survey_stops_its_job_and_leaves_its_map(
     assert queue.dismissed == [(job_id, "survey")]
     assert client.get(f"/surveys/{survey_id}").status_code == 404
     assert client.get("/maps/lobby").json()["status"] == "ready"
+
+
+def refuse(catalog: Catalog, survey_id: str, job_id: str) -> None:
+    """What the worker leaves of a survey of which no scan was accepted."""
+    (scan,) = catalog.surveys.get(survey_id).scans
+    why = {"accepted": False, "reason": "other_place", "detail": "hall.pcd: another place", "numbers": {}}
+    placement = Placement(state="refused", confidence=None)
+    catalog.surveys.save_outcomes(survey_id, [scan.model_copy(update=why)], placement=placement)
+    catalog.blobs.put_bytes(blob_keys.survey_picture(survey_id), b"\x89PNG")
+    catalog.jobs.fail(job_id, Problem(code="registration_failed", detail="hall.pcd: another place"))
+
+
+def test_a_survey_shows_how_sure_its_placement_is(client: TestClient, catalog: Catalog) -> None:
+    add_map(catalog)
+    survey_id, _ = add_survey(catalog, ready=False)
+    assert client.get(f"/surveys/{survey_id}").json()["placement"] is None
+    catalog.surveys.save_outcomes(survey_id, [], placement=Placement(state="in_doubt", confidence=0.71))
+    expected = {"state": "in_doubt", "confidence": 0.71}
+    assert client.get(f"/surveys/{survey_id}").json()["placement"] == expected
+    (listed,) = client.get("/maps/lobby/surveys").json()["surveys"]
+    assert listed["placement"] == expected
+
+
+def test_a_refused_survey_shows_why_for_each_scan_and_has_a_picture(
+    client: TestClient, catalog: Catalog
+) -> None:
+    add_map(catalog)
+    survey_id, job_id = add_survey(catalog, ready=False)
+    refuse(catalog, survey_id, job_id)
+    found = client.get(f"/surveys/{survey_id}").json()
+    assert found["placement"] == {"state": "refused", "confidence": None}
+    (scan,) = found["scans"]
+    assert (scan["reason"], scan["numbers"], scan["candidates"], scan["warnings"]) == (
+        "other_place",
+        {},
+        None,
+        [],
+    )
+    assert scan["detail"] in found["problem"]["detail"]
+    (preview,) = (link for link in found["links"] if link["rel"] == "preview")
+    assert client.get(preview["href"]).content == b"\x89PNG"
+    assert client.get(f"/surveys/{survey_id}/tiles").status_code == 409
+
+
+def test_a_survey_in_doubt_tells_no_objects_and_says_why(client: TestClient, catalog: Catalog) -> None:
+    add_map(catalog)
+    survey_id, job_id = add_survey(catalog, ready=False)
+    catalog.surveys.save_outcomes(survey_id, [], placement=Placement(state="in_doubt", confidence=0.71))
+    tiles = [tile(0, 0, "inconsistent", 0.9, observed_share=1.0)]
+    catalog.surveys.save_result(survey_id, tiles=tiles, threshold=0.5)
+    catalog.jobs.succeed(job_id)
+    answer = client.get(f"/surveys/{survey_id}/objects")
+    assert (answer.status_code, "its placement is in doubt" in answer.json()["detail"]) == (404, True)
+    assert client.get("/maps/lobby/changes").json()["features"] == []
+    (feature,) = client.get(f"/surveys/{survey_id}/tiles").json()["features"]
+    assert (feature["properties"]["state"], feature["properties"]["score"]) == ("inconsistent", 0.9)
+    accepting = client.post("/maps/lobby/versions", json={"survey_id": survey_id})
+    assert (accepting.status_code, accepting.json()["type"]) == (409, "urn:spicd:problem:conflict")
+    assert "visit the place again" in accepting.json()["detail"]

@@ -212,7 +212,9 @@ def test_a_scan_of_the_version_in_use_is_refused_and_one_that_was_left_out_may_c
     (kept,) = catalog.maps.get("lobby").scans
     answer = post(client, scan_ids=[kept.scan_id])
     assert (answer.status_code, kept.scan_id in answer.json()["detail"]) == (422, True)
-    catalog.versions.save_outcomes(job_id, [ScanOutcome(scan_id=kept.scan_id, accepted=False, reason="-")])
+    catalog.versions.save_outcomes(
+        job_id, [ScanOutcome(scan_id=kept.scan_id, accepted=False, reason="no_fit")]
+    )
     assert post(client, scan_ids=[kept.scan_id]).status_code == 202
     (again,) = catalog.versions.get("lobby", 2).scans
     assert again.accepted is None

@@ -68,7 +68,16 @@ def test_a_result_saved_twice_is_the_second_result(catalog: Catalog) -> None:
 def test_outcomes_of_a_failed_map_are_kept(catalog: Catalog) -> None:
     job_id = add_map(catalog, ready=False)
     scan_id = catalog.maps.get("lobby").scans[0].scan_id
-    left_out = ScanOutcome(scan_id=scan_id, accepted=False, fitness=0.1, rmse=0.04, reason="fitness 0.10")
+    left_out = ScanOutcome(
+        scan_id=scan_id,
+        accepted=False,
+        fitness=0.1,
+        rmse=0.04,
+        reason="ambiguous",
+        detail="two poses fit alike, 0.90 and 0.89; give a pose prior",
+        numbers={"margin": 0.01},
+        candidates=(IDENTITY, IDENTITY),
+    )
     catalog.versions.save_outcomes(job_id, [left_out])
     assert catalog.maps.get("lobby").scans == (left_out,)
 
@@ -263,7 +272,7 @@ def test_a_late_step_of_a_deleted_map_touches_nothing_of_the_map_that_took_its_i
     new = add_map(catalog)
     before = catalog.maps.get("lobby")
     assert blob_keys.map_folder(old) != blob_keys.map_folder(new)
-    left_out = [ScanOutcome(scan_id=before.scans[0].scan_id, accepted=False, reason="late")]
+    left_out = [ScanOutcome(scan_id=before.scans[0].scan_id, accepted=False, reason="no_fit")]
     with pytest.raises(NotFound):
         catalog.versions.save_outcomes(old, left_out)
     with pytest.raises(NotFound):

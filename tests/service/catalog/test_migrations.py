@@ -82,6 +82,22 @@ def test_the_survey_of_the_last_build_tells_no_objects_and_its_change_once(opene
     assert opened.surveys.get(later).objects == {"appeared": 1, "disappeared": 0, "moved": 0}
 
 
+def test_a_sentence_of_the_last_build_is_the_detail_of_a_scan_without_a_reason(old: Settings) -> None:
+    run(old, "UPDATE survey_scans SET accepted = 0, fitness = 0.1, reason = 'visit.pcd: fitness 0.10'")
+    catalog = open_catalog(old)
+    (survey_scan,) = catalog.surveys.get("survey-1").scans
+    (map_scan,) = catalog.maps.get("lobby").scans
+    catalog.close()
+    assert (survey_scan.accepted, survey_scan.reason) == (False, None)
+    assert survey_scan.detail == "visit.pcd: fitness 0.10"
+    assert (survey_scan.numbers, survey_scan.candidates, survey_scan.warnings) == (None, None, ())
+    assert (map_scan.reason, map_scan.detail, map_scan.confidence) == (None, None, None)
+
+
+def test_of_a_survey_of_the_last_build_nobody_judged_the_placement(opened: Catalog) -> None:
+    assert opened.surveys.get("survey-1").placement is None
+
+
 def test_what_a_version_of_the_last_build_took_over_is_known(old: Settings) -> None:
     run(
         old,

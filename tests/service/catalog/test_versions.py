@@ -72,7 +72,7 @@ def test_a_scan_of_a_survey_that_was_left_out_is_left_out_of_the_version(catalog
     add_map(catalog)
     ids = [add_scan(catalog, name).scan_id for name in ("seen", "astray")]
     survey, job = catalog.surveys.create("lobby", scan_ids=ids, model="m/1")
-    astray = ScanOutcome(scan_id=ids[1], accepted=False, reason="fitness 0.10")
+    astray = ScanOutcome(scan_id=ids[1], accepted=False, reason="no_fit", detail="fitness 0.10")
     catalog.surveys.save_outcomes(survey.survey_id, [SURE.model_copy(update={"scan_id": ids[0]}), astray])
     catalog.jobs.succeed(job.job_id)
     version, _ = catalog.versions.create("lobby", survey_id=survey.survey_id)
@@ -83,7 +83,9 @@ def test_a_later_version_keeps_what_the_first_left_out_out(catalog: Catalog) -> 
     first = add_map(catalog)
     (scan,) = catalog.maps.get("lobby").scans
     second = add_version(catalog)
-    left_out = catalog.versions.of_job(second).scans[1].model_copy(update={"accepted": False, "reason": "-"})
+    left_out = (
+        catalog.versions.of_job(second).scans[1].model_copy(update={"accepted": False, "reason": "no_fit"})
+    )
     catalog.versions.save_outcomes(second, [left_out])
     version, _ = catalog.versions.create("lobby", scan_ids=[add_scan(catalog, "third").scan_id])
     assert version.scans[0] == scan

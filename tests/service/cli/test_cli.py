@@ -37,9 +37,19 @@ SURVEY = {
     "map_id": "lobby",
     "status": "ready",
     "captured_at": "2026-03-02T12:00:00Z",
+    "placement": {"state": "in_doubt", "confidence": 0.712},
     "counts": {"changed": 9, "unchanged": 150},
     "scans": [
-        {"scan_id": "scan-2", "accepted": False, "fitness": 0.1, "rmse": None, "reason": "too little overlap"}
+        {"scan_id": "scan-2", "accepted": False, "reason": "too_little_overlap", "detail": "covers 4% of it"},
+        {
+            "scan_id": "scan-3",
+            "accepted": True,
+            "fitness": 0.9,
+            "confidence": 0.97,
+            "warnings": [
+                {"reason": "wrong_scale", "detail": "its scale is 1.012", "numbers": {"scale": 1.012}}
+            ],
+        },
     ],
 }
 CHANGES = {
@@ -237,7 +247,7 @@ def test_the_client_sets_an_anchor_and_takes_it_away(service: Service) -> None:
 def test_names_that_look_like_markup_are_printed_as_they_are(
     service: Service, tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
 ) -> None:
-    scan = {**MAP["scans"][0], "accepted": False, "reason": name}
+    scan = {**MAP["scans"][0], "accepted": False, "reason": "no_fit", "detail": name}
     service.on("GET /maps", {"maps": [{**MAP, "name": name}], "links": []})
     service.on("GET /maps/lobby", {**MAP, "name": "Lobby", "scans": [scan]})
     service.on("GET /models", {"models": [{"name": "m", "version": "1", "summary": name}]})
@@ -301,6 +311,38 @@ def test_surveys_submit_waits_and_shows_what_was_left_out(
     assert "changed 9, unchanged 150" in shown
     assert "too little overlap" in shown
     assert "http://127.0.0.1:8000/surveys/survey-1/cloud.ply" in shown
+
+
+def test_a_survey_is_shown_with_its_placement_and_why_scans_were_left_out(
+    service: Service, capsys: pytest.CaptureFixture[str]
+) -> None:
+    service.on("GET /surveys/survey-1", SURVEY)
+    assert spicd("surveys", "show", "survey-1") == 0
+    shown = capsys.readouterr().out
+    assert "in doubt (confidence 0.71)" in shown
+    for said in ("too little overlap", "covers 4% of it", "0.97", "wrong scale: its scale is 1.012"):
+        assert said in shown
+
+
+def test_a_refused_survey_is_shown_with_its_picture(
+    service: Service, capsys: pytest.CaptureFixture[str]
+) -> None:
+    refused = {**SURVEY, "status": "failed", "placement": {"state": "refused", "confidence": None}}
+    service.on("GET /surveys/survey-1", refused)
+    assert spicd("surveys", "show", "survey-1") == 0
+    shown = capsys.readouterr().out
+    assert "refused" in shown
+    assert "/surveys/survey-1/picture.png" in shown
+    assert "cloud.ply" not in shown
+
+
+def test_surveys_are_listed_with_their_placement(
+    service: Service, capsys: pytest.CaptureFixture[str]
+) -> None:
+    earlier = {name: value for name, value in SURVEY.items() if name != "placement"}
+    service.on("GET /maps/lobby/surveys", {"surveys": [SURVEY, {**earlier, "placement": None}], "links": []})
+    assert spicd("surveys", "list", "lobby") == 0
+    assert capsys.readouterr().out.count("in doubt") == 1
 
 
 def test_changes_passes_its_filters_on_and_lists_the_tiles(

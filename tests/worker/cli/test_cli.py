@@ -17,11 +17,13 @@ from tests.support import toy
 from tests.support.models import make_untrained
 from tests.support.two_visits import free_place
 from worker.benchmarks.plots import draw_curves
-from worker.cli import detect, main, terminal
+from worker.cli import detect, main, register, terminal
 from worker.cloud.formats.pcd import write_pcd
 from worker.cloud.formats.scan import read_scan
 from worker.cloud.poses import inverse, transformed
 from worker.detectors.card import MODEL_STORE
+from worker.pipeline.registration.diagnosis import Diagnosis
+from worker.pipeline.registration.results import RegistrationResult, ScanRejected, ScanResult
 from worker.progress import Progress
 from worker.simulation.scenes import random_room, rigid
 from worker.simulation.scenes.furniture import crate
@@ -130,7 +132,10 @@ def test_detect_says_by_how_much_the_later_scan_was_off(
     files: tuple[str, str], store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run("detect", *files, "--out", str(tmp_path), "--model-store", str(store), "--json") == 0
-    found = json.loads(capsys.readouterr().out)["current"][0]
+    told = json.loads(capsys.readouterr().out)
+    assert told["placement"]["state"] == "confirmed"
+    found = told["current"][0]
+    assert (found["accepted"], found["reason"], found["warnings"]) == (True, None, [])
     undone = np.array(found["map_from_scan"]) @ rigid(0.08, -0.05, 0.0, yaw=2.0)
     np.testing.assert_allclose(undone, np.eye(4), atol=0.01)
 
@@ -190,10 +195,18 @@ def test_a_bad_file_ends_in_one_sentence_that_names_it(
 def test_the_summary_prints_names_that_look_like_markup_as_they_are(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    scan = {"accepted": False, "fitness": None, "rmse": None, "reason": "too far"}
+    scan: dict[str, Any] = {
+        "accepted": False,
+        "fitness": None,
+        "rmse": None,
+        "reason": "no_fit",
+        "detail": "too far",
+        "warnings": [],
+    }
     result = {
         "model": "spicd-net/1",
         "threshold": 0.5,
+        "placement": {"state": "confirmed", "confidence": 0.98},
         "counts": {"tiles": 0},
         "reference": [{**scan, "name": "[old]/hall.pcd"}],
         "current": [{**scan, "name": "a[/]b.pcd"}],
@@ -205,6 +218,87 @@ def test_the_summary_prints_names_that_look_like_markup_as_they_are(
     terminal.show(result, detect.summary)
     shown = capsys.readouterr().out
     assert all(name in shown for name in ("[old]/hall.pcd", "a[/]b.pcd", "[new]/tiles.geojson"))
+
+
+def test_the_summary_says_that_the_placement_is_in_doubt(capsys: pytest.CaptureFixture[str]) -> None:
+    odd = {"reason": "wrong_scale", "detail": "its scale is 1.012", "numbers": {"scale": 1.012}}
+    result = {
+        "model": "spicd-net/1",
+        "threshold": 0.5,
+        "placement": {"state": "in_doubt", "confidence": 0.71},
+        "counts": {"tiles": 4, "inconsistent": 4},
+        "reference": [],
+        "current": [
+            {
+                "name": "b.pcd",
+                "accepted": True,
+                "fitness": 0.9,
+                "rmse": 0.02,
+                "reason": None,
+                "detail": None,
+                "warnings": [odd],
+            }
+        ],
+        "changed": [],
+        "objects": None,
+        "moving": None,
+        "files": {},
+    }
+    terminal.show(result, detect.summary)
+    shown = capsys.readouterr().out
+    assert "placement in doubt (confidence 0.71): no tile counts as unchanged or changed" in shown
+    assert "wrong scale: its scale is 1.012" in shown
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("as_json", [True, False])
+def test_register_says_why_a_scan_has_no_place(
+    files: tuple[str, str], tmp_path: Path, capsys: pytest.CaptureFixture[str], as_json: bool
+) -> None:
+    """A bare floor leaves three motions free."""
+    floor = np.random.default_rng(2).uniform((0, 0, 0), (4, 3, 0), (30_000, 3)).astype(np.float32)
+    write_pcd(tmp_path / "floor.pcd", floor)
+    words = ["--json"] if as_json else []
+    assert run("register", files[0], str(tmp_path / "floor.pcd"), *words) == 1
+    told = capsys.readouterr()
+    assert "floor.pcd" in told.err
+    if as_json:
+        result = json.loads(told.out)
+        assert (result["accepted"], result["reason"]) == (False, "degenerate")
+        assert result["detail"] == told.err.strip()
+        assert result["numbers"]
+        assert (result["candidates"], result["warnings"]) == (None, [])
+    else:
+        assert re.search(r"reason +. degenerate", told.out)
+
+
+def test_a_refusal_lists_the_candidates_and_an_acceptance_its_warnings(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    other = rigid(2.5, 0, 0, yaw=180)
+    why = Diagnosis(reason="ambiguous", detail="two", numbers={"margin": 0.012}, poses=(np.eye(4), other))
+    result = register.document(ScanResult.rejected("b.pcd", ScanRejected(why, fitness=0.9)), 1.0)
+    assert (result["reason"], result["fitness"]) == ("ambiguous", 0.9)
+    np.testing.assert_allclose(result["candidates"], [np.eye(4), other])
+    terminal.show(result, register._refusal_table)
+    shown = capsys.readouterr().out
+    assert all(said in shown for said in ("margin 0.012", "candidate 2", "2.5000"))
+    odd = Diagnosis(reason="wrong_scale", detail="its scale is 1.012", numbers={"scale": 1.012})
+    good = RegistrationResult(
+        map_from_scan=np.eye(4),
+        sensor_origin=None,
+        fitness=0.9,
+        inlier_rmse=0.02,
+        overlap=0.8,
+        two_way_inlier_ratio=0.9,
+        from_global_search=False,
+        uncertainty=None,
+    )
+    result = register.document(ScanResult.accepted("b.pcd", good, warnings=(odd,), confidence=0.97), 1.0)
+    assert result["warnings"][0]["numbers"] == {"scale": 1.012}
+    terminal.show(result, register._table)
+    shown = capsys.readouterr().out
+    assert all(said in shown for said in ("0.97", "wrong scale: its scale is 1.012"))
 
 
 @pytest.mark.slow
@@ -251,6 +345,7 @@ def test_the_summary_lists_objects_with_how_they_moved(capsys: pytest.CaptureFix
     result = {
         "model": "voxel-rule/1",
         "threshold": 0.5,
+        "placement": {"state": "confirmed", "confidence": 0.98},
         "counts": {"tiles": 0},
         "reference": [],
         "current": [],

@@ -67,3 +67,22 @@ def test_scans_merged_from_several_places_are_not_trusted(room: Room) -> None:
 
 def test_nothing_but_the_origin_is_seen_from_nowhere() -> None:
     assert share_in_front(np.zeros((5, 3)), np.zeros(3)) == 0.0
+
+
+@pytest.mark.parametrize("shift", [(3000.0, 2000.0, 0.0), (100.0, 0.0, 0.0), (0.0, 0.0, 60.0)])
+def test_a_scan_was_not_seen_from_far_outside_it(room: Room, shift: tuple[float, float, float]) -> None:
+    """As in a file whose points were moved into a map's grid while its viewpoint was left at zero."""
+    points = room.before[0].points.astype(np.float64)
+    assert share_in_front(points + shift, np.zeros(3)) < ENOUGH
+
+
+def test_a_storey_was_not_seen_from_high_above_it() -> None:
+    """Its floor and the top of its walls, seen from 60 m above it."""
+    east, north = (axis.ravel() for axis in np.meshgrid(np.arange(-20, 20, 0.2), np.arange(-20, 20, 0.2)))
+    floor = np.column_stack([east, north, np.zeros_like(east)])
+    tops = floor[np.rint(east * 5) % 5 == 0] + (0.0, 0.0, 2.9)
+    assert share_in_front(np.concatenate([floor, tops]), np.array([0.0, 0.0, 60.0])) < ENOUGH
+
+
+def test_a_wall_before_a_camera_was_seen_by_it() -> None:
+    assert share_in_front(wall(4.0, y=(-1.0, 1.0)), np.zeros(3)) > ENOUGH

@@ -29,7 +29,7 @@ from worker.pipeline.flow import (
     detect,
     locate_survey,
 )
-from worker.pipeline.registration.results import RegisteredScan, ScanFile
+from worker.pipeline.registration.results import RegisteredScan, ScanFile, SurveyPlacement
 from worker.pipeline.registration.settings import RegistrationSettings
 from worker.pipeline.results.changes import TileState
 from worker.pipeline.settings import PipelineSettings
@@ -206,6 +206,21 @@ def test_the_threshold_is_the_cards_unless_one_is_given() -> None:
     assert detect(pairs, Counting()).counts()["changed"] == 1
     assert detect(pairs, Counting(), threshold=0.5).counts()["changed"] == 0
     assert detect(pairs, Counting(), threshold=0.0).threshold == 0.0
+
+
+@pytest.mark.parametrize(
+    ("in_doubt", "states"),
+    [(False, ["unchanged", "changed", "unobserved"]), (True, ["inconsistent", "inconsistent", "unobserved"])],
+)
+def test_where_the_placement_is_in_doubt_no_tile_is_unchanged_or_changed(
+    in_doubt: bool, states: list[str]
+) -> None:
+    pairs = Comparison.of_tiles(row_of([1000] * 3, [1000, 1500, 3], observed=[True, True, False]))
+    changes = detect(
+        pairs, Counting(), placement=SurveyPlacement(confidence=0.71, in_doubt=in_doubt), settings=SETTINGS
+    )
+    assert [TileState(state).label for state in changes.states] == states
+    assert changes.doubtful_placement == (0.71 if in_doubt else None)
 
 
 def test_the_detector_is_given_what_the_map_kept_for_it() -> None:

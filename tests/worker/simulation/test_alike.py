@@ -73,7 +73,7 @@ def test_floors_of_a_hotel_have_the_same_shell_and_other_hotels_another():
     assert fixed(hotel_corridor(3)) != fixed(hotel_corridor(4))
 
 
-def test_even_rooms_of_a_hotel_have_the_same_shell_and_their_furniture_within_some_centimetres():
+def test_even_rooms_of_a_hotel_have_the_same_shell_and_their_furniture_within_some_decimetres():
     first, third = hotel_room(3), hotel_room(3, number=2)
     assert fixed(first) == fixed(third)
     assert {item.name for item in first.movable} == {item.name for item in third.movable}
@@ -81,7 +81,7 @@ def test_even_rooms_of_a_hotel_have_the_same_shell_and_their_furniture_within_so
         np.linalg.norm((third[item.name].mesh.bounds - item.mesh.bounds).mean(axis=0))
         for item in first.movable
     ]
-    assert 0.01 < np.median(off) < 0.15 and max(off) < 0.5
+    assert 0.05 < np.median(off) < 0.3 and max(off) < 0.7
 
 
 def test_odd_rooms_of_a_hotel_are_mirrored():
@@ -90,8 +90,8 @@ def test_odd_rooms_of_a_hotel_are_mirrored():
     for name in ("bath", "bed-1", "desk-1", "radiator"):
         there = first[name].mesh.bounds.mean(axis=0)
         here = second[name].mesh.bounds.mean(axis=0)
-        assert here[0] == pytest.approx(width - there[0], abs=0.3)
-        assert here[1] == pytest.approx(there[1], abs=0.3)
+        assert here[0] == pytest.approx(width - there[0], abs=0.6)
+        assert here[1] == pytest.approx(there[1], abs=0.6)
     assert overlapping(second) == []
 
 

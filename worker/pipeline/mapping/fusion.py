@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from worker.cloud.tiling import TileGrid, Tiles, cut
-from worker.cloud.types import Bools, Colors, Normals, Points
+from worker.cloud.types import Bools, Colors, Indices, Normals, Points
 from worker.cloud.voxels import Voxels, fused
 from worker.errors import MapFailed
 from worker.pipeline.registration.results import RegisteredScan
@@ -40,6 +40,7 @@ class CurrentMap:
 
     points: Points  #: (M, 3) float32, metres, map frame, one a voxel
     colors: Colors | None  #: (M, 3) uint8
+    displaced: Indices | None = None  #: (T, 3) tiles in which walls, floor or ceiling do not lie on the map's
 
 
 def fuse(scans: Iterable[RegisteredScan], *, voxel_size: float) -> Voxels:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from pydantic import Field
 
 from worker.cloud.settings import StrictModel
+from worker.pipeline.placement.settings import PlacementSettings
 from worker.pipeline.registration.settings import RegistrationSettings
 
 
@@ -45,3 +46,4 @@ class JointRegistrationSettings:
     registration: RegistrationSettings
     mapping: MappingSettings
     max_points: int  #: of one scan
+    placement: PlacementSettings = field(default_factory=lambda: PlacementSettings.model_validate({}))

@@ -12,6 +12,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from worker.cloud.poses import inverse, transformed
+from worker.cloud.sight import Sights
 from worker.cloud.types import Floats, Matrix4, Points
 from worker.cloud.voxels import Voxels
 from worker.errors import ScanError
@@ -46,9 +47,10 @@ class Folder:
         """Load one scan, from memory if it was asked for lately."""
         return _loaded(self.path(index))
 
-    def save_map(self, index: int, surface: Surface) -> None:
+    def save_map(self, index: int, surface: Surface, sights: Sights | None = None) -> None:
         """Lay a map beside the scans, as if it were one of them."""
-        PreparedScan(name="map", surface=surface, image=None, sensor_pose=np.eye(4)).save(self.path(index))
+        scan = PreparedScan(name="map", surface=surface, image=None, sensor_pose=np.eye(4), sights=sights)
+        scan.save(self.path(index))
 
 
 @functools.lru_cache(maxsize=_KEPT)
@@ -96,13 +98,14 @@ class PrepareTask:
     index: int  #: of the file
     file: ScanFile
     settings: JointRegistrationSettings
+    with_sights: bool = False  #: to judge poses by what it saw
 
 
 def read_and_prepare(task: PrepareTask) -> tuple[int, ValidScan | ScanError | ScanRejected]:
     """Read a file, prepare it and lay it into the folder; return its index, and why it is not valid if it is not."""
     try:
         scan = task.file.read(max_points=task.settings.max_points)
-        prepared = prepare(scan, task.settings.registration)
+        prepared = prepare(scan, task.settings.registration, with_sights=task.with_sights)
     except (ScanError, ScanRejected) as error:
         return task.index, error
     prepared.save(task.folder.path(task.index))

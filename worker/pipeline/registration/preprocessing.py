@@ -13,6 +13,7 @@ import numpy as np
 
 from worker.cloud import npz
 from worker.cloud.formats.scan import Scan
+from worker.cloud.sight import Sights
 from worker.cloud.types import Arrays, Floats, Matrix4
 from worker.cloud.visibility import ENOUGH, RangeImage, share_in_front
 from worker.cloud.voxels import Voxels
@@ -29,6 +30,9 @@ class PreparedScan:
     surface: Surface  #: one point a voxel
     image: RangeImage | None  #: what was seen from where; None where the points contradict the file's origin
     sensor_pose: Matrix4  #: (4, 4) scan_from_sensor, as the file has it
+    sights: Sights | None = (
+        None  #: the same as the image, finer, with the farthest returns; where it was asked for
+    )
 
     @property
     def origin(self) -> Floats | None:
@@ -46,25 +50,36 @@ class PreparedScan:
         }
         if self.image is not None:
             arrays |= {"origin": self.image.origin, "ranges": self.image.ranges.astype(np.float32)}
+        if self.sights is not None:
+            sights = self.sights
+            arrays |= {"seen_from": sights.origins, "nearest": sights.nearest, "farthest": sights.farthest}
         npz.save_arrays(path, arrays)
 
     @classmethod
     def load(cls, path: Path) -> PreparedScan:
         """Read what `save` kept, and build the tree."""
         arrays = npz.load_arrays(path)
-        image = None
+        image = sights = None
         if "origin" in arrays:
             image = RangeImage(origin=arrays["origin"], ranges=arrays["ranges"].astype(np.float64))
+        if "nearest" in arrays:
+            sights = Sights(
+                origins=arrays["seen_from"], nearest=arrays["nearest"], farthest=arrays["farthest"]
+            )
         return cls(
             name=str(arrays["name"]),
             surface=Surface.of(arrays["points"], arrays["normals"], arrays["oriented"]),
             image=image,
             sensor_pose=arrays["sensor_pose"],
+            sights=sights,
         )
 
 
-def prepare(scan: Scan, settings: RegistrationSettings) -> PreparedScan:
-    """Sample the scan to voxels in its own frame; raises ScanRejected where it cannot be registered to anything."""
+def prepare(scan: Scan, settings: RegistrationSettings, *, with_sights: bool = False) -> PreparedScan:
+    """Sample the scan to voxels in its own frame, and on request keep how far it saw, to judge poses by.
+
+    Raises ScanRejected where it cannot be registered to anything.
+    """
     origin: Floats = scan.sensor_pose[:3, 3]
     trusted = share_in_front(scan.points, origin) >= ENOUGH
     voxels = Voxels.of(scan.points, size=settings.voxel_size, origin=origin if trusted else None)
@@ -89,4 +104,5 @@ def prepare(scan: Scan, settings: RegistrationSettings) -> PreparedScan:
         surface=surface_of(voxels, settings),
         image=RangeImage.of(scan.points, origin) if trusted else None,
         sensor_pose=scan.sensor_pose,
+        sights=Sights.of([(scan.points, origin)]) if trusted and with_sights else None,
     )

@@ -168,7 +168,7 @@ class ScanResult:
 class SurveyPlacement:
     """How sure it is that the accepted scans of a survey stand where they were taken."""
 
-    confidence: float  #: 0..1, calibrated on the placement benchmark
+    confidence: float | None  #: 0..1, calibrated on the placement benchmark; None where no rays are known
     in_doubt: bool  #: too little to believe it: no tile of the survey is `unchanged` then
 
 

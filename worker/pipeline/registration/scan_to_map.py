@@ -95,14 +95,15 @@ def best_quarter_turn(refinement: Refinement, best: Hypothesis) -> Hypothesis:
     """
     if best.consistent_with_prior:
         return best
-    for start in _quarter_turns(refinement.source, best.target_from_source):
+    for start in quarter_turns(refinement.source, best.target_from_source):
         coarse = coarse_alignment(refinement.source, refinement.target, start)
         if coarse.score >= best.score:
             best = better(best, refinement.from_start(coarse.target_from_source))
     return best
 
 
-def _quarter_turns(source: Surface, pose: Matrix4) -> Iterator[Matrix4]:
+def quarter_turns(source: Surface, pose: Matrix4) -> Iterator[Matrix4]:
+    """Yield the pose turned by one, two and three quarters about the vertical through the middle of the source."""
     there = transformed(source.points, pose)
     center = (there.min(axis=0) + there.max(axis=0)) / 2
     for quarter in (1, 2, 3):

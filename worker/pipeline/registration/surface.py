@@ -34,7 +34,7 @@ class Surface:
         points = points.astype(np.float64)
         return cls(points=points, normals=normals.astype(np.float64), oriented=oriented, tree=cKDTree(points))
 
-    def selected(self, rows: slice | Bools) -> Surface:
+    def selected(self, rows: slice | Bools | NDArray[np.intp]) -> Surface:
         """Return some of the points with the tree of all: a surface to be moved, not to be queried."""
         return Surface(
             points=self.points[rows], normals=self.normals[rows], oriented=self.oriented[rows], tree=self.tree

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from worker.cloud.tiling import TilePairs, tile_id
-from worker.cloud.types import Bools
+from worker.cloud.types import Bools, Indices
 from worker.detectors.detector import Detection, VoxelScores, change_score
 from worker.pipeline.results.objects import ChangeObjects
 
@@ -20,7 +20,7 @@ class TileState(IntEnum):
 
     UNCHANGED = 0  #: looked at, and the same
     CHANGED = 1  #: looked at, and different
-    INCONSISTENT = 2  #: below the threshold, but "different place" is the likeliest class
+    INCONSISTENT = 2  #: looked at, but maybe another place: of this tile, or of the whole survey
     UNOBSERVED = 3  #: not seen well enough to say
 
     @property
@@ -43,6 +43,7 @@ class ChangeSet:
     disappeared: NDArray[np.int32] | None = None  #: (T,) likewise
     voxels: VoxelScores | None = None  #: as above
     objects: ChangeObjects | None = None  #: as above
+    doubtful_placement: float | None = None  #: 0..1, its confidence; None: the placement is not in doubt
 
     @property
     def scores(self) -> NDArray[np.float32]:
@@ -64,6 +65,27 @@ class ChangeSet:
         if self.observed_share is not None:
             states[weak & (self.observed_share < min_observed_share)] = TileState.UNOBSERVED
         return replace(self, states=states)
+
+    def in_doubt(self, confidence: float) -> ChangeSet:
+        """Return what is left to say where the placement of the survey is in doubt, of this confidence (0..1).
+
+        Every tile that was looked at is inconsistent, whatever a detector makes of it: it may be another place. There
+        are no objects.
+        """
+        states = self.states.copy()
+        states[states != TileState.UNOBSERVED] = TileState.INCONSISTENT
+        return replace(self, states=states, voxels=None, objects=None, doubtful_placement=confidence)
+
+    def with_displaced(self, displaced: Indices) -> ChangeSet:
+        """Call tiles (D, 3) inconsistent in which the building itself is off; objects that lie in such alone go."""
+        if not len(displaced):
+            return self
+        ids = {tile_id(index) for index in displaced}
+        inside = np.array([tile_id(index) in ids for index in self.pairs.reference.indices], bool)
+        states = self.states.copy()
+        states[inside & (states != TileState.UNOBSERVED)] = TileState.INCONSISTENT
+        objects = None if self.objects is None else self.objects.outside(ids)
+        return replace(self, states=states, objects=objects)
 
     def counts(self) -> dict[str, int]:
         """Count the tiles by state, every state named."""

@@ -13,6 +13,7 @@ from matplotlib.patheffects import withStroke
 from worker.cloud.types import Floats
 from worker.pipeline.results.objects import ChangeObject, ChangeObjects, ObjectKind
 from worker.pipeline.results.places import Place
+from worker.pipeline.results.sheet import INK, QUIET
 
 #: Colour-blind-safe (Okabe and Ito, 2008): vermilion, blue, reddish purple; as in the coloured cloud where that has it
 OBJECT_COLORS: dict[ObjectKind, tuple[int, int, int]] = {
@@ -23,8 +24,6 @@ OBJECT_COLORS: dict[ObjectKind, tuple[int, int, int]] = {
 LIST_WIDTH = 3.0  #: inches, beside the plan
 MOST_LISTED = 16  #: objects; the rest is counted
 ON_THE_FLOOR = 0.2  #: metres; what hangs lower stands there, for nothing is told right above a floor
-INK = "#1a1a1a"
-QUIET = "#666666"
 _BADGE = 0.2  # inches across
 _LEAST_SHIFT, _LEAST_TURN = 0.15, np.radians(10)  # metres for an arrow, radians that are told
 _AROUND = np.radians([45, 135, 315, 225, 90, 0, 180, 270])  # where a number may stand, best first

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
 from itertools import permutations
 from typing import Literal, get_args
 
@@ -111,6 +111,21 @@ class ChangeObjects:
         """Count the objects by kind, every kind named."""
         counts = Counter(thing.kind for thing in self.objects)
         return {kind: counts[kind] for kind in get_args(ObjectKind)}
+
+    def outside(self, tile_ids: Collection[str]) -> ChangeObjects:
+        """Return the objects that do not lie in these tiles alone; the others' voxels belong to none."""
+        kept = tuple(
+            thing
+            for thing in self.objects
+            if any(index not in tile_ids for place in thing.places for index in place.tiles)
+        )
+        numbers = [thing.number for thing in kept]
+        return replace(
+            self,
+            objects=kept,
+            now=np.where(np.isin(self.now, numbers), self.now, 0).astype(np.int32),
+            before=np.where(np.isin(self.before, numbers), self.before, 0).astype(np.int32),
+        )
 
 
 def change_objects(

@@ -5,6 +5,7 @@ Where the detector found objects, these tell the story, and the tiles stand back
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -12,12 +13,9 @@ from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import PatchCollection
-from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 from matplotlib.patheffects import withStroke
-from numpy.typing import NDArray
 
 from worker.cloud.types import Bools, Points
 from worker.cloud.voxel_keys import centers
@@ -25,17 +23,31 @@ from worker.files import write_atomically
 from worker.pipeline.results.changes import ChangeSet, TileState
 from worker.pipeline.results.export import STATE_COLORS
 from worker.pipeline.results.object_marks import (
-    INK,
     LIST_WIDTH,
-    QUIET,
     color_of_kind,
     draw_objects,
     legend_entries,
     list_objects,
 )
 from worker.pipeline.results.objects import ChangeObjects
-
-Extent = tuple[float, float, float, float]  #: left, right, bottom, top; metres, map frame
+from worker.pipeline.results.sheet import (
+    ALARM,
+    HEAD,
+    HIGHEST,
+    INK,
+    LINE,
+    NARROWEST,
+    QUIET,
+    SIDE,
+    WIDEST,
+    Extent,
+    LeftOut,
+    draw_scale_bar,
+    draw_walls,
+    dress_axes,
+    left_out_lines,
+    write_head,
+)
 
 #: How strongly a tile is filled, and a second sign beside the colour, for eyes and printers without it. Of the tiles
 #: in one column of the grid the first in this order is shown; the rest would lie under it.
@@ -53,32 +65,19 @@ FAINT = {
 }
 PRECEDENCE = tuple(STYLES)
 HATCH_WIDTH = 0.5  # points
-HEAD, FOOT, SIDE = 0.75, 1.0, 0.55  # inches above, below and left of it
+FOOT = 1.0  # inches below it
 
 
-def draw_scale_bar(figure: Figure, extent: Extent, scale: float) -> None:
-    """Draw a scale bar at the head, on the right; `scale` is inches a metre."""
-    wide, high = figure.get_size_inches()
-    longest = max((extent[1] - extent[0]) / 4, 0.5)
-    length = next(size for size in (20.0, 10.0, 5.0, 2.0, 1.0, 0.5) if size <= longest)
-    right, y = 1 - SIDE / wide, 1 - 0.6 / high
-    left = right - length * scale / wide
-    figure.add_artist(Line2D((left, right), (y, y), color=INK, linewidth=3, solid_capstyle="butt"))
-    figure.text((left + right) / 2, y + 0.06 / high, f"{length:g} m", ha="center", fontsize=8, color=INK)
-
-
-def dress(figure: Figure, axes: Axes, extent: Extent, changes: ChangeSet, title: str) -> None:
-    """Write axes, title and counts at the head, the legend at the foot."""
-    axes.set_xlim(extent[0], extent[1])
-    axes.set_ylim(extent[2], extent[3])
-    axes.tick_params(labelsize=7, colors=QUIET, length=2)
-    axes.set_xlabel("x of the map (m)", fontsize=8, color=QUIET)
-    axes.set_ylabel("y of the map (m)", fontsize=8, color=QUIET)
-    for spine in axes.spines.values():
-        spine.set_visible(False)
-    above, left = figure.get_figheight(), SIDE / figure.get_figwidth()
-    figure.text(left, 1 - 0.3 / above, title, fontsize=12, color=INK, va="center", weight="bold")
-    figure.text(left, 1 - 0.55 / above, summary(changes), fontsize=9, color=QUIET, va="center")
+def dress(
+    figure: Figure, axes: Axes, extent: Extent, changes: ChangeSet, title: str, left_out: Sequence[LeftOut]
+) -> None:
+    """Write axes, title, counts and scans that were left out at the head, the legend at the foot."""
+    dress_axes(axes, extent)
+    doubted = changes.doubtful_placement is not None
+    head = [(summary(changes), ALARM if doubted else QUIET)]
+    head += [(line, QUIET) for line in left_out_lines(left_out, figure.get_figwidth())]
+    write_head(figure, title, head)
+    above = figure.get_figheight()
     entries = _legend(changes)
     figure.legend(
         handles=entries,
@@ -97,7 +96,10 @@ def dress(figure: Figure, axes: Axes, extent: Extent, changes: ChangeSet, title:
 
 
 def summary(changes: ChangeSet) -> str:
-    """Say in one line what a survey found."""
+    """Say in one line what a survey found, or why it says nothing."""
+    if changes.doubtful_placement is not None:
+        confidence = f"{changes.doubtful_placement:.2f}"
+        return f"placement in doubt (confidence {confidence}): no tile counts as unchanged"
     count, of = changes.counts()["changed"], len(changes.states)
     if changes.objects is None:
         return f"{count} of {of} tiles changed, at a score above {changes.threshold:.2f}"
@@ -134,42 +136,48 @@ def color_of(state: TileState) -> tuple[float, float, float]:
     return red, green, blue
 
 
-_PIXEL = 0.05  # metres, or more where the picture would have too many
-_MOST_PIXELS = 4000  # along a side
-_DARKEST_WALL = 0.5  # grey of the map, so that ink on it is seen at once
 _ROOM_FOR_ID = 0.75  # inches; a smaller tile shows its score alone
-_WIDEST, _HIGHEST, _NARROWEST = 11.0, 9.0, 6.5  # inches of the map's part of the picture
 _LOWEST = 2.5  # inches, where objects are listed beside it
 _STRAY = 0.1  # of the points of a full tile; one with fewer neither widens the picture nor is drawn in it
 
 
-def draw_picture(path: Path, reference: Points, current: Points, changes: ChangeSet, *, title: str) -> None:
+def draw_picture(
+    path: Path,
+    reference: Points,
+    current: Points,
+    changes: ChangeSet,
+    *,
+    title: str,
+    left_out: Sequence[LeftOut] = (),
+) -> None:
     """Write a PNG of the map (M, 3) from above, in grey, with objects by kind and number, or else tiles by state.
 
     Without objects, what only the survey (N, 3) saw is drawn in ink. Map frame, metres, x to the right and y up;
-    ceilings are cut away. Raises OSError.
+    ceilings are cut away. The head says where the placement is in doubt, and which scans were `left_out`. Raises
+    OSError.
     """
     extent = _extent(changes)
     width, height = extent[1] - extent[0], extent[3] - extent[2]
-    scale = min(_WIDEST / width, _HIGHEST / height)  # inches a metre
+    scale = min(WIDEST / width, HIGHEST / height)  # inches a metre
     things = [] if changes.objects is None else changes.objects.objects
     beside = LIST_WIDTH if things else 0.0
     plan = max(
-        width * scale, _NARROWEST - beside
+        width * scale, NARROWEST - beside
     )  # inches that the plan and what is left and right of it take
-    sheet = (plan + 2 * SIDE + beside, max(height * scale, _LOWEST if things else 0.0) + HEAD + FOOT)
+    head = HEAD + (LINE if left_out else 0.0)
+    sheet = (plan + 2 * SIDE + beside, max(height * scale, _LOWEST if things else 0.0) + head + FOOT)
     figure = Figure(figsize=sheet, dpi=130, facecolor="white")
     FigureCanvasAgg(figure)
     place = ((SIDE + (plan - width * scale) / 2) / sheet[0], FOOT / sheet[1])
     axes = figure.add_axes((*place, width * scale / sheet[0], height * scale / sheet[1]))
-    _draw_walls(axes, reference, current, extent, with_news=changes.objects is None)
+    draw_walls(axes, reference, current, extent, with_news=changes.objects is None)
     _draw_tiles(axes, changes, tile_inches=float(changes.pairs.reference.grid.size[0]) * scale)
     if changes.objects is not None:
         _draw_voxels(axes, changes.objects)
         draw_objects(axes, changes.objects.objects, scale=scale)
-        list_objects(figure, things, left=SIDE + plan + 0.25, top=sheet[1] - HEAD, bottom=FOOT)
+        list_objects(figure, things, left=SIDE + plan + 0.25, top=sheet[1] - head, bottom=FOOT)
     draw_scale_bar(figure, extent, scale)
-    dress(figure, axes, extent, changes, title)
+    dress(figure, axes, extent, changes, title, left_out)
     with rc_context({"hatch.linewidth": HATCH_WIDTH}):
         write_atomically(path, lambda aside: figure.savefig(aside, format="png"))
 
@@ -195,18 +203,6 @@ def _telling(changes: ChangeSet) -> Bools:
     return telling
 
 
-def _draw_walls(axes: Axes, reference: Points, current: Points, extent: Extent, *, with_news: bool) -> None:
-    """Draw how much stands above each spot between knee and head, so that furniture and walls show."""
-    floor = float(np.percentile(reference[:, 2], 1))
-    before, now = (_standing(points, floor, extent) for points in (reference, current))
-    shade = np.clip(before / 12.0, 0, 1) * _DARKEST_WALL
-    picture = np.repeat(1 - shade[:, :, None], 3, axis=2)
-    if with_news:
-        only_now = (now > 2) & ~_near(before > 0)
-        picture[only_now] = to_rgb(INK)
-    axes.imshow(picture, origin="lower", extent=extent, interpolation="antialiased", zorder=0)
-
-
 def _draw_voxels(axes: Axes, objects: ChangeObjects) -> None:
     """Draw the voxels of the objects in the colours of their kinds."""
     for numbers in (objects.before, objects.now):
@@ -224,25 +220,6 @@ def _draw_voxels(axes: Axes, objects: ChangeObjects) -> None:
             axes.add_collection(
                 PatchCollection(squares, facecolor=(*color, 0.45), edgecolor="none", zorder=4)
             )
-
-
-def _standing(points: Points, floor: float, extent: Extent) -> NDArray[np.float64]:
-    """Return (rows, columns) voxels from 15 cm to 2 m above the floor in each pixel."""
-    body = points[(points[:, 2] > floor + 0.15) & (points[:, 2] < floor + 2.0)]
-    left, right, bottom, top = extent
-    pixel = max(_PIXEL, (top - bottom) / _MOST_PIXELS, (right - left) / _MOST_PIXELS)
-    bins = [round((top - bottom) / pixel), round((right - left) / pixel)]
-    counts, _, _ = np.histogram2d(body[:, 1], body[:, 0], bins=bins, range=[[bottom, top], [left, right]])
-    return np.asarray(counts, np.float64)
-
-
-def _near(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Grow the mask by two pixels, 10 cm: noise at a wall is no change."""
-    grown = mask.copy()
-    for axis in (0, 1):
-        for shift in (-2, -1, 1, 2):
-            grown |= np.roll(mask, shift, axis=axis)
-    return grown
 
 
 def _draw_tiles(axes: Axes, changes: ChangeSet, *, tile_inches: float) -> None:

@@ -15,7 +15,7 @@ from worker.simulation.scenes.scene import Room, Scene
 LONG = 3.0  #: times as long as wide is a corridor
 PASSAGE = 0.5  #: metres around the points of a route that stay free in a building of several rooms
 #: Sigma of where furniture stands in one hotel room and in the next: metres along x and y, degrees.
-SHIFT, TURN = 0.05, 2.0
+SHIFT, TURN = 0.1, 6.0
 
 Piece = tuple[
     str, Mesh, float, float, float
@@ -69,7 +69,7 @@ def hotel_corridor(seed: int, *, floor: int = 0) -> Scene:
 def hotel_room(seed: int, *, number: int = 0) -> Scene:
     """Build a room of a hotel, which the seed makes: every room has the same plan, the odd ones mirrored.
 
-    The same kinds of furniture stand at the same places, but for some centimetres and degrees, which `number` draws.
+    The same kinds of furniture stand at the same places, but for a decimetre or two and some degrees, which `number` draws.
     """
     hotel = np.random.default_rng([seed, 20])
     width, depth, height = hotel.uniform((3.5, 5.6, 2.4), (4.4, 6.8, 2.8)).tolist()

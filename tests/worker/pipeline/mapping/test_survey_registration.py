@@ -70,7 +70,9 @@ def register(
     growing: bool = False,
     progress: Progress = no_progress,
 ) -> tuple[ScanResult, ...]:
-    return register_survey_scans(files, target, settings=settings, growing=growing, progress=progress)
+    return register_survey_scans(
+        files, target, settings=settings, growing=growing, progress=progress
+    ).outcomes
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ import pytest
 
 from tests.support.rooms import Room, as_scan
 from worker.cloud.formats.scan import Scan, read_scan
-from worker.cloud.poses import difference, exponential
+from worker.cloud.poses import difference, exponential, transformed
 from worker.cloud.types import Points
 from worker.cloud.voxels import Voxels
 from worker.pipeline.registration.hypothesis import Hypothesis
@@ -196,6 +196,19 @@ def test_real_pairs_land_within_3_cm_and_half_a_degree_with_no_start(shared_data
     centimetres, degrees = _off(found, np.loadtxt(transform))
     assert centimetres < 3.0
     assert degrees < 0.5
+
+
+def test_a_scan_that_was_moved_by_kilometres_while_its_viewpoint_was_not_is_registered(
+    shared_data: Path,
+) -> None:
+    """Its normals once turned to a sensor 3.6 km away, and half of its walls then faced the wrong way."""
+    scan, shift = read_scan(shared_data / "room_scan" / "room_scan2.pcd"), np.array([3000.0, 2000.0, 0.0])
+    base = read_scan(shared_data / "room_scan" / "room_scan1.pcd")
+    target = surface_of(Voxels.of(base.points, size=SETTINGS.voxel_size, origin=np.zeros(3)), SETTINGS)
+    found = register(_ready((scan.points + shift).astype(np.float32)), target, settings=SETTINGS)
+    given = np.loadtxt(shared_data / "room_scan" / "T_scan2_to_scan1.txt")
+    there = transformed(scan.points + shift, found.target_from_source)
+    assert np.abs(there - transformed(scan.points, given)).max() < 0.03
 
 
 @pytest.mark.parametrize(

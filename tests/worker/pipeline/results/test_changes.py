@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.support.rooms import scores_of
-from tests.support.tilings import row_of
+from tests.support.tilings import four_states, row_of
 from worker.detectors.detector import Detection
 from worker.pipeline.results.changes import ChangeSet, TileState, decide
 from worker.pipeline.results.objects import ChangeObjects
@@ -166,3 +166,27 @@ def test_with_objects_a_tile_that_none_lies_in_is_not_changed() -> None:
     assert [TileState(state).label for state in with_objects.states] == ["unchanged", "unobserved"]
     without = changes.where_objects_lie(0.5)
     assert [TileState(state).label for state in without.states] == ["changed", "changed"]
+
+
+def test_in_doubt_every_tile_that_was_looked_at_is_inconsistent_and_keeps_its_score() -> None:
+    changes = four_states()
+    doubted = changes.in_doubt(0.71)
+    assert [TileState(state).label for state in doubted.states] == ["inconsistent"] * 3 + ["unobserved"]
+    assert doubted.scores.tolist()[:3] == changes.scores.tolist()[:3]
+    assert (doubted.doubtful_placement, changes.doubtful_placement) == (0.71, None)
+    assert changes.counts()["unchanged"] == 1
+
+
+def test_in_doubt_there_are_no_objects() -> None:
+    loud = (0.1, 0.9, 0.0)
+    nothing = ChangeObjects(
+        objects=(),
+        moving=3,
+        voxel_size=0.05,
+        keys=np.empty(0, np.int64),
+        now=np.empty(0, np.int32),
+        before=np.empty(0, np.int32),
+    )
+    doubted = replace(_by_voxels(loud, loud, shares=[1.0, 0.2]), objects=nothing).in_doubt(0.5)
+    assert (doubted.objects, doubted.voxels) == (None, None)
+    assert doubted.counts() == {"unchanged": 0, "changed": 0, "inconsistent": 2, "unobserved": 0}

@@ -16,9 +16,10 @@ from worker.pipeline.results.changes import ChangeSet, TileState
 from worker.pipeline.results.export import STATE_COLORS
 from worker.pipeline.results.object_marks import OBJECT_COLORS, badge_places, details, headline
 from worker.pipeline.results.objects import ChangeObject, ChangeObjects
-from worker.pipeline.results.picture import _standing, draw_picture, summary
+from worker.pipeline.results.picture import draw_picture, summary
 from worker.pipeline.results.places import Place
 from worker.pipeline.results.shapes import Motion
+from worker.pipeline.results.sheet import LeftOut, standing
 
 
 def changes(states: list[TileState], indices: list[tuple[int, int, int]]) -> ChangeSet:
@@ -90,8 +91,8 @@ def test_one_tile_and_a_long_building_both_make_a_sheet_of_sensible_size(tmp_pat
 
 def test_a_very_long_place_is_drawn_in_coarser_pixels() -> None:
     points = np.array([[0.0, 0.0, 0.0], [900.0, 1.0, 1.0]], np.float32)
-    assert max(_standing(points, 0.0, (0.0, 1000.0, 0.0, 10.0)).shape) <= 4000
-    assert _standing(points, 0.0, (0.0, 10.0, 0.0, 5.0)).shape == (100, 200)
+    assert max(standing(points, 0.0, (0.0, 1000.0, 0.0, 10.0)).shape) <= 4000
+    assert standing(points, 0.0, (0.0, 10.0, 0.0, 5.0)).shape == (100, 200)
 
 
 def place(
@@ -217,3 +218,22 @@ def test_numbers_of_things_side_by_side_do_not_lie_upon_each_other() -> None:
     places = np.array(badge_places(things, scale=1.0))
     gaps = np.linalg.norm(places[:, None] - places[None], axis=2)[~np.eye(len(places), dtype=bool)]
     assert gaps.min() > 0.15  # inches, of which a number takes 0.2
+
+
+def test_a_placement_in_doubt_is_said_at_the_head_in_a_colour_of_its_own(tmp_path: Path) -> None:
+    quiet = changes([TileState.CHANGED] * 4, ROW)
+    doubted = quiet.in_doubt(0.714)
+    assert summary(doubted) == "placement in doubt (confidence 0.71): no tile counts as unchanged"
+    alarm = (176, 0, 32)
+    shares = [share_near(drawn(tmp_path / "p.png", each)[:90], alarm) for each in (quiet, doubted)]
+    assert shares[1] > shares[0] + 0.005
+
+
+def test_scans_that_were_left_out_have_a_line_at_the_head(tmp_path: Path) -> None:
+    found = changes([TileState.UNCHANGED] * 4, ROW)
+    without = drawn(tmp_path / "without.png", found)
+    left_out = [LeftOut(name="cut short.pcd", reason="unreadable", detail="cut short.pcd: it ends early")]
+    points = np.array([[0.0, 0.0, 0.0], [6.0, 1.5, 0.0]], np.float32)
+    draw_picture(tmp_path / "with.png", points, points, found, title="Map hall", left_out=left_out)
+    told = np.asarray(imread(tmp_path / "with.png"))
+    assert told.shape[0] == without.shape[0] + round(0.2 * 130)

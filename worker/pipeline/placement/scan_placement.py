@@ -1,0 +1,356 @@
+"""Scan placement: where one scan was taken in a map, believed only where nothing contradicts it.
+
+The best pose near the prior is looked for first. Where rays of both visits do not bear it out, the scan is looked for
+in the whole map. Every pose found is held against the rays of both visits (`contradictions`), and the best one must
+win against its rivals; a prior breaks ties, and never lowers the bar.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from worker.cloud.poses import difference, skew
+from worker.cloud.types import Floats, Matrix4
+from worker.pipeline.placement.belief import confidence, log_odds, odds_of
+from worker.pipeline.placement.contradictions import (
+    BUILDING,
+    THINGS,
+    Contradictions,
+    Held,
+    Place,
+    counted,
+    held_both_ways,
+)
+from worker.pipeline.placement.settings import PlacementSettings
+from worker.pipeline.registration.bev_correlation import bev_candidates
+from worker.pipeline.registration.diagnosis import Diagnosis
+from worker.pipeline.registration.fpfh_ransac import fpfh_candidates
+from worker.pipeline.registration.hypothesis import Hypothesis
+from worker.pipeline.registration.icp import normal_equations
+from worker.pipeline.registration.preprocessing import PreparedScan
+from worker.pipeline.registration.refinement import CoarsePose, Refinement, by_score, coarse_alignment
+from worker.pipeline.registration.results import ScanRejected
+from worker.pipeline.registration.scan_to_map import quarter_turns, register
+from worker.pipeline.registration.settings import RegistrationSettings
+from worker.pipeline.registration.surface import Surface
+from worker.pipeline.registration.verification import (
+    rejected,
+    require_accepted,
+    require_constrained,
+    require_unambiguous,
+)
+
+CLEAR = 0.99  #: confidence from which on nothing else is looked for
+_BEV_CANDIDATES, _NEAR_PRIOR = (
+    12,
+    48,
+)  # that the bird's-eye views name: in the whole map, and to choose from near a prior
+_BEST_CANDIDATES = 4  # of those that get a full ICP
+_RIVAL = 0.85  # of the best coarse score, from which on another candidate is refined as well
+_WORTH = 0.3  # coarse score of an FPFH candidate that gets a full ICP; right ones have 0.5 and more
+_APART = (0.3, 0.17)  # metres, radians: poses nearer to each other are one
+_WEAK = 1.5  # times the best held direction's error, from which on the pose may have slid along another
+_SLIDE = 0.2  # metres
+
+
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class PlacedScan:
+    """A pose of a scan with what speaks for it and against it."""
+
+    hypothesis: Hypothesis
+    told: Contradictions | None  #: None where no rays are known, of the scan or of the map
+    log_odds: float | None  #: None where both visits saw too little of each other
+    held: tuple[Held, Held] | None = None  #: the points behind it, both ways
+    warnings: tuple[Diagnosis, ...] = ()
+
+    @property
+    def pose(self) -> Matrix4:
+        """(4, 4) map_from_scan."""
+        return self.hypothesis.target_from_source
+
+    @property
+    def confidence(self) -> float | None:
+        """0..1, None as `log_odds` is."""
+        return None if self.log_odds is None else confidence(self.log_odds)
+
+    @property
+    def rank(self) -> tuple[float, float]:
+        """What poses of one scan are sorted by: the odds, then the score."""
+        return (-np.inf if self.log_odds is None else self.log_odds, self.hypothesis.score)
+
+
+def place_scan(
+    scan: PreparedScan,
+    place: Place,
+    *,
+    prior: Matrix4 | None = None,
+    registration: RegistrationSettings,
+    placement: PlacementSettings,
+    tick: Callable[[], None] = lambda: None,
+) -> PlacedScan:
+    """Find map_from_scan and believe it only where rays do not contradict it and no other pose does as well.
+
+    Raises ScanRejected with a diagnosis. Where the rays of the scan or of the map are not known, surfaces decide
+    alone, as in `registration.scan_to_map.register`.
+    """
+    if scan.sights is None or place.sights is None:
+        hypothesis = register(scan, place.surface, prior=prior, settings=registration, tick=tick)
+        return PlacedScan(hypothesis=hypothesis, told=None, log_odds=None)
+    search = _Search(
+        scan=scan, place=place, prior=prior, registration=registration, placement=placement, tick=tick
+    )
+    return search.run()
+
+
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class _Search:
+    scan: PreparedScan
+    place: Place
+    prior: Matrix4 | None
+    registration: RegistrationSettings
+    placement: PlacementSettings
+    tick: Callable[[], None]
+    found: list[PlacedScan] = field(default_factory=list)  #: every pose that was refined, without doubles
+
+    def run(self) -> PlacedScan:
+        """Search near the prior, then everywhere; decide; refine with all points."""
+        if self.prior is not None:
+            self._near_prior(self.prior)
+        if not self._is_clear():
+            self._everywhere()
+        chosen = self._chosen()
+        source, target = self.scan.surface, self.place.surface
+        require_constrained(self.scan.name, source, target, chosen.hypothesis, self.registration)
+        around = replace(self._free.narrow(), prior=chosen.pose, tick=lambda: None)
+        require_unambiguous(self.scan.name, chosen.hypothesis, around.from_start, self.registration)
+        return self._settled(chosen)
+
+    @property
+    def _free(self) -> Refinement:
+        """ICP that knows of no prior."""
+        return Refinement(
+            source=self.scan.surface,
+            target=self.place.surface,
+            prior=None,
+            settings=self.registration,
+            tick=self.tick,
+        )
+
+    # --- finding poses
+
+    def _near_prior(self, prior: Matrix4) -> None:
+        refinement = replace(self._free, prior=prior)
+        self._note(refinement.from_prior(prior))
+        if not self._is_clear():
+            starts = bev_candidates(self.scan.surface, self.place.surface, count=_NEAR_PRIOR)
+            self._refine_best(filter(refinement.is_near_prior, starts))
+
+    def _everywhere(self) -> None:
+        """Try what the bird's-eye views name, quarter turns of the best, then local features."""
+        starts = bev_candidates(self.scan.surface, self.place.surface, count=_BEV_CANDIDATES)
+        self._refine_best([np.eye(4), *starts] if self.prior is None else starts)
+        if self.found:
+            best = max(self.found, key=lambda placed: placed.rank)
+            self._refine_best(
+                quarter_turns(self.scan.surface, best.pose), least=_RIVAL * best.hypothesis.score
+            )
+        if not self._is_clear():
+            self._refine_features(thoroughly=not any(map(self._is_accepted, self.found)))
+
+    def _refine_best(self, starts: Iterator[Matrix4] | list[Matrix4], *, least: float = 0.0) -> None:
+        """Refine the best starts; once a pose is clear, only those that come near it in coarse alignment."""
+        coarse = self._coarse(starts)[:_BEST_CANDIDATES]
+        for candidate in coarse:
+            enough = _RIVAL * coarse[0].score if self._is_clear() else 0.0
+            if candidate.score >= max(enough, least) and not self._is_known(candidate.target_from_source):
+                self._note(self._free.from_start(candidate.target_from_source))
+
+    def _coarse(self, starts: Iterator[Matrix4] | list[Matrix4]) -> list[CoarsePose]:
+        return by_score(coarse_alignment(self.scan.surface, self.place.surface, start) for start in starts)
+
+    def _refine_features(self, *, thoroughly: bool) -> None:
+        """Try what local features name: one draw, or many where surfaces bear out nothing that was found so far."""
+        resolutions = self.registration.search_resolutions[: None if thoroughly else 1]
+        seeds = self.registration.search_seeds if thoroughly and self.prior is None else 1
+        for pose in fpfh_candidates(
+            self.scan.surface, self.place.surface, resolutions=resolutions, seeds=seeds
+        ):
+            (coarse,) = self._coarse([pose])
+            if coarse.score >= _WORTH and not self._is_known(coarse.target_from_source):
+                self._note(self._free.from_start(coarse.target_from_source))
+            if self._is_clear():
+                return
+
+    def _note(self, hypothesis: Hypothesis) -> None:
+        placed = self._told(hypothesis)
+        doubles = [other for other in self.found if _same(other.pose, placed.pose)]
+        if all(placed.rank > other.rank for other in doubles):
+            self.found[:] = [other for other in self.found if other not in doubles] + [placed]
+
+    def _told(self, hypothesis: Hypothesis) -> PlacedScan:
+        held = held_both_ways(self.scan, self.place, hypothesis.target_from_source)
+        told = counted(held)
+        return PlacedScan(hypothesis=hypothesis, told=told, log_odds=log_odds(told), held=held)
+
+    # --- deciding between them
+
+    def _chosen(self) -> PlacedScan:
+        """Return the pose that wins against all others; the nearest to the prior of those that nothing tells apart."""
+        accepted = sorted(filter(self._is_accepted, self.found), key=lambda placed: placed.rank)[::-1]
+        if not accepted:
+            raise self._refused()
+        best = accepted[0]
+        least = (best.rank[0] if np.isfinite(best.rank[0]) else 0.0) - np.log(self.placement.min_rival_ratio)
+        rivals = [placed for placed in accepted if placed.rank[0] >= least]
+        if self.prior is not None:
+            near = [placed for placed in rivals if self._is_near_prior(placed.pose)]
+            if near:
+                return self._believed(near[0])
+        if len(rivals) > 1:
+            raise self._ambiguous(rivals)
+        return self._believed(best) if self.prior is None else self._overcome(self._believed(best))
+
+    def _is_accepted(self, placed: PlacedScan) -> bool:
+        """Ask for what surfaces have to show; clear odds let a smaller overlap do, as a prior does."""
+        found = placed.hypothesis
+        if placed.log_odds is None:
+            return found.is_accepted(self.registration)
+        near = self.prior is not None and self._is_near_prior(placed.pose)
+        vouched = near or self._odds_are_clear(placed)
+        trusted = replace(found, consistent_with_prior=vouched, contradicts_prior=False)
+        return trusted.is_accepted(self.registration)
+
+    def _is_clear(self) -> bool:
+        return any(self._odds_are_clear(placed) and self._is_accepted(placed) for placed in self.found)
+
+    def _odds_are_clear(self, placed: PlacedScan) -> bool:
+        return placed.log_odds is not None and placed.log_odds >= odds_of(CLEAR)
+
+    def _is_known(self, pose: Matrix4) -> bool:
+        return any(_same(placed.pose, pose) for placed in self.found)
+
+    def _is_near_prior(self, pose: Matrix4) -> bool:
+        return replace(self._free, prior=self.prior).is_near_prior(pose)
+
+    def _believed(self, placed: PlacedScan) -> PlacedScan:
+        """Raise ScanRejected where rays contradict the pose."""
+        if placed.confidence is not None and placed.confidence < self.placement.min_scan_confidence:
+            raise other_place(self.scan.name, placed)
+        return placed
+
+    def _overcome(self, placed: PlacedScan) -> PlacedScan:
+        """Say by how much the prior was wrong; raise ScanRejected where that is too much, or the pose is not clear."""
+        assert self.prior is not None
+        metres, radians = difference(placed.pose, self.prior)
+        numbers = {"metres": metres, "degrees": float(np.degrees(radians))}
+        off = f"{metres:.1f} m and {numbers['degrees']:.0f} degrees"
+        if metres > self.placement.max_prior_distance or not self._odds_are_clear(placed):
+            raise rejected(
+                self.scan.name,
+                placed.hypothesis,
+                "wrong_prior",
+                f"it fits the map {off} from its prior and not near it; check the prior, or leave it out",
+                **numbers,
+            )
+        detail = f"scan {self.scan.name}: its prior is off by {off}; the place was found without it"
+        warning = Diagnosis(reason="wrong_prior", detail=detail, numbers=numbers)
+        return replace(placed, warnings=(*placed.warnings, warning))
+
+    # --- refusing
+
+    def _refused(self) -> ScanRejected:
+        """Return the error of a scan without an accepted pose: of the best one, near the prior if there is one there."""
+        near = [
+            placed for placed in self.found if self.prior is not None and self._is_near_prior(placed.pose)
+        ]
+        best = max(near or self.found, key=lambda placed: placed.hypothesis.score)
+        hypothesis = replace(best.hypothesis, consistent_with_prior=bool(near))
+        try:
+            require_accepted(self.scan.name, hypothesis, self.registration)
+        except ScanRejected as error:
+            return error
+        return other_place(self.scan.name, best)
+
+    def _ambiguous(self, rivals: list[PlacedScan]) -> ScanRejected:
+        best, other = rivals[:2]
+        metres, radians = difference(best.pose, other.pose)
+        error = rejected(
+            self.scan.name,
+            best.hypothesis,
+            "ambiguous",
+            f"it fits at {len(rivals)} places alike, {metres:.1f} m and {np.degrees(radians):.0f} degrees apart; "
+            "give a pose prior, or scan more of the place",
+            metres=metres,
+            degrees=float(np.degrees(radians)),
+            poses=len(rivals),
+        )
+        poses = tuple(placed.pose for placed in rivals)
+        return ScanRejected(
+            replace(error.diagnosis, poses=poses), fitness=error.fitness, inlier_rmse=error.inlier_rmse
+        )
+
+    # --- the last steps
+
+    def _settled(self, placed: PlacedScan) -> PlacedScan:
+        """Refine with every point; along a direction that is held weakly, look for a better pose to either side."""
+        settled = self._final(placed)
+        weak = _weak_direction(self.scan.surface, self.place.surface, settled.pose)
+        for shift in () if weak is None else (weak * _SLIDE, -weak * _SLIDE):
+            start = settled.pose.copy()
+            start[:3, 3] += shift
+            other = self._final(self._told(self._free.narrow().from_start(start)))
+            if other.rank > settled.rank and other.hypothesis.score > settled.hypothesis.score:
+                settled = other
+        return replace(settled, warnings=placed.warnings)
+
+    def _final(self, placed: PlacedScan) -> PlacedScan:
+        return self._told(self._free.final(placed.hypothesis))
+
+
+def other_place(name: str, placed: PlacedScan) -> ScanRejected:
+    """Return the error of a scan that rays contradict at its best pose."""
+    numbers = numbers_of(placed)
+    return rejected(
+        name,
+        placed.hypothesis,
+        "other_place",
+        f"it fits the map's surfaces, but rays went through {numbers['building_seen_through']:.1%} of the walls, "
+        f"floor and ceiling and {numbers['things_seen_through']:.0%} of the things that both visits looked at "
+        f"(confidence {placed.confidence or 0.0:.2f}); it is of another place, or too much has changed",
+        **numbers,
+    )
+
+
+def numbers_of(placed: PlacedScan) -> dict[str, float]:
+    """Return what diagnoses tell of a pose: shares contradicted and the confidence, 0..1, and how many things."""
+    told = placed.told
+    if told is None:
+        return {}
+    judged, through = told.judged.sum(axis=0), told.through.sum(axis=0)
+    numbers = {
+        "building_seen_through": float(through[BUILDING] / max(judged[BUILDING], 1)),
+        "things_seen_through": float(through[THINGS] / max(judged[THINGS], 1)),
+        "things_that_agree": float(told.things[:, 0].sum()),
+        "things_denied": float(told.things[:, 1].sum()),
+    }
+    return numbers if placed.confidence is None else {**numbers, "confidence": placed.confidence}
+
+
+def _same(a: Matrix4, b: Matrix4) -> bool:
+    metres, radians = difference(a, b)
+    return metres < _APART[0] and radians < _APART[1]
+
+
+def _weak_direction(source: Surface, target: Surface, pose: Matrix4) -> Floats | None:
+    """Return the unit vector (3,) along which the sensor's place is held worst, None where that is about as well.
+
+    A corridor holds a scan along itself by what stands there alone; ICP may stop a decimetre off.
+    """
+    equations = normal_equations(source, target, pose, max_correspondence_distance=0.05, every=4)
+    information = equations.information + 1e-6 * np.trace(equations.information) * np.eye(6)
+    arm = np.hstack([-skew(pose[:3, 3]), np.eye(3)])
+    variances, directions = np.linalg.eigh(arm @ np.linalg.inv(information) @ arm.T)
+    return directions[:, -1] if np.sqrt(variances[-1] / variances[0]) > _WEAK else None
