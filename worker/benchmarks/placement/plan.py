@@ -104,9 +104,15 @@ class PlacementSettings(StrictModel):
     @property
     def fingerprint(self) -> str:
         """Equal for maps made alike."""
-        chosen = {"sites", "shares", "scales", "metres_off", "degrees_off"}
-        text = f"{MAP_RECIPE} {self.model_dump_json(exclude=chosen)}"
-        return hashlib.sha256(text.encode()).hexdigest()[:12]
+        chosen = ("sites", "shares", "scales", "metres_off", "degrees_off")
+        surveys_alone = {"pipeline": {"placement"}}
+        told = self.model_dump_json(exclude={**dict.fromkeys(chosen, True), **surveys_alone})
+        return _hashed(f"{MAP_RECIPE} {told}")
+
+    @property
+    def survey_fingerprint(self) -> str:
+        """Equal for surveys simulated alike and registered with the same settings."""
+        return _hashed(f"{SURVEY_RECIPE} {self.pipeline.model_dump_json()}")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -218,6 +224,10 @@ def trials(
 def kinds_named(words: str) -> tuple[Kind, ...]:
     """Read a list with commas, in the order given. Raises ValueError for another name."""
     return names_among(words, KINDS, "kind of trial")
+
+
+def _hashed(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 
 def _trials_on(site: SitePlan, settings: PlacementSettings) -> Iterator[Trial]:
