@@ -149,7 +149,7 @@ def answer(name: str, survey: Survey, site: PlacementSite, settings: PipelineSet
     placement = None
     try:
         located = locate_survey(survey.files, site.reference, settings=settings, reference_seen=site.seen)
-        outcomes, placement = located.outcomes, getattr(located, "placement", None)
+        outcomes, placement = located.outcomes, located.placement
     except NoScanAccepted as nobody:
         outcomes = nobody.outcomes
     except ScanError as unreadable:
@@ -202,7 +202,7 @@ def scan_answer(outcome: ScanResult, true: Matrix4 | None, *, in_doubt: bool = F
 
 def answers_folder(settings: PlacementSettings, folder: Path) -> Path:
     """Return where the answers of the code as it stands are kept."""
-    return folder / settings.fingerprint / ANSWERS / code_fingerprint()
+    return folder / settings.fingerprint / ANSWERS / f"{code_fingerprint()}-{settings.survey_fingerprint}"
 
 
 @cache

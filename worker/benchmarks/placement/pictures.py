@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from itertools import groupby
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
@@ -20,42 +18,17 @@ from worker.benchmarks.placement.plan import PlacementSettings
 from worker.benchmarks.placement.sites import PlacementSite, load_site
 from worker.benchmarks.placement.surveys import simulate
 from worker.benchmarks.plots import COLORS, INK, MISSED, WRONG
-from worker.cloud.poses import transformed
-from worker.cloud.sight import Sights
-from worker.cloud.types import Bools, Floats, Matrix4, Points
-from worker.cloud.voxels import Voxels
+from worker.cloud.types import Bools, Floats, Matrix4
 from worker.errors import RegistrationFailed
+from worker.pipeline.placement.contradictions import Held, Place, held_both_ways
 from worker.pipeline.registration.preprocessing import PreparedScan, prepare
 from worker.pipeline.registration.refinement import Refinement
 from worker.pipeline.registration.scan_to_map import global_registration
 from worker.pipeline.settings import PipelineSettings
 
+EVERY = 1_000_000  #: points of each kind that are held against the other cloud: all that there are
 BODY = (0.15, 0.25)  #: metres over the floor and under the ceiling that are left out, so that walls are seen
 _SHARES = (1.0, 99.0)  # percent of the map's heights taken for floor and ceiling
-
-
-@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
-class Contradicted:
-    """What cannot stand if the pose is right."""
-
-    scan: Bools  #: (N,) points of the scan where the map's scans saw through
-    map: Bools  #: (M,) points of the map where the scan saw through
-
-
-#: From a scan's points (N, 3), map frame, its sensor's place (3,) and the map, what is contradicted.
-Contradictions = Callable[[Points, Floats, PlacementSite], Contradicted]
-
-
-def seen_through(points: Points, origin: Floats, site: PlacementSite) -> Contradicted:
-    """Hold a scan and a map against each other: what one surely saw through, and no scan of it confirmed."""
-    by_map = site.seen.verdicts(points)
-    sights = Sights.of([(points, origin)])
-    assert sights is not None  # of one scan there is always one
-    by_scan = sights.verdicts(site.reference.points)
-    return Contradicted(
-        scan=(by_map.surely > 0) & (by_map.confirmed == 0),
-        map=(by_scan.surely > 0) & (by_scan.confirmed == 0),
-    )
 
 
 def draw_impostors(
@@ -63,7 +36,6 @@ def draw_impostors(
     settings: PlacementSettings,
     folder: Path,
     count: int,
-    contradictions: Contradictions = seen_through,
 ) -> list[str]:
     """Write a picture of so many impostors, of every kind in turn, into `folder`; return the names of the files.
 
@@ -74,7 +46,7 @@ def draw_impostors(
         if len(names) == count:
             break
         site = load_site(one.trial.site, settings, folder)
-        figure = _drawn(one, site, settings, contradictions)
+        figure = _drawn(one, site, settings)
         if figure is not None:
             names.append(f"impostor-{one.trial.name}.png")
             plots.save(figure, folder / names[-1])
@@ -104,74 +76,79 @@ def best_pose(scan: PreparedScan, site: PlacementSite, settings: PipelineSetting
         return None
 
 
-def _drawn(
-    one: Answered, site: PlacementSite, settings: PlacementSettings, contradictions: Contradictions
-) -> Figure | None:
+def _drawn(one: Answered, site: PlacementSite, settings: PlacementSettings) -> Figure | None:
+    """Draw the first scan of a trial at the pose that it was given, or at the best one."""
+    pipeline = settings.pipeline
     with TemporaryDirectory(prefix="spicd-placement-") as scratch:
         survey = simulate(one.trial, site, settings, Path(scratch))
-        pipeline = settings.pipeline
-        scan = survey.files[0].read(max_points=pipeline.max_scan_points)
+        read = survey.files[0].read(max_points=pipeline.max_scan_points)
+    try:
+        scan = prepare(read, pipeline.registration, with_sights=True)
+    except RegistrationFailed:
+        return None
     said = one.answer.scans[0]
-    if said.pose is not None:
-        pose: Matrix4 | None = np.array(said.pose).reshape(4, 4)
-    else:
-        pose = best_pose(prepare(scan, pipeline.registration), site, pipeline)
+    pose = best_pose(scan, site, pipeline) if said.pose is None else np.array(said.pose).reshape(4, 4)
     if pose is None:
         return None
-    placed = transformed(scan.points, pose).astype(np.float32)
-    points = Voxels.of(placed, size=site.reference.voxel_size).points
-    origin: Floats = (pose @ scan.sensor_pose)[:3, 3]
+    place = Place(surface=site.reference.surface(), sights=site.seen.sights)
+    held = held_both_ways(scan, place, pose, sample=EVERY)
+    origin: Floats = (pose @ read.sensor_pose)[:3, 3]
     return impostor_figure(
-        f"{one.trial.site.name}: {one.trial.row}",
-        _said(said),
-        points,
-        origin,
-        site.reference.points,
-        contradictions(points, origin, site),
+        f"{one.trial.site.name}: {one.trial.row}", said, held, origin, place.surface.points
     )
 
 
 def impostor_figure(
-    title: str, said: str, points: Points, origin: Floats, map_points: Points, contradicted: Contradicted
+    title: str, said: ScanAnswer, held: tuple[Held, Held], origin: Floats, map_points: Floats
 ) -> Figure:
-    """Draw the scan's points (N, 3) over the map's (M, 3), less floor and ceiling, and mark what is contradicted."""
-    figure = Figure(figsize=(8, 7), dpi=110, layout="constrained")
+    """Draw the scan over the map's points (M, 3), less floor and ceiling, and mark what contradicts its pose."""
+    figure = Figure(figsize=(8, 7.4), dpi=110, layout="constrained")
     axes = figure.add_subplot()
-    low, high = np.percentile(map_points[:, 2], _SHARES)
-
-    def body(of: Points) -> Bools:
-        inside: Bools = (of[:, 2] > low + BODY[0]) & (of[:, 2] < high - BODY[1])
-        return inside
-
-    plots.draw_plan(axes, map_points[body(map_points)])
-    shown = body(points)
-    _dots(axes, points[shown & ~contradicted.scan], COLORS[0], 0.4)
-    _dots(axes, map_points[body(map_points) & contradicted.map], MISSED, 1.0)
-    _dots(axes, points[shown & contradicted.scan], WRONG, 1.0)
+    low, high = np.percentile(map_points[:, 2], _SHARES) + np.array([BODY[0], -BODY[1]])
+    plots.draw_plan(axes, map_points[(map_points[:, 2] > low) & (map_points[:, 2] < high)].astype(np.float32))
+    into_map, into_scan = held
+    agrees = ~into_map.through & ~into_map.off
+    for points, color, size in (
+        (into_map.points[agrees], COLORS[0], 0.8),
+        (into_map.points[into_map.off & ~into_map.through], COLORS[3], 1.6),
+        (into_scan.points[into_scan.through], MISSED, 2.0),
+        (into_map.points[into_map.through], WRONG, 2.0),
+    ):
+        shown = points[(points[:, 2] > low) & (points[:, 2] < high)]
+        axes.plot(shown[:, 0], shown[:, 1], ".", color=color, markersize=size, markeredgewidth=0)
     axes.plot(origin[0], origin[1], "^", color=INK, markersize=7)
-    plots.entitle(axes, f"{title}\n{said}")
-    figure.legend(
-        handles=_legend(contradicted), loc="outside lower center", ncols=2, fontsize=8, frameon=False
-    )
+    plots.entitle(axes, f"{title}\n{_said(said)}")
+    figure.legend(handles=_legend(held), loc="outside lower center", ncols=2, fontsize=8, frameon=False)
     return figure
 
 
-def _dots(axes: Axes, points: Points, color: str, size: float) -> None:
-    axes.plot(points[:, 0], points[:, 1], ".", color=color, markersize=2 * size, markeredgewidth=0)
-
-
-def _legend(contradicted: Contradicted) -> list[Line2D]:
+def _legend(held: tuple[Held, Held]) -> list[Line2D]:
+    into_map, into_scan = held
+    off = f"scan, near the map's surfaces and off them ({_share(into_map.off, into_map.near)})"
     named = (
         ("s", "#999999", "map"),
         (".", COLORS[0], "scan, at the pose that fits best"),
-        (".", WRONG, f"scan, where the map saw through ({contradicted.scan.mean():.1%} of its voxels)"),
-        (".", MISSED, f"map, where the scan saw through ({contradicted.map.mean():.1%} of its voxels)"),
+        (".", WRONG, f"scan, where the map's rays went through ({_both(into_map)})"),
+        (".", MISSED, f"map, where the scan's rays went through ({_both(into_scan)})"),
+        (".", COLORS[3], off),
         ("^", INK, "sensor"),
     )
     return [
         Line2D([], [], marker=marker, color=color, linestyle="", label=label)
         for marker, color, label in named
     ]
+
+
+def _both(held: Held) -> str:
+    """Say how much of the building, and of the things in it, is contradicted, of what could be judged."""
+    building, things = (
+        _share(held.through & kind, held.judged & kind) for kind in (held.building, ~held.building)
+    )
+    return f"building {building}, things {things}"
+
+
+def _share(part: Bools, whole: Bools) -> str:
+    return f"{np.count_nonzero(part) / max(np.count_nonzero(whole), 1):.1%}"
 
 
 def _said(said: ScanAnswer) -> str:

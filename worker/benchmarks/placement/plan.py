@@ -58,7 +58,8 @@ EXPECTED: Mapping[Kind, tuple[Reason, ...]] = {
 #: Of the first place of each part. Other benchmarks use seeds up to 2,000,000 (training sets) and 1,900,000.
 FIRST_SEED: Mapping[Part, int] = {"calibration": 2_100_000, "validation": 2_300_000, "figures": 2_500_000}
 NEXT_TRIAL = 1000  #: between the seeds of two trials on one map; there are fewer maps than that
-RECIPE = 1  #: raised when the same settings begin to give other trials: kept ones are then made anew
+#: Raised when the same settings begin to give other maps, or other surveys: kept maps, or answers, are made anew then.
+MAP_RECIPE, SURVEY_RECIPE = 1, 2
 
 BUILDERS: Mapping[SiteKind, Callable[[int], Scene]] = {
     "room": random_room,
@@ -102,10 +103,16 @@ class PlacementSettings(StrictModel):
 
     @property
     def fingerprint(self) -> str:
-        """Equal for maps and trials made alike."""
-        chosen = {"sites", "shares", "scales", "metres_off", "degrees_off"}
-        text = f"{RECIPE} {self.model_dump_json(exclude=chosen)}"
-        return hashlib.sha256(text.encode()).hexdigest()[:12]
+        """Equal for maps made alike."""
+        chosen = ("sites", "shares", "scales", "metres_off", "degrees_off")
+        surveys_alone = {"pipeline": {"placement"}}
+        told = self.model_dump_json(exclude={**dict.fromkeys(chosen, True), **surveys_alone})
+        return _hashed(f"{MAP_RECIPE} {told}")
+
+    @property
+    def survey_fingerprint(self) -> str:
+        """Equal for surveys simulated alike and registered with the same settings."""
+        return _hashed(f"{SURVEY_RECIPE} {self.pipeline.model_dump_json()}")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -217,6 +224,10 @@ def trials(
 def kinds_named(words: str) -> tuple[Kind, ...]:
     """Read a list with commas, in the order given. Raises ValueError for another name."""
     return names_among(words, KINDS, "kind of trial")
+
+
+def _hashed(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 
 def _trials_on(site: SitePlan, settings: PlacementSettings) -> Iterator[Trial]:

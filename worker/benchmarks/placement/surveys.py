@@ -31,9 +31,9 @@ from worker.simulation.visits import drifted_within, edited_by, stops, visit
 STOPS = 12  #: places along a route of which a survey takes neighbouring ones
 SIZE_OFF = 0.04  #: metres at most that a room of the same size is off, along each axis
 MOVED, TURNED = 0.5, 10.0  #: metres and degrees by which a moving sensor moves during its scan
-OVERLAP = (0.30, 0.50)  #: of a scan that the map covers, in the trials of low overlap
+OVERLAP = (0.32, 0.50)  #: of a scan that the map covers, in the trials of low overlap
 COVERED = 0.1  #: metres to the map within which a point is covered
-_CANDIDATES = 10  # stops looked at for that overlap
+_CANDIDATES = 24  # stops looked at for that overlap, at most
 _FULL_SCALE = 0.015  # a scan that is off by more than this has no right place on the map
 
 
@@ -111,7 +111,8 @@ def _here(
 ) -> tuple[TrialScan, ...]:
     """Take right scans, of the place as it is after its edits."""
     before, share = trial.site.scene(), trial.amount if trial.kind in ("right", "low-overlap") else 0.0
-    after, poses = edited_by(lambda draw: changed(before, share, seed=draw), trial.seed, STOPS)
+    count = _CANDIDATES if trial.kind == "low-overlap" else STOPS
+    after, poses = edited_by(lambda draw: changed(before, share, seed=draw), trial.seed, count)
     if trial.kind == "low-overlap":
         taken = _half_covered(trial.site, after, poses, site, settings, trial.seed, rng)
     else:
@@ -164,9 +165,9 @@ def _half_covered(
     seed: int,
     rng: np.random.Generator,
 ) -> tuple[SimulatedScan, ...]:
-    """Take the scan of which the map covers 30 to 50%, or as near to that as there is, of up to ten stops."""
+    """Take the scan of which the map covers 30 to 50%, or as near to that as there is among the stops."""
     best: tuple[float, SimulatedScan] | None = None
-    for number in rng.permutation(len(poses))[:_CANDIDATES].tolist():
+    for number in rng.permutation(len(poses)).tolist():
         (scan,) = _taken(scene, (poses[number],), settings, seed + number)
         share = covered(scan.points, site, site.map_from_world @ scan.world_from_sensor)
         off = max(OVERLAP[0] - share, share - OVERLAP[1], 0.0)

@@ -62,6 +62,15 @@ def test_maps_made_otherwise_lie_elsewhere():
     assert SETTINGS.with_values(standing_s=1.0).fingerprint != SETTINGS.fingerprint
 
 
+def test_limits_of_placement_leave_the_maps_and_make_the_answers_others():
+    stricter = SETTINGS.pipeline.with_values(
+        placement=SETTINGS.pipeline.placement.with_values(min_confidence=0.8)
+    )
+    settings = SETTINGS.with_values(pipeline=stricter)
+    assert settings.fingerprint == SETTINGS.fingerprint
+    assert settings.survey_fingerprint != SETTINGS.survey_fingerprint
+
+
 def test_right_scans_of_places_that_repeat_have_a_row_of_their_own():
     rows = {trial.row for trial in trials(SETTINGS, "figures", only=("right",)) if trial.site.repeats}
     assert rows == {"right, hotel corridor", "right, hotel corridor, prior"}

@@ -9,7 +9,7 @@ import pytest
 
 from tests.support.placement import ROOM, SETTINGS
 from worker.benchmarks.placement.plan import SitePlan, Trial
-from worker.benchmarks.placement.sites import map_stops
+from worker.benchmarks.placement.sites import load_site, map_stops
 from worker.benchmarks.placement.surveys import (
     MOVED,
     SIZE_OFF,
@@ -152,3 +152,11 @@ def test_the_frame_of_a_map_is_turned_against_the_building(site):
     assert difference(site.map_from_world, np.eye(4))[1] > np.radians(5)
     inside = transformed(site.reference.points, inverse(site.map_from_world))
     assert np.median(ROOM.scene().caster.distances(inside)) < 0.02
+
+
+def test_a_scan_of_low_overlap_is_covered_by_a_third_to_a_half(folder):
+    settings = SETTINGS.with_values(stops={"corridor": 12})
+    half = SitePlan(kind="corridor", seed=2_700_001, half=True)
+    site = load_site(half, settings, folder)
+    (scan,) = trial_scans(Trial(site=half, number=1, kind="low-overlap"), site, settings)
+    assert 0.3 <= 1 - off_the_map(scan, site) <= 0.52
