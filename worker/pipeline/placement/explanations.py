@@ -25,7 +25,7 @@ from worker.pipeline.placement.scale import estimate_scale
 from worker.pipeline.placement.variants import UP_AXES, mirrored, part, scaled, turned, up_axis
 from worker.pipeline.registration.bev_correlation import bev_candidates
 from worker.pipeline.registration.diagnosis import Diagnosis, Reason
-from worker.pipeline.registration.hypothesis import Hypothesis, better
+from worker.pipeline.registration.hypothesis import Hypothesis
 from worker.pipeline.registration.preprocessing import PreparedScan
 from worker.pipeline.registration.refinement import Refinement, by_score, coarse_alignment
 from worker.pipeline.registration.results import ScanRejected
@@ -39,7 +39,7 @@ UNITS: dict[str, float] = {"millimetres": 0.001, "centimetres": 0.01, "inches": 
 FACTORS = tuple(factor for unit in UNITS.values() for factor in (unit, 1 / unit))
 _SAME_HEIGHT = 1.25  # times: two heights from floor to ceiling that may be one
 _WORTH_SCALING = 1.05  # times the map's height, from which on the height itself is tried as the scale
-_CANDIDATES, _REFINED = 12, 3  # of a search: that the bird's-eye views name, and that get a full ICP
+_CANDIDATES, _REFINED = 12, 4  # of a search: that the bird's-eye views name, and that get a full ICP
 _STRAYS = (1, 99)  # percentiles, between which a cloud's height is measured
 #: share of a scan near the map at a pose, from which on a scale or a motion may be all that keeps it from lying there
 _COVERED = (0.3, 0.5)
@@ -85,22 +85,19 @@ class Refused:
         )
         return Refinement(source=source, target=self.target, prior=None, settings=brief, tick=self.tick)
 
-    def search(self, prepared: PreparedScan) -> Hypothesis:
-        """Return the best hypothesis of a variant anywhere on the map.
+    def search(self, prepared: PreparedScan) -> Iterator[Hypothesis]:
+        """Yield hypotheses of a variant anywhere on the map, of the likeliest start first.
 
-        Variants are upright, so that the bird's-eye views do where they can be drawn; else the whole search.
+        Variants are upright, so that the bird's-eye views do where they can be drawn; else the whole search. The best
+        by score is not always the true one, as rooms of one building are alike: that is left to `holds`.
         """
-        refinement, settings = self.refinement(prepared.surface), self.settings
+        refinement = self.refinement(prepared.surface)
         starts = bev_candidates(prepared.surface, self.target, count=_CANDIDATES)
-        if not starts:
-            return global_registration(refinement, None)
         coarse = by_score(coarse_alignment(prepared.surface, self.target, start) for start in starts)
-        best = refinement.from_start(coarse[0].target_from_source)
-        for other in coarse[1:_REFINED]:
-            if best.two_way_inlier_ratio > best.required_inlier_ratio(settings) + settings.search_margin:
-                break
-            best = better(best, refinement.from_start(other.target_from_source))
-        return best
+        for pose in coarse[:_REFINED]:
+            yield refinement.from_start(pose.target_from_source)
+        if not starts:
+            yield global_registration(refinement, None)
 
     def ready(self, variant: Scan) -> PreparedScan | None:
         """Prepare a variant; None where it cannot be registered to anything."""
@@ -128,8 +125,6 @@ def diagnose(case: Refused) -> Diagnosis | None:
 def _scale_as_it_lies(case: Refused) -> Diagnosis | None:
     """Estimate the scale at the best hypotheses; scale the scan and refine where it surely is off."""
     for hypothesis in case.hypotheses[:_TRIED]:
-        if hypothesis.overlap < _COVERED[0]:
-            continue
         diagnosis = _scaled_from(case, case.prepared, 1.0, hypothesis)
         if diagnosis is not None:
             return diagnosis
@@ -140,7 +135,7 @@ def _scaled_from(
     case: Refused, prepared: PreparedScan | None, factor: float, hypothesis: Hypothesis
 ) -> Diagnosis | None:
     """Estimate the scale of a scan multiplied by `factor`, at a pose of it; a diagnosis if it then holds."""
-    if prepared is None:
+    if prepared is None or hypothesis.overlap < _COVERED[0]:
         return None
     estimate = estimate_scale(prepared.surface, case.target, hypothesis.target_from_source, prepared.origin)
     scale = factor * estimate.scale
@@ -253,12 +248,13 @@ def _scaled_anywhere(case: Refused, factor: float) -> Diagnosis | None:
     prepared = case.ready(scaled(case.scan, factor))
     if prepared is None:
         return None
-    return _scaled_from(case, prepared, factor, case.search(prepared))
+    tried = (_scaled_from(case, prepared, factor, hypothesis) for hypothesis in case.search(prepared))
+    return next((diagnosis for diagnosis in tried if diagnosis is not None), None)
 
 
 def _mirror_image(case: Refused) -> Diagnosis | None:
     prepared = case.ready(mirrored(case.scan))
-    if prepared is None or not case.holds(prepared, case.search(prepared)):
+    if prepared is None or not any(case.holds(prepared, hypothesis) for hypothesis in case.search(prepared)):
         return None
     detail = "its mirror image fits the map, it does not; negate x or y, or read its axes as right-handed"
     return case.diagnosis("mirrored", detail)
@@ -269,8 +265,9 @@ def _turned_up(case: Refused, turn: Floats) -> Diagnosis | None:
     prepared = case.ready(turned(case.scan, turn))
     if prepared is None:
         return None
-    hypothesis = case.search(prepared)
-    if not case.holds(prepared, hypothesis):
+    held = (hypothesis for hypothesis in case.search(prepared) if case.holds(prepared, hypothesis))
+    hypothesis = next(held, None)
+    if hypothesis is None:
         return None
     number = up_axis(hypothesis.target_from_source[:3, :3] @ turn)
     name = ("-" if number < 0 else "") + "xyz"[abs(number) - 1]
