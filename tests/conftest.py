@@ -41,6 +41,7 @@ SLOW = (
     "worker/pipeline/mapping/test_pair_registration.py",
     "worker/pipeline/mapping/test_relocalization.py",
     "worker/pipeline/mapping/test_survey_registration.py",
+    "worker/pipeline/placement/test_explanations.py",
     "worker/pipeline/registration/test_ambiguity.py",
     "worker/pipeline/registration/test_fpfh_ransac.py",
     "worker/pipeline/registration/test_preprocessing.py",
