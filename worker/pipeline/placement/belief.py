@@ -31,7 +31,7 @@ class Line:
         return float(self.bias + np.sqrt(shares) @ np.array(self.weights))
 
 
-LINE = Line(bias=12.5, weights=(-12.1, -4.3, -2.2, -1.0, -4.1, -12.3, -4.4))
+LINE = Line(bias=12.24, weights=(-1.59, -21.85, -9.18, -1.54, -5.86, 0.0, -11.60))
 
 
 def shares(told: Contradictions) -> Floats:

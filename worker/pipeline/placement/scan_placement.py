@@ -30,7 +30,7 @@ from worker.pipeline.registration.bev_correlation import bev_candidates
 from worker.pipeline.registration.diagnosis import Diagnosis
 from worker.pipeline.registration.fpfh_ransac import fpfh_candidates
 from worker.pipeline.registration.hypothesis import Hypothesis
-from worker.pipeline.registration.icp import normal_equations
+from worker.pipeline.registration.icp import icp, normal_equations
 from worker.pipeline.registration.preprocessing import PreparedScan
 from worker.pipeline.registration.refinement import CoarsePose, Refinement, by_score, coarse_alignment
 from worker.pipeline.registration.results import ScanRejected
@@ -44,17 +44,19 @@ from worker.pipeline.registration.verification import (
     require_unambiguous,
 )
 
-CLEAR = 0.99  #: confidence from which on nothing else is looked for
+CLEAR = 0.9  #: confidence from which on nothing else is looked for
 _BEV_CANDIDATES, _NEAR_PRIOR = (
     12,
     48,
 )  # that the bird's-eye views name: in the whole map, and to choose from near a prior
 _BEST_CANDIDATES = 4  # of those that get a full ICP
-_RIVAL = 0.85  # of the best coarse score, from which on another candidate is refined as well
+_RIVAL = 0.93  # of the best coarse score, from which on another candidate is refined as well
 _WORTH = 0.3  # coarse score of an FPFH candidate that gets a full ICP; right ones have 0.5 and more
 _APART = (0.3, 0.17)  # metres, radians: poses nearer to each other are one
-_WEAK = 1.5  # times the best held direction's error, from which on the pose may have slid along another
-_SLIDE = 0.2  # metres
+_WEAK = 1.8  # times the best held direction's error, from which on the pose may have slid along another
+_SLIDE = 0.2  # metres, that it is pushed to either side
+_SLID = 0.04  # metres; what comes to rest nearer than this has come back
+_SLIDE_DISTANCE, _SLIDE_ITERATIONS, _SLIDE_POINTS = 0.1, 15, 2500  # metres; of the ICP that tells
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
@@ -155,9 +157,7 @@ class _Search:
         self._refine_best([np.eye(4), *starts] if self.prior is None else starts)
         if self.found:
             best = max(self.found, key=lambda placed: placed.rank)
-            self._refine_best(
-                quarter_turns(self.scan.surface, best.pose), least=_RIVAL * best.hypothesis.score
-            )
+            self._refine_best(quarter_turns(self.scan.surface, best.pose), least=best.hypothesis.score)
         if not self._is_clear():
             self._refine_features(thoroughly=not any(map(self._is_accepted, self.found)))
 
@@ -300,12 +300,28 @@ class _Search:
         settled = self._final(placed)
         weak = _weak_direction(self.scan.surface, self.place.surface, settled.pose)
         for shift in () if weak is None else (weak * _SLIDE, -weak * _SLIDE):
-            start = settled.pose.copy()
-            start[:3, 3] += shift
-            other = self._final(self._told(self._free.narrow().from_start(start)))
+            slid = self._slid(settled.pose, shift)
+            if difference(slid, settled.pose)[0] < _SLID:
+                continue
+            other = self._final(self._told(self._free.narrow().from_start(slid)))
             if other.rank > settled.rank and other.hypothesis.score > settled.hypothesis.score:
                 settled = other
         return self._measured(replace(settled, warnings=placed.warnings))
+
+    def _slid(self, pose: Matrix4, shift: Floats) -> Matrix4:
+        """Return where a few points end that start beside a pose: mostly where they came from."""
+        start = pose.copy()
+        start[:3, 3] += shift
+        return icp(
+            self.scan.surface,
+            self.place.surface,
+            start,
+            max_correspondence_distance=_SLIDE_DISTANCE,
+            max_iterations=_SLIDE_ITERATIONS,
+            robust=True,
+            every=max(1, len(self.scan.surface.points) // _SLIDE_POINTS),
+            tick=self.tick,
+        ).target_from_source
 
     def _measured(self, placed: PlacedScan) -> PlacedScan:
         """Tell of a scale that is off; raise ScanRejected where it is off by too much."""

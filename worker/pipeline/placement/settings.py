@@ -13,7 +13,7 @@ class PlacementSettings(StrictModel):
     """Confidences are those of `belief`; docs/placement.md has the error curve that they lie on."""
 
     min_confidence: float = Field(
-        0.9, gt=0, lt=1, description="of the survey's poses; below it no tile counts as unchanged"
+        0.7, gt=0, lt=1, description="of the survey's poses; below it no tile counts as unchanged"
     )
     min_scan_confidence: float = Field(
         0.1, gt=0, lt=1, description="of one scan's pose; below it the scan is left out as of another place"
