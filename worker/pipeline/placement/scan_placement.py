@@ -24,6 +24,7 @@ from worker.pipeline.placement.contradictions import (
     counted,
     held_both_ways,
 )
+from worker.pipeline.placement.scale import estimate_scale
 from worker.pipeline.placement.settings import PlacementSettings
 from worker.pipeline.registration.bev_correlation import bev_candidates
 from worker.pipeline.registration.diagnosis import Diagnosis
@@ -202,7 +203,7 @@ class _Search:
         accepted = sorted(filter(self._is_accepted, self.found), key=lambda placed: placed.rank)[::-1]
         if not accepted:
             raise self._refused()
-        best = accepted[0]
+        best = self._believed(accepted[0])
         least = (best.rank[0] if np.isfinite(best.rank[0]) else 0.0) - np.log(self.placement.min_rival_ratio)
         rivals = [placed for placed in accepted if placed.rank[0] >= least]
         if self.prior is not None:
@@ -211,7 +212,7 @@ class _Search:
                 return self._believed(near[0])
         if len(rivals) > 1:
             raise self._ambiguous(rivals)
-        return self._believed(best) if self.prior is None else self._overcome(self._believed(best))
+        return best if self.prior is None else self._overcome(best)
 
     def _is_accepted(self, placed: PlacedScan) -> bool:
         """Ask for what surfaces have to show; clear odds let a smaller overlap do, as a prior does."""
@@ -304,7 +305,23 @@ class _Search:
             other = self._final(self._told(self._free.narrow().from_start(start)))
             if other.rank > settled.rank and other.hypothesis.score > settled.hypothesis.score:
                 settled = other
-        return replace(settled, warnings=placed.warnings)
+        return self._measured(replace(settled, warnings=placed.warnings))
+
+    def _measured(self, placed: PlacedScan) -> PlacedScan:
+        """Tell of a scale that is off; raise ScanRejected where it is off by too much."""
+        estimate = estimate_scale(self.scan.surface, self.place.surface, placed.pose, self.scan.origin)
+        if not estimate.is_off_by(self.placement.max_scale_error):
+            return placed
+        scale = 1 / estimate.scale
+        numbers = {"scale": scale, "sigma": estimate.sigma}
+        detail = (
+            f"it is {abs(scale - 1):.1%} too {'large' if scale > 1 else 'small'} (scale {scale:.4f}, sigma "
+            f"{estimate.sigma:.4f}); check the sensor's calibration and the file's unit"
+        )
+        if self.placement.scale == "refuse" or estimate.is_off_by(self.placement.refused_scale_error):
+            raise rejected(self.scan.name, placed.hypothesis, "wrong_scale", detail, **numbers)
+        warning = Diagnosis(reason="wrong_scale", detail=f"scan {self.scan.name}: {detail}", numbers=numbers)
+        return replace(placed, warnings=(*placed.warnings, warning))
 
     def _final(self, placed: PlacedScan) -> PlacedScan:
         return self._told(self._free.final(placed.hypothesis))
