@@ -66,6 +66,7 @@ def _verdicts(result: Document) -> Table:
 def _targets(targets: Document) -> Table:
     names = {
         "impostors_believed": "surveys of alike places that were believed",
+        "believed_of_other_plans": "the same without hotel rooms of the very same plan and furniture",
         "mirrored_or_scaled_believed": "scans mirrored, or scaled by 2% and more, that were believed",
         "right_lost": "right scans, up to 25% changed, refused, ambiguous, in doubt or wrong",
     }
