@@ -75,18 +75,25 @@ def figures(answered: Sequence[Answered]) -> Document:
 def targets(answered: Sequence[Answered]) -> Document:
     """Count what the targets speak of: impostors believed, mirrored and scaled ones believed, right ones lost."""
     impostors = [one for one in answered if one.trial.impostor]
-    believed = sum(any(scan.verdict == "wrong" for scan in one.answer.scans) for one in impostors)
+    others = [one for one in impostors if not one.trial.same_plan]
     spoilt = [scan for one in answered for scan in _spoilt(one)]
     wrong = sum(scan.verdict == "wrong" for scan in spoilt)
     fair = [scan for one in answered if _fair(one.trial) for scan in one.answer.scans]
     lost = sum(scan.verdict != "right" for scan in fair)
     good = [scan for scan in fair if scan.verdict == "right"]
     return {
-        "impostors_believed": {"of": len(impostors), "count": believed, **_rate(believed, len(impostors))},
+        "impostors_believed": _believed(impostors),
+        "believed_of_other_plans": _believed(others),
         "mirrored_or_scaled_believed": {"of": len(spoilt), "count": wrong, **_rate(wrong, len(spoilt))},
         "right_lost": {"of": len(fair), "count": lost, **_rate(lost, len(fair))},
         "right_within_3_cm": {"of": len(good), "count": sum(scan.good for scan in good)},
     }
+
+
+def _believed(impostors: Sequence[Answered]) -> Document:
+    """Count the surveys of which a scan is believed."""
+    count = sum(any(scan.verdict == "wrong" for scan in one.answer.scans) for one in impostors)
+    return {"of": len(impostors), "count": count, **_rate(count, len(impostors))}
 
 
 def reliability(answered: Sequence[Answered]) -> list[Document]:

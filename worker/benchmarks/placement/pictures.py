@@ -148,7 +148,7 @@ def _both(held: Held) -> str:
 
 
 def _share(part: Bools, whole: Bools) -> str:
-    return f"{np.count_nonzero(part) / max(np.count_nonzero(whole), 1):.1%}"
+    return f"{int(part.sum()) / max(int(whole.sum()), 1):.1%}"
 
 
 def _said(said: ScanAnswer) -> str:

@@ -164,13 +164,22 @@ class Trial:
         return 1 + self.number
 
     @property
+    def same_plan(self) -> bool:
+        """Whether it is of a hotel room with the walls of the map's and the same furniture within some centimetres.
+
+        Next to nothing tells it from the map's own room after its furniture was pushed about.
+        """
+        rooms = self.kind == "hotel" and self.site.kind == "hotel-room"
+        return rooms and self.other_number % 2 == 0
+
+    @property
     def row(self) -> str:
         """The row of the table that it counts in."""
         with_prior = ", prior" if self.prior else ""
         if self.kind == "right" and self.site.repeats:
             return f"right, hotel corridor{with_prior}"
         if self.kind == "hotel":
-            room = "room, mirrored" if self.other_number % 2 else "room, same plan"
+            room = "room, same plan" if self.same_plan else "room, mirrored"
             return f"hotel {'corridor' if self.site.repeats else room}{with_prior}"
         detail = {
             "right": f" {self.amount:.0%} changed",

@@ -42,7 +42,8 @@ def _verdicts(result: Document) -> Table:
         "ambiguous",
         "refused",
         "wrong (95%)",
-        "off, median (worst)",
+        "cm off, median (worst)",
+        "degrees off",
         "seconds",
     )
     rows = [
@@ -52,7 +53,7 @@ def _verdicts(result: Document) -> Table:
             _of(row["right"], row["here"]),
             *(str(row[verdict]) for verdict in ("wrong", "in_doubt", "ambiguous", "refused")),
             _interval(row["wrong_rate"]),
-            _errors(row),
+            *(_errors(row[unit], digits) for unit, digits in (("centimetres", 1), ("degrees", 2))),
             shown(None if row["seconds"] is None else row["seconds"]["median"], ".2f"),
         )
         for row in result["rows"]
@@ -65,6 +66,7 @@ def _verdicts(result: Document) -> Table:
 def _targets(targets: Document) -> Table:
     names = {
         "impostors_believed": "surveys of alike places that were believed",
+        "believed_of_other_plans": "the same without hotel rooms of the very same plan and furniture",
         "mirrored_or_scaled_believed": "scans mirrored, or scaled by 2% and more, that were believed",
         "right_lost": "right scans, up to 25% changed, refused, ambiguous, in doubt or wrong",
     }
@@ -145,11 +147,5 @@ def _interval(rate: Document) -> str:
     return "" if rate["rate"] is None else f"{rate['rate']:.1%} ({rate['low']:.1%} to {rate['high']:.1%})"
 
 
-def _errors(row: Document) -> str:
-    if row["centimetres"] is None:
-        return ""
-    metres, degrees = row["centimetres"], row["degrees"]
-    return (
-        f"{metres['median']:.1f} ({metres['worst']:.1f}) cm, "
-        f"{degrees['median']:.2f} ({degrees['worst']:.2f}) degrees"
-    )
+def _errors(spread: Document | None, digits: int) -> str:
+    return "" if spread is None else f"{spread['median']:.{digits}f} ({spread['worst']:.{digits}f})"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 from tests.support.placement import ROOM
@@ -85,9 +87,21 @@ def test_targets_count_impostors_by_survey_and_right_scans_up_to_a_quarter_chang
         ]
     )
     assert [counted["impostors_believed"][key] for key in ("count", "of")] == [1, 3]
+    assert [counted["believed_of_other_plans"][key] for key in ("count", "of")] == [1, 3]
     assert [counted["mirrored_or_scaled_believed"][key] for key in ("count", "of")] == [1, 2]
     assert [counted["right_lost"][key] for key in ("count", "of")] == [1, 2]
     assert counted["right_within_3_cm"] == {"of": 1, "count": 1}
+
+
+def test_hotel_rooms_of_the_same_plan_are_counted_and_left_out_beside():
+    hotel = SitePlan(kind="hotel-room", seed=1)
+    believed = scan("wrong", here=False)
+    pair = [answered("hotel", believed, site=hotel), answered("twin", scan("refused", here=False))]
+    same = Answered(trial=replace(pair[0].trial, number=3), answer=pair[0].answer)
+    assert same.trial.same_plan
+    counted = targets([same, pair[1]])
+    assert [counted["impostors_believed"][key] for key in ("count", "of")] == [1, 2]
+    assert [counted["believed_of_other_plans"][key] for key in ("count", "of")] == [0, 1]
 
 
 def test_reliability_holds_stated_confidence_against_how_often_it_was_right():
