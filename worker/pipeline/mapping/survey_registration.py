@@ -32,10 +32,12 @@ from worker.pipeline.mapping.tasks import (
 )
 from worker.pipeline.placement.belief import confidence, log_odds
 from worker.pipeline.placement.contradictions import Held, Place
-from worker.pipeline.placement.scan_placement import PlacedScan, other_place, place_scan
+from worker.pipeline.placement.explanations import Refused, diagnose
+from worker.pipeline.placement.scan_placement import PlacedScan, believed_by, other_place, place_scan
+from worker.pipeline.registration.diagnosis import Diagnosis, Reason
 from worker.pipeline.registration.hypothesis import Hypothesis
 from worker.pipeline.registration.icp import normal_equations
-from worker.pipeline.registration.preprocessing import PreparedScan
+from worker.pipeline.registration.preprocessing import PreparedScan, prepare
 from worker.pipeline.registration.results import (
     ScanFile,
     ScanRejected,
@@ -51,6 +53,8 @@ from worker.progress import Progress, monotonic_progress, no_progress
 MAP = -1  #: the map's index among the scans; the lowest, so that it is the target of every pair
 _DISTANCE, _EVERY = 0.05, 2  # metres; points: how a scan by itself is weighed
 _DISAGREE = 0.05  # metres that the other scans may move a scan from where it was registered
+#: Reasons behind which there may be a better one.
+EXPLAINED: tuple[Reason, ...] = ("other_place", "no_fit", "wrong_prior", "too_few_points", "degenerate")
 _FEW = 5  # scans up to which processes cost more than they bring
 _LIKELY = 0.5  # confidence below which a scan needs another one to vouch for it
 
@@ -126,6 +130,39 @@ def _place_one(task: _PlaceTask) -> tuple[int, PlacedScan | ScanRejected]:
     return task.index, task.run(_place_of(task.folder, task.map_index))
 
 
+@dataclass(frozen=True, kw_only=True, slots=True)
+class _ExplainTask:
+    """One scan that found no place, to find out why."""
+
+    folder: Folder
+    map_index: int
+    index: int
+    file: ScanFile
+    hypotheses: tuple[Hypothesis, ...]
+    settings: JointRegistrationSettings
+
+    def run(self, place: Place, *, tick: Callable[[], None] = lambda: None) -> Diagnosis | None:
+        """Return the explanation that holds; None where none does. The file is read again, for the order of points."""
+        settings = self.settings
+        prepared = self.folder.load(self.index) if self.hypotheses else None
+        case = Refused(
+            scan=self.file.read(max_points=settings.max_points),
+            prepared=prepared,
+            hypotheses=self.hypotheses,
+            target=place.surface,
+            settings=settings.registration,
+            prepare=functools.partial(prepare, settings=settings.registration, with_sights=True),
+            believed=believed_by(place),
+            max_searches=settings.placement.max_searches if self.hypotheses else 0,
+            tick=tick,
+        )
+        return diagnose(case)
+
+
+def _explain_one(task: _ExplainTask) -> tuple[int, Diagnosis | None]:
+    return task.index, task.run(_place_of(task.folder, task.map_index))
+
+
 @functools.lru_cache(maxsize=2)
 def _place_of(folder: Folder, map_index: int) -> Place:
     laid = folder.load(map_index)
@@ -148,6 +185,7 @@ class _Visit:
         priors = self._prepare()
         placed = self._place(priors, self.place, MAP)
         self._vouch(placed, priors)
+        self._explain()
         if self.growing:
             self._grow(placed, priors)
         self.progress("registering", 1.0)
@@ -238,6 +276,34 @@ class _Visit:
             if self._is_in_doubt(scan, among=len(placed), vouched=vouched):
                 self.errors[index] = other_place(self.files[index].name, scan)
                 del placed[index]
+
+    def _explain(self) -> None:
+        """Look for better reasons why scans found no place: mirrored, scaled, moved, and so on."""
+        settings = self.workspace.settings
+        tasks = [
+            _ExplainTask(
+                folder=self.workspace.folder,
+                map_index=MAP,
+                index=index,
+                file=self.files[index],
+                hypotheses=getattr(error, "hypotheses", ()),
+                settings=settings,
+            )
+            for index, error in sorted(self.errors.items())
+            if isinstance(error, ScanRejected) and error.diagnosis.reason in EXPLAINED
+        ][: settings.placement.diagnosed]
+        for index, diagnosis in self._explaining(tasks):
+            error = self.errors[index]
+            if diagnosis is not None and isinstance(error, ScanRejected):
+                fitness, inlier_rmse = error.fitness, error.inlier_rmse
+                self.errors[index] = ScanRejected(diagnosis, fitness=fitness, inlier_rmse=inlier_rmse)
+
+    def _explaining(self, tasks: Sequence[_ExplainTask]) -> Iterator[tuple[int, Diagnosis | None]]:
+        if self.workspace.processes.count > 1:
+            yield from self.workspace.processes.map_unordered(_explain_one, tasks)
+            return
+        for task in tasks:
+            yield task.index, task.run(self.place, tick=self._tick(1.0))
 
     def _expected(self, index: int, placed: Placed, priors: Mapping[int, Matrix4 | None]) -> Matrix4 | None:
         """Return where the other scans, by their priors, would have this one; None where they do not say."""

@@ -7,7 +7,7 @@ win against its rivals; a prior breaks ties, and never lowers the bar.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -21,11 +21,13 @@ from worker.pipeline.placement.contradictions import (
     Contradictions,
     Held,
     Place,
+    contradictions,
     counted,
     held_both_ways,
 )
 from worker.pipeline.placement.scale import estimate_scale
 from worker.pipeline.placement.settings import PlacementSettings
+from worker.pipeline.placement.variants import up_axis
 from worker.pipeline.registration.bev_correlation import bev_candidates
 from worker.pipeline.registration.diagnosis import Diagnosis
 from worker.pipeline.registration.fpfh_ransac import fpfh_candidates
@@ -53,10 +55,24 @@ _BEST_CANDIDATES = 4  # of those that get a full ICP
 _RIVAL = 0.93  # of the best coarse score, from which on another candidate is refined as well
 _WORTH = 0.3  # coarse score of an FPFH candidate that gets a full ICP; right ones have 0.5 and more
 _APART = (0.3, 0.17)  # metres, radians: poses nearer to each other are one
+_SCALE_SIGMAS = 4.0  # that a scale has to be off to be told
+_UP = 3  # the number of z among the axes
 _WEAK = 1.8  # times the best held direction's error, from which on the pose may have slid along another
 _SLIDE = 0.2  # metres, that it is pushed to either side
 _SLID = 0.04  # metres; what comes to rest nearer than this has come back
 _SLIDE_DISTANCE, _SLIDE_ITERATIONS, _SLIDE_POINTS = 0.1, 15, 2500  # metres; of the ICP that tells
+
+
+class NotPlaced(ScanRejected):
+    """A scan that was looked for everywhere and has no place; the poses that came nearest stand beside the reason."""
+
+    def __init__(self, refused: ScanRejected | Diagnosis, hypotheses: Sequence[Hypothesis] = ()) -> None:
+        if isinstance(refused, ScanRejected):
+            fitness, inlier_rmse = refused.fitness, refused.inlier_rmse
+            super().__init__(refused.diagnosis, fitness=fitness, inlier_rmse=inlier_rmse)
+        else:  # as an exception is read that came from another process
+            super().__init__(refused)
+        self.hypotheses = tuple(hypotheses)  #: best first
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
@@ -105,7 +121,20 @@ def place_scan(
     search = _Search(
         scan=scan, place=place, prior=prior, registration=registration, placement=placement, tick=tick
     )
-    return search.run()
+    try:
+        return search.run()
+    except ScanRejected as error:
+        raise NotPlaced(error, search.hypotheses()) from error
+
+
+def believed_by(place: Place) -> Callable[[PreparedScan, Hypothesis], bool]:
+    """Return what tells whether rays bear a pose of a scan out; where none are known, surfaces have to do."""
+
+    def believed(scan: PreparedScan, hypothesis: Hypothesis) -> bool:
+        odds = log_odds(contradictions(scan, place, hypothesis.target_from_source))
+        return odds is None or odds > 0
+
+    return believed
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
@@ -142,6 +171,10 @@ class _Search:
             tick=self.tick,
         )
 
+    def hypotheses(self) -> list[Hypothesis]:
+        """Return what was found, best first."""
+        return [placed.hypothesis for placed in sorted(self.found, key=lambda placed: placed.rank)[::-1]]
+
     # --- finding poses
 
     def _near_prior(self, prior: Matrix4) -> None:
@@ -156,8 +189,9 @@ class _Search:
         starts = bev_candidates(self.scan.surface, self.place.surface, count=_BEV_CANDIDATES)
         self._refine_best([np.eye(4), *starts] if self.prior is None else starts)
         if self.found:
-            best = max(self.found, key=lambda placed: placed.rank)
-            self._refine_best(quarter_turns(self.scan.surface, best.pose), least=best.hypothesis.score)
+            best = max(self.found, key=lambda placed: placed.rank).pose
+            (itself,) = self._coarse([best])
+            self._refine_best(quarter_turns(self.scan.surface, best), least=_RIVAL * itself.score)
         if not self._is_clear():
             self._refine_features(thoroughly=not any(map(self._is_accepted, self.found)))
 
@@ -325,18 +359,29 @@ class _Search:
 
     def _measured(self, placed: PlacedScan) -> PlacedScan:
         """Tell of a scale that is off; raise ScanRejected where it is off by too much."""
+        placed = self._upright(placed)
         estimate = estimate_scale(self.scan.surface, self.place.surface, placed.pose, self.scan.origin)
-        if not estimate.is_off_by(self.placement.max_scale_error):
+        if not estimate.is_off_by(self.placement.max_scale_error, sigmas=_SCALE_SIGMAS):
             return placed
-        scale = 1 / estimate.scale
-        numbers = {"scale": scale, "sigma": estimate.sigma}
+        scale, numbers = estimate.scale, {"scale": estimate.scale, "sigma": estimate.sigma}
         detail = (
-            f"it is {abs(scale - 1):.1%} too {'large' if scale > 1 else 'small'} (scale {scale:.4f}, sigma "
-            f"{estimate.sigma:.4f}); check the sensor's calibration and the file's unit"
+            f"it fits the map better after its lengths are multiplied by {scale:.4f} (sigma {estimate.sigma:.4f}); "
+            "check the sensor's calibration"
         )
-        if self.placement.scale == "refuse" or estimate.is_off_by(self.placement.refused_scale_error):
+        too_far = estimate.is_off_by(self.placement.refused_scale_error, sigmas=_SCALE_SIGMAS)
+        if self.placement.scale == "refuse" or too_far:
             raise rejected(self.scan.name, placed.hypothesis, "wrong_scale", detail, **numbers)
         warning = Diagnosis(reason="wrong_scale", detail=f"scan {self.scan.name}: {detail}", numbers=numbers)
+        return replace(placed, warnings=(*placed.warnings, warning))
+
+    def _upright(self, placed: PlacedScan) -> PlacedScan:
+        """Tell of a scan that lies on the map with another axis up than z."""
+        number = up_axis(placed.pose[:3, :3])
+        if number == _UP:
+            return placed
+        name = ("-" if number < 0 else "") + "xyz"[abs(number) - 1]
+        detail = f"scan {self.scan.name}: its {name} axis points up, not z; it was turned to fit the map"
+        warning = Diagnosis(reason="other_up_axis", detail=detail, numbers={"up": number})
         return replace(placed, warnings=(*placed.warnings, warning))
 
     def _final(self, placed: PlacedScan) -> PlacedScan:

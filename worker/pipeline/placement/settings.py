@@ -38,4 +38,11 @@ class PlacementSettings(StrictModel):
         lt=1,
         description="of a scan against the map, from which on it is left out whatever `scale` says",
     )
-    diagnose: bool = Field(True, description="look for the reason of a scan that found no place")
+    diagnosed: int = Field(
+        3,
+        ge=0,
+        description="scans of a survey at most that a reason is looked for of why they found no place",
+    )
+    max_searches: int = Field(
+        3, ge=0, description="global registrations that may be spent on such a reason, of one scan"
+    )

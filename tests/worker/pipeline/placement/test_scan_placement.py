@@ -14,6 +14,7 @@ from worker.pipeline.placement.scan_placement import PlacedScan, place_scan
 from worker.pipeline.placement.settings import PlacementSettings
 from worker.pipeline.registration.preprocessing import PreparedScan, prepare
 from worker.pipeline.registration.results import ScanRejected
+from worker.pipeline.registration.surface import Surface
 from worker.simulation.sensor import SimulatedScan
 
 PLACEMENT = PlacementSettings.model_validate({})
@@ -111,7 +112,7 @@ def test_a_scale_that_is_off_by_a_percent_is_a_warning_or_a_refusal_by_setting(
     found = placed(stretched, place, scan.world_from_sensor)
     assert [warning.reason for warning in found.warnings] == ["wrong_scale"] * told
     if told:
-        assert found.warnings[0].numbers["scale"] == pytest.approx(scale, abs=0.004)
+        assert found.warnings[0].numbers["scale"] == pytest.approx(1 / scale, abs=0.004)
         with pytest.raises(ScanRejected) as refused:
             placed(stretched, place, scan.world_from_sensor, scale="refuse")
         assert refused.value.diagnosis.reason == "wrong_scale"
@@ -124,7 +125,7 @@ def test_a_scan_whose_rays_are_not_known_is_placed_by_surfaces_alone(room: Room,
     assert found.confidence is None
 
 
-def _bare_room() -> tuple[object, PreparedScan]:
+def _bare_room() -> tuple[Surface, PreparedScan]:
     rng = np.random.default_rng(1)
     half = np.array([3.0, 2.0])
     floor = rng.uniform(-half, half, (24_000, 2))
