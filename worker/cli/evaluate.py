@@ -101,6 +101,10 @@ def placement(
     processes: Annotated[int, typer.Option(min=1, max=2, help="That register side by side.")] = 2,
     real: Annotated[Path | None, typer.Option(help="Folder of real scans: see docs/test-data.md.")] = None,
     pictures: Annotated[int, typer.Option(min=0, help="Of impostors, with what contradicts them.")] = 0,
+    fit: Annotated[
+        bool,
+        typer.Option("--fit", help="Fit the line of belief on the calibration part instead, and show it."),
+    ] = False,
     out: Annotated[
         Path, typer.Option(help="Folder for placement.json, pictures, and maps and answers, which are kept.")
     ] = Path("bench/placement"),
@@ -113,9 +117,16 @@ def placement(
     """
     from worker.benchmarks.documents import write_json  # noqa: PLC0415
     from worker.benchmarks.placement.benchmark import PlacementBenchmarkSettings, evaluate  # noqa: PLC0415
+    from worker.benchmarks.placement.fit import fit_line, fit_table  # noqa: PLC0415
     from worker.benchmarks.placement.plan import KINDS, PlacementSettings, kinds_named  # noqa: PLC0415
     from worker.benchmarks.placement.report import tables  # noqa: PLC0415
 
+    if fit:
+        made = PlacementSettings(sites=sites)
+        with terminal.progress_bar() as progress:
+            line = fit_line(made, out, processes=processes, most=trials, progress=progress)
+        terminal.show(line, fit_table, as_json=as_json)
+        return
     settings = PlacementBenchmarkSettings(
         out=out,
         part=part,

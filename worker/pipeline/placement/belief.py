@@ -14,7 +14,7 @@ import numpy as np
 from worker.cloud.types import Floats
 from worker.pipeline.placement.contradictions import BUILDING, THINGS, Contradictions
 
-_FEWEST = 200.0  # points each way that both visits have to judge; with fewer nothing is said
+FEWEST = 200.0  #: points each way that both visits have to judge; with fewer nothing is said
 #: Points put beside each share, so that a few of them prove little.
 _BESIDE_BUILDING, _BESIDE_THINGS = 200.0, 100.0
 
@@ -59,7 +59,7 @@ def shares(told: Contradictions) -> Floats:
 
 def log_odds(told: Contradictions, line: Line = LINE) -> float | None:
     """Return the log odds of a pose; None where too little was seen by both to say anything."""
-    if told.judged.sum(axis=1).min() < _FEWEST:
+    if told.judged.sum(axis=1).min() < FEWEST:
         return None
     return line.log_odds(shares(told))
 

@@ -8,6 +8,7 @@ win against its rivals; a prior breaks ties, and never lowers the bar.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -125,6 +126,28 @@ def place_scan(
         return search.run()
     except ScanRejected as error:
         raise NotPlaced(error, search.hypotheses()) from error
+
+
+def poses_tried(
+    scan: PreparedScan,
+    place: Place,
+    *,
+    prior: Matrix4 | None = None,
+    registration: RegistrationSettings,
+    placement: PlacementSettings,
+) -> tuple[PlacedScan, ...]:
+    """Return every pose that `place_scan` holds against rays on its way: what a line of belief is fitted on."""
+    search = _Search(
+        scan=scan,
+        place=place,
+        prior=prior,
+        registration=registration,
+        placement=placement,
+        tick=lambda: None,
+    )
+    with suppress(ScanRejected):
+        search.run()
+    return tuple(search.found)
 
 
 def believed_by(place: Place) -> Callable[[PreparedScan, Hypothesis], bool]:
