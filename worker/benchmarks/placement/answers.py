@@ -19,7 +19,7 @@ from worker.benchmarks.placement.plan import PlacementSettings, SitePlan, Trial
 from worker.benchmarks.placement.sites import PlacementSite, load_site, make_site
 from worker.benchmarks.placement.surveys import Survey, simulate
 from worker.cloud.poses import difference
-from worker.cloud.types import Matrix4
+from worker.cloud.types import Floats, Matrix4
 from worker.errors import ScanError
 from worker.pipeline.flow import NoScanAccepted, locate_survey
 from worker.pipeline.registration.results import ScanResult
@@ -156,11 +156,12 @@ def answer(name: str, survey: Survey, site: PlacementSite, settings: PipelineSet
         outcomes = tuple(ScanResult.rejected(file.name, unreadable) for file in survey.files)
     seconds = time.perf_counter() - begun
     in_doubt = placement is not None and placement.in_doubt
+    middles = survey.middles or (np.zeros(3),) * len(survey.files)
     return TrialAnswer(
         name=name,
         scans=tuple(
-            scan_answer(outcome, true, in_doubt=in_doubt)
-            for outcome, true in zip(outcomes, survey.true, strict=True)
+            scan_answer(outcome, true, in_doubt=in_doubt, middle=middle)
+            for outcome, true, middle in zip(outcomes, survey.true, middles, strict=True)
         ),
         seconds=seconds,
         confidence=None if placement is None else placement.confidence,
@@ -168,8 +169,13 @@ def answer(name: str, survey: Survey, site: PlacementSite, settings: PipelineSet
     )
 
 
-def scan_answer(outcome: ScanResult, true: Matrix4 | None, *, in_doubt: bool = False) -> ScanAnswer:
-    """Hold what became of a scan against its true map_from_scan, None where it has none."""
+def scan_answer(
+    outcome: ScanResult, true: Matrix4 | None, *, in_doubt: bool = False, middle: Floats | None = None
+) -> ScanAnswer:
+    """Hold what became of a scan against its true map_from_scan, None where it has none.
+
+    The error is measured at `middle` (3,), metres, scan frame: a frame's origin may lie kilometres away.
+    """
     result = outcome.registration
     if result is None:
         reason = None if outcome.diagnosis is None else outcome.diagnosis.reason
@@ -181,7 +187,10 @@ def scan_answer(outcome: ScanResult, true: Matrix4 | None, *, in_doubt: bool = F
             detail=outcome.reason,
             fitness=outcome.fitness,
         )
-    metres, radians = (None, None) if true is None else difference(true, result.map_from_scan)
+    scan_from_middle = np.eye(4)
+    scan_from_middle[:3, 3] = 0.0 if middle is None else middle
+    map_from_middle = result.map_from_scan @ scan_from_middle
+    metres, radians = (None, None) if true is None else difference(true @ scan_from_middle, map_from_middle)
     said = ScanAnswer(
         verdict="wrong",
         here=true is not None,

@@ -25,7 +25,7 @@ from worker.cloud import npz
 from worker.cloud.formats.pcd import write_pcd
 from worker.cloud.formats.scan import read_scan
 from worker.cloud.poses import inverse
-from worker.cloud.types import Matrix4
+from worker.cloud.types import Floats, Matrix4
 from worker.pipeline.flow import build_map
 from worker.pipeline.registration.results import ScanFile
 from worker.pipeline.settings import PipelineSettings
@@ -208,7 +208,8 @@ def _answer_and_keep(task: _Task) -> None:
     scan = read_scan(sent.path, name=sent.path.name, max_points=task.settings.max_scan_points)
     pose = None if sent.prior is None else sent.prior @ scan.sensor_pose
     file = ScanFile(name=sent.path.stem, path=sent.path, pose=pose)
-    survey = Survey(files=(file,), true=(sent.true,))
+    middle: Floats = np.median(scan.points, axis=0).astype(np.float64)
+    survey = Survey(files=(file,), true=(sent.true,), middles=(middle,))
     answer(sent.name, survey, _loaded(sent.site), task.settings).keep(task.kept)
 
 

@@ -52,6 +52,8 @@ class Survey:
 
     files: tuple[ScanFile, ...]
     true: tuple[Matrix4 | None, ...]  #: map_from_scan
+    #: (3,) of each, metres, scan frame: where the error of its pose is measured; left out: at the frame's origin
+    middles: tuple[Floats, ...] | None = None
 
 
 def simulate(trial: Trial, site: PlacementSite, settings: PlacementSettings, folder: Path) -> Survey:

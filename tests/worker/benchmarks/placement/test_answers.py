@@ -63,6 +63,13 @@ def test_any_pose_of_a_scan_of_another_place_is_wrong_and_none_is_where_the_surv
     assert not scan_answer(accepted(HERE), None, in_doubt=True).near
 
 
+def test_the_error_is_measured_where_the_points_are():
+    far, turned = rigid(-4000.0), rigid(yaw=0.01)
+    said = scan_answer(accepted(HERE @ turned @ far), HERE @ far, middle=np.array([4000.0, 0.0, 0.0]))
+    assert said.verdict == "right" and said.metres == pytest.approx(0.0, abs=1e-6)
+    assert scan_answer(accepted(HERE @ turned @ far), HERE @ far).verdict == "wrong"
+
+
 def test_scans_left_out_are_ambiguous_or_refused_by_their_diagnosis():
     assert scan_answer(refused("ambiguous"), HERE).verdict == "ambiguous"
     said = scan_answer(refused("other_place"), None)
