@@ -7,14 +7,14 @@ poses of right scans; `spicd-worker evaluate placement --fit` makes it anew, doc
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from worker.cloud.types import Floats
 from worker.pipeline.placement.contradictions import BUILDING, THINGS, Contradictions
 
-FEWEST = 200.0  #: points each way that both visits have to judge; with fewer nothing is said
+FEWEST = 200.0  #: points of one visit that the other has to judge; of fewer nothing is said
 #: Points put beside each share, so that a few of them prove little.
 _BESIDE_BUILDING, _BESIDE_THINGS = 200.0, 100.0
 
@@ -31,7 +31,7 @@ class Line:
         return float(self.bias + np.sqrt(shares) @ np.array(self.weights))
 
 
-LINE = Line(bias=12.24, weights=(-1.59, -21.85, -9.18, -1.54, -5.86, 0.0, -11.60))
+LINE = Line(bias=13.87, weights=(-5.22, -27.07, -4.25, -3.01, -5.47, 0.0, -10.09))
 
 
 def shares(told: Contradictions) -> Floats:
@@ -58,10 +58,15 @@ def shares(told: Contradictions) -> Floats:
 
 
 def log_odds(told: Contradictions, line: Line = LINE) -> float | None:
-    """Return the log odds of a pose; None where too little was seen by both to say anything."""
-    if told.judged.sum(axis=1).min() < FEWEST:
+    """Return the log odds of a pose; None where too little was seen to say anything.
+
+    Where the rays of one visit alone are known, or looked where the other has points, they speak for both.
+    """
+    enough = told.judged.sum(axis=1) >= FEWEST
+    if not enough.any():
         return None
-    return line.log_odds(shares(told))
+    speaks = np.flatnonzero(enough)[[0, -1]]  # each way, or the one that has to do twice
+    return line.log_odds(shares(replace(told, judged=told.judged[speaks], through=told.through[speaks])))
 
 
 def confidence(odds: float) -> float:

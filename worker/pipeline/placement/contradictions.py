@@ -22,6 +22,8 @@ from worker.pipeline.registration.surface import Surface, facing
 
 SURFACE_DISTANCE = 0.05  #: metres off a tangent plane, up to which a point lies on a surface
 REACH = 0.3  #: metres; farther from the other cloud than this, a point is not compared by surfaces
+#: metres along a surface from its nearest point, beyond which nothing is known of it: clouds are sparse at their edges
+BESIDE = 0.12
 OWN = 1.0  #: metres around the sensor that are not asked: what stands there is the robot
 _SAMPLE = 3_000  # points asked in each direction, of the building and of its things each
 _CELL = 0.06  # metres, of the columns that hold a wall
@@ -194,9 +196,12 @@ def _by_surface(
     points = transformed(part.points, surface_from_cloud)
     distance, index = surface.nearest(points, within=REACH)
     near = facing(part, surface, surface_from_cloud, index, np.isfinite(distance))
-    off = np.zeros(len(points), bool)
     gap = points[near] - surface.points[index[near]]
-    off[near] = np.abs(np.einsum("ij,ij->i", gap, surface.normals[index[near]])) > SURFACE_DISTANCE
+    off_plane = np.abs(np.einsum("ij,ij->i", gap, surface.normals[index[near]]))
+    beside = np.sqrt(np.maximum(distance[near] ** 2 - off_plane**2, 0.0)) > BESIDE
+    off = np.zeros(len(points), bool)
+    off[near] = (off_plane > SURFACE_DISTANCE) & ~beside
+    near[near] = ~beside
     return near, off
 
 

@@ -39,7 +39,8 @@ UNITS: dict[str, float] = {"millimetres": 0.001, "centimetres": 0.01, "inches": 
 FACTORS = tuple(factor for unit in UNITS.values() for factor in (unit, 1 / unit))
 _SAME_HEIGHT = 1.25  # times: two heights from floor to ceiling that may be one
 _WORTH_SCALING = 1.05  # times the map's height, from which on the height itself is tried as the scale
-_CANDIDATES, _REFINED = 12, 4  # of a search: that the bird's-eye views name, and that get a full ICP
+_BETTER = 0.95  # of the best score of the scan as it is, that a variant has to reach in coarse alignment
+_CANDIDATES, _REFINED = 12, 3  # of a search: that the bird's-eye views name, and that get a full ICP
 _STRAYS = (1, 99)  # percentiles, between which a cloud's height is measured
 #: share of a scan near the map at a pose, from which on a scale or a motion may be all that keeps it from lying there
 _COVERED = (0.3, 0.5)
@@ -94,8 +95,10 @@ class Refused:
         refinement = self.refinement(prepared.surface)
         starts = bev_candidates(prepared.surface, self.target, count=_CANDIDATES)
         coarse = by_score(coarse_alignment(prepared.surface, self.target, start) for start in starts)
+        least = _BETTER * max((hypothesis.score for hypothesis in self.hypotheses), default=0.0)
         for pose in coarse[:_REFINED]:
-            yield refinement.from_start(pose.target_from_source)
+            if pose.score >= least:
+                yield refinement.from_start(pose.target_from_source)
         if not starts:
             yield global_registration(refinement, None)
 

@@ -54,6 +54,7 @@ _BEV_CANDIDATES, _NEAR_PRIOR = (
 )  # that the bird's-eye views name: in the whole map, and to choose from near a prior
 _BEST_CANDIDATES = 4  # of those that get a full ICP
 _RIVAL = 0.93  # of the best coarse score, from which on another candidate is refined as well
+_MIRRORED = 2  # candidates of the mirror image that get a full ICP
 _WORTH = 0.3  # coarse score of an FPFH candidate that gets a full ICP; right ones have 0.5 and more
 _APART = (0.3, 0.17)  # metres, radians: poses nearer to each other are one
 _SCALE_SIGMAS = 4.0  # that a scale has to be off to be told
@@ -113,17 +114,15 @@ def place_scan(
 ) -> PlacedScan:
     """Find map_from_scan and believe it only where rays do not contradict it and no other pose does as well.
 
-    Raises ScanRejected with a diagnosis. Where the rays of the scan or of the map are not known, surfaces decide
-    alone, as in `registration.scan_to_map.register`.
+    Raises NotPlaced with a diagnosis. Where neither the rays of the scan nor those of the map are known, surfaces
+    decide alone, as in `registration.scan_to_map.register`.
     """
-    if scan.sights is None or place.sights is None:
-        hypothesis = register(scan, place.surface, prior=prior, settings=registration, tick=tick)
-        return PlacedScan(hypothesis=hypothesis, told=None, log_odds=None)
     search = _Search(
         scan=scan, place=place, prior=prior, registration=registration, placement=placement, tick=tick
     )
     try:
-        return search.run()
+        blind = scan.sights is None and place.sights is None
+        return search.by_surfaces() if blind else search.run()
     except ScanRejected as error:
         raise NotPlaced(error, search.hypotheses()) from error
 
@@ -193,6 +192,31 @@ class _Search:
             settings=self.registration,
             tick=self.tick,
         )
+
+    def by_surfaces(self) -> PlacedScan:
+        """Search as maps are built, where no rays are known; the mirror image has to fit worse."""
+        hypothesis = register(
+            self.scan, self.place.surface, prior=self.prior, settings=self.registration, tick=self.tick
+        )
+        self._require_handed(hypothesis)
+        return self._measured(PlacedScan(hypothesis=hypothesis, told=None, log_odds=None))
+
+    def _require_handed(self, hypothesis: Hypothesis) -> None:
+        """Raise ScanRejected where the mirror image of the scan lies better on the map than the scan itself."""
+        image = replace(self._free, source=reflected(self.scan.surface))
+        starts = bev_candidates(image.source, image.target, count=_BEV_CANDIDATES)
+        coarse = by_score(coarse_alignment(image.source, image.target, start) for start in starts)
+        found = [image.from_start(pose.target_from_source).score for pose in coarse[:_MIRRORED]]
+        if max(found, default=0.0) > hypothesis.score:
+            raise rejected(
+                self.scan.name,
+                hypothesis,
+                "mirrored",
+                f"its mirror image fits the map better (inlier ratio times overlap {max(found):.2f}) than it does "
+                f"({hypothesis.score:.2f}); negate x or y, or read its axes as right-handed",
+                mirrored=max(found),
+                itself=hypothesis.score,
+            )
 
     def hypotheses(self) -> list[Hypothesis]:
         """Return what was found, best first."""
@@ -423,6 +447,12 @@ def other_place(name: str, placed: PlacedScan) -> ScanRejected:
         f"(confidence {placed.confidence or 0.0:.2f}); it is of another place, or too much has changed",
         **numbers,
     )
+
+
+def reflected(surface: Surface) -> Surface:
+    """Return the mirror image, x negated, to be moved."""
+    flip = np.array([-1.0, 1.0, 1.0])
+    return Surface.of(surface.points * flip, surface.normals * flip, surface.oriented)
 
 
 def numbers_of(placed: PlacedScan) -> dict[str, float]:

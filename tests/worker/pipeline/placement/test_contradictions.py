@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from tests.support.graphs import shifted
@@ -67,10 +69,22 @@ def test_both_directions_are_held_at_places_of_the_map_frame(
         assert not (held.off & ~held.near).any()
 
 
-def test_without_what_the_map_saw_only_surfaces_speak(room: Room, right: PreparedScan) -> None:
-    told = told_of(right, Place(surface=room.target, sights=None), room.after[0].world_from_sensor)
+def test_without_what_the_map_saw_the_scans_own_rays_speak_for_both(room: Room, right: PreparedScan) -> None:
+    blind = Place(surface=room.target, sights=None)
+    told = told_of(right, blind, room.after[0].world_from_sensor)
     assert told.judged[INTO_MAP].sum() == 0
     assert told.judged[INTO_SCAN].sum() > 1000
+    odds = log_odds(told)
+    assert odds is not None
+    assert confidence(odds) > 0.9
+    off = log_odds(told_of(right, blind, shifted(0.5, 0.0) @ room.after[0].world_from_sensor))
+    assert off is not None
+    assert confidence(off) < 0.05
+
+
+def test_without_any_rays_nothing_is_said(room: Room, right: PreparedScan) -> None:
+    unseen = replace(right, sights=None)
+    told = told_of(unseen, Place(surface=room.target, sights=None), room.after[0].world_from_sensor)
     assert told.near.min() > 0
     assert log_odds(told) is None
 

@@ -120,9 +120,16 @@ def test_a_scale_that_is_off_by_a_percent_is_a_warning_or_a_refusal_by_setting(
 
 def test_a_scan_whose_rays_are_not_known_is_placed_by_surfaces_alone(room: Room, place: Place) -> None:
     blind = prepare(as_scan(room.after[0].points), QUICK)
-    found = placed(blind, place)
+    found = placed(blind, Place(surface=place.surface, sights=None))
     assert difference(found.pose, room.after[0].world_from_sensor)[0] < 0.03
     assert found.confidence is None
+
+
+def test_a_mirror_image_is_refused_also_where_no_rays_are_known(room: Room, place: Place) -> None:
+    image = prepare(as_scan(room.after[0].points * np.array([-1, 1, 1], np.float32)), QUICK)
+    with pytest.raises(ScanRejected) as refused:
+        placed(image, Place(surface=place.surface, sights=None))
+    assert refused.value.diagnosis.reason in ("mirrored", "no_fit")
 
 
 def _bare_room() -> tuple[Surface, PreparedScan]:
