@@ -39,12 +39,12 @@ UNITS: dict[str, float] = {"millimetres": 0.001, "centimetres": 0.01, "inches": 
 FACTORS = tuple(factor for unit in UNITS.values() for factor in (unit, 1 / unit))
 _SAME_HEIGHT = 1.25  # times: two heights from floor to ceiling that may be one
 _WORTH_SCALING = 1.05  # times the map's height, from which on the height itself is tried as the scale
-_BETTER = 0.95  # of the best score of the scan as it is, that a variant has to reach in coarse alignment
-_CANDIDATES, _REFINED = 12, 3  # of a search: that the bird's-eye views name, and that get a full ICP
+_BETTER = 1.0  # of the best score of the scan as it is, that a variant has to reach in coarse alignment
+_CANDIDATES, _REFINED = 12, 2  # of a search: that the bird's-eye views name, and that get a full ICP
 _STRAYS = (1, 99)  # percentiles, between which a cloud's height is measured
 #: share of a scan near the map at a pose, from which on a scale or a motion may be all that keeps it from lying there
 _COVERED = (0.3, 0.5)
-_TRIED = 3  # hypotheses whose scale is estimated
+_TRIED = 2  # hypotheses whose scale is estimated
 _LEAST_OFF = 0.006  # scales nearer to 1 explain no refusal: right scans were estimated up to 0.5% off
 _MOVED = (
     0.05,
@@ -167,7 +167,7 @@ def _unit(scale: float) -> str:
 
 def _motion(case: Refused) -> Diagnosis | None:
     """Align the first and the last fifth of the points by themselves: do they lie on the map, but apart?"""
-    starts = [hypothesis for hypothesis in case.hypotheses[:_TRIED] if hypothesis.overlap >= _COVERED[1]]
+    starts = [hypothesis for hypothesis in case.hypotheses[:1] if hypothesis.overlap >= _COVERED[1]]
     ends = [case.ready(part(case.scan, *shares)) for shares in _ENDS] if starts else []
     ready = [end for end in ends if end is not None]
     for start in starts if len(ready) == len(_ENDS) else ():

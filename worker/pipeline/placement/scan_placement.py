@@ -254,12 +254,9 @@ class _Search:
         return by_score(coarse_alignment(self.scan.surface, self.place.surface, start) for start in starts)
 
     def _refine_features(self, *, thoroughly: bool) -> None:
-        """Try what local features name: one draw, or many where surfaces bear out nothing that was found so far."""
-        resolutions = self.registration.search_resolutions[: None if thoroughly else 1]
-        seeds = self.registration.search_seeds if thoroughly and self.prior is None else 1
-        for pose in fpfh_candidates(
-            self.scan.surface, self.place.surface, resolutions=resolutions, seeds=seeds
-        ):
+        """Try what local features name: one draw, or one at each of two resolutions where surfaces refuse all so far."""
+        resolutions = self.registration.search_resolutions[: 2 if thoroughly else 1]
+        for pose in fpfh_candidates(self.scan.surface, self.place.surface, resolutions=resolutions, seeds=1):
             (coarse,) = self._coarse([pose])
             if coarse.score >= _WORTH and not self._is_known(coarse.target_from_source):
                 self._note(self._free.from_start(coarse.target_from_source))

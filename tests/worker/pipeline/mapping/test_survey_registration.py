@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,15 +22,16 @@ from tests.support.walks import (
     written,
 )
 from worker.cloud.formats.pcd import write_pcd
+from worker.cloud.sight import Sights
 from worker.cloud.voxels import Voxels
 from worker.errors import Cancelled, ScanError, ScanTooLarge
 from worker.pipeline.mapping.settings import JointRegistrationSettings
-from worker.pipeline.mapping.survey_registration import register_survey_scans
+from worker.pipeline.mapping.survey_registration import SurveyRegistration, register_survey_scans
 from worker.pipeline.registration.results import ScanFile, ScanResult
 from worker.pipeline.registration.settings import RegistrationSettings
 from worker.pipeline.registration.surface import Surface, surface_of
 from worker.progress import Progress, no_progress
-from worker.simulation.scenes import random_room
+from worker.simulation.scenes import random_room, refurnished
 from worker.simulation.visits import visit
 
 #: without any search, so that a prior has to do
@@ -284,3 +286,118 @@ def test_a_dismissal_stops_within_one_step(room: Room, files: tuple[ScanFile, ..
         register(files[:2], room.target, progress=dismissed)
     assert told.count(last) == 2
     assert told[-1] == last
+
+
+# --- with what the map's scans saw
+
+
+@pytest.fixture(scope="module")
+def sights(room: Room) -> Sights | None:
+    return Sights.of((scan.world_points, scan.world_from_sensor[:3, 3]) for scan in room.before)
+
+
+@pytest.fixture(scope="module")
+def strange(folder: Path) -> ScanFile:
+    """A scan of the very same shell with all other furniture, its prior as right as that of the others."""
+    (scan,) = visit(refurnished(random_room(3), seed=5), 1, seed=11)
+    return written(folder / "strange.pcd", scan, pose=scan.world_from_sensor)
+
+
+def surveyed(
+    files: Sequence[ScanFile], room: Room, sights: Sights | None, *, processes: int = 1, growing: bool = False
+) -> SurveyRegistration:
+    return register_survey_scans(
+        files,
+        room.target,
+        sights=sights,
+        settings=joint_settings(),
+        processes=processes,
+        growing=growing,
+    )
+
+
+def test_right_scans_are_confirmed_with_a_confidence(
+    room: Room, files: tuple[ScanFile, ...], sights: Sights | None
+) -> None:
+    found = surveyed(files, room, sights)
+    assert found.placement.confidence is not None
+    assert found.placement.confidence > 0.95
+    assert not found.placement.in_doubt
+    assert all((outcome.confidence or 0.0) > 0.9 for outcome in found.outcomes)
+    assert len(found.held) == len(files)
+
+
+def test_without_what_the_map_saw_and_scans_whose_place_is_known_their_own_rays_speak(
+    room: Room, files: tuple[ScanFile, ...]
+) -> None:
+    found = surveyed(files[:1], room, None)
+    assert found.placement.confidence is not None
+    assert found.placement.confidence > 0.9
+
+
+def test_a_scan_of_another_place_does_not_cost_the_others(
+    room: Room, files: tuple[ScanFile, ...], strange: ScanFile, sights: Sights | None
+) -> None:
+    found = surveyed([files[0], strange, files[1]], room, sights)
+    first, other, last = found.outcomes
+    assert first.registration is not None
+    assert last.registration is not None
+    assert other.registration is None
+    assert other.diagnosis is not None
+    assert other.diagnosis.reason in ("other_place", "disagrees")
+    assert not found.placement.in_doubt
+
+
+def test_a_survey_of_another_place_alone_is_refused_or_in_doubt(
+    room: Room, strange: ScanFile, sights: Sights | None
+) -> None:
+    found = surveyed([strange], room, sights)
+    (outcome,) = found.outcomes
+    assert outcome.registration is None or found.placement.in_doubt
+
+
+def test_a_map_does_not_grow_by_a_scan_in_doubt(room: Room, strange: ScanFile, sights: Sights | None) -> None:
+    (outcome,) = surveyed([strange], room, sights, growing=True).outcomes
+    assert outcome.registration is None
+
+
+def test_a_scan_with_a_wrong_prior_is_found_by_the_frame_of_the_others(
+    room: Room, files: tuple[ScanFile, ...], sights: Sights | None
+) -> None:
+    """Two scans whose priors are 4 m off alike are sure of their place; a third one's search is told where to look."""
+    away = shifted(4.0, 0.0)
+    moved = [replace(file, pose=away @ file.pose) for file in files if file.pose is not None]
+    found = surveyed(moved, room, sights)
+    for outcome, scan in zip(found.outcomes, (*room.after, room.before[2]), strict=True):
+        assert off(registered(outcome).map_from_scan, scan.world_from_sensor) < 0.02
+        assert {warning.reason for warning in outcome.warnings} <= {"wrong_prior"}
+
+
+def test_priors_that_are_all_farther_off_than_any_may_be_are_refused(
+    room: Room, files: tuple[ScanFile, ...], sights: Sights | None
+) -> None:
+    away = shifted(9.0, 0.0)
+    moved = [replace(file, pose=away @ file.pose) for file in files if file.pose is not None]
+    found = surveyed(moved, room, sights)
+    reasons = {outcome.diagnosis.reason for outcome in found.outcomes if outcome.diagnosis is not None}
+    assert reasons == {"wrong_prior"}
+    assert all(outcome.registration is None for outcome in found.outcomes)
+
+
+def test_scans_are_registered_side_by_side_with_the_same_result(
+    room: Room, files: tuple[ScanFile, ...], sights: Sights | None
+) -> None:
+    more = [replace(files[number % 3], name=f"scan-{number}") for number in range(6)]
+    alone, beside = surveyed(more, room, sights), surveyed(more, room, sights, processes=2)
+    for one, other in zip(alone.outcomes, beside.outcomes, strict=True):
+        assert off(registered(one).map_from_scan, registered(other).map_from_scan) < 1e-3
+        assert one.confidence == pytest.approx(other.confidence, abs=0.02)
+
+
+def test_a_mirrored_scan_is_named_as_one(room: Room, folder: Path, sights: Sights | None) -> None:
+    scan = room.after[0]
+    path = folder / "mirrored.pcd"
+    write_pcd(path, scan.points * np.array([-1, 1, 1], np.float32))
+    (outcome,) = surveyed([ScanFile(name=path.name, path=path)], room, sights).outcomes
+    assert outcome.diagnosis is not None
+    assert outcome.diagnosis.reason == "mirrored"
