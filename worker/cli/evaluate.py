@@ -101,6 +101,9 @@ def placement(
     processes: Annotated[int, typer.Option(min=1, max=2, help="That register side by side.")] = 2,
     real: Annotated[Path | None, typer.Option(help="Folder of real scans: see docs/test-data.md.")] = None,
     pictures: Annotated[int, typer.Option(min=0, help="Of impostors, with what contradicts them.")] = 0,
+    reasons: Annotated[
+        bool, typer.Option(help="Look for why refused scans found no place; without, they cost half.")
+    ] = True,
     fit: Annotated[
         bool,
         typer.Option("--fit", help="Fit the line of belief on the calibration part instead, and show it."),
@@ -121,8 +124,10 @@ def placement(
     from worker.benchmarks.placement.plan import KINDS, PlacementSettings, kinds_named  # noqa: PLC0415
     from worker.benchmarks.placement.report import tables  # noqa: PLC0415
 
+    made = PlacementSettings(sites=sites)
+    if not reasons:
+        made = made.without_reasons()
     if fit:
-        made = PlacementSettings(sites=sites)
         with terminal.progress_bar() as progress:
             line = fit_line(made, out, processes=processes, most=trials, progress=progress)
         terminal.show(line, fit_table, as_json=as_json)
@@ -135,7 +140,7 @@ def placement(
         processes=processes,
         real=real,
         pictures=pictures,
-        made=PlacementSettings(sites=sites),
+        made=made,
     )
     with terminal.progress_bar() as progress:
         result = {"command": command_line(context), **evaluate(settings, progress)}

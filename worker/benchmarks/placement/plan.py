@@ -101,6 +101,11 @@ class PlacementSettings(StrictModel):
     standing_s: float = Field(5.0, gt=0, description="seconds at each stop; about 20,000 points a second")
     pipeline: PipelineSettings = PipelineSettings()
 
+    def without_reasons(self) -> PlacementSettings:
+        """Return the same, but nobody asks why scans found no place: verdicts are as they were."""
+        placement = self.pipeline.placement.with_values(diagnosed=0)
+        return self.with_values(pipeline=self.pipeline.with_values(placement=placement))
+
     @property
     def fingerprint(self) -> str:
         """Equal for maps made alike."""

@@ -31,7 +31,7 @@ class Line:
         return float(self.bias + np.sqrt(shares) @ np.array(self.weights))
 
 
-LINE = Line(bias=13.87, weights=(-5.22, -27.07, -4.25, -3.01, -5.47, 0.0, -10.09))
+LINE = Line(bias=15.64, weights=(-6.41, -25.70, -6.25, -3.69, -4.45, 0.0, -8.83))
 
 
 def shares(told: Contradictions) -> Floats:

@@ -161,20 +161,21 @@ def _into_scan(scan: PreparedScan, place: Place, map_from_scan: Matrix4, sample:
 def building_of(points: Floats, normals: Floats) -> Bools:
     """Tell (N,) which points, metres, z up, belong to walls, floor and ceiling: (N, 3) each.
 
-    A wall is a column of upright surface that reaches the upper quarter of the height: hardly a thing does.
+    A wall is a column of upright surface that reaches the upper quarter of the height: hardly a thing does. What else
+    is up there, lamps and pipes, comes with the building as well.
     """
     floor, ceiling = np.percentile(points[:, 2], (1, 99)) if len(points) else (0.0, 0.0)
     height, z = points[:, 2] - floor, np.abs(normals[:, 2])
-    level = (z > _LEVEL) & ((height < _SLAB) | (points[:, 2] > ceiling - _SLAB))
-    upright = z < _STEEP
+    level = (z > _LEVEL) & (height < _SLAB)
+    high, upright = height > _UPPER * (ceiling - floor), z < _STEEP
     columns = np.floor(points[:, :2] / _CELL).astype(np.int64)
     columns -= columns.min(axis=0, initial=0) - 1
     wall = np.zeros(columns.max(axis=0, initial=0) + 2, bool)
-    upper = columns[upright & (height > _UPPER * (ceiling - floor)) & (points[:, 2] < ceiling - _SLAB)]
+    upper = columns[upright & high & (points[:, 2] < ceiling - _SLAB)]
     for east in (-1, 0, 1):
         for north in (-1, 0, 1):
             wall[upper[:, 0] + east, upper[:, 1] + north] = True
-    building: Bools = level | (upright & wall[columns[:, 0], columns[:, 1]])
+    building: Bools = level | high | (upright & wall[columns[:, 0], columns[:, 1]])
     return building
 
 

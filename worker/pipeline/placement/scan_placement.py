@@ -48,6 +48,7 @@ from worker.pipeline.registration.verification import (
 )
 
 CLEAR = 0.9  #: confidence from which on nothing else is looked for
+OVERCOMES = 0.99  #: confidence that a pose needs against a prior that says otherwise
 _BEV_CANDIDATES, _NEAR_PRIOR = (
     12,
     48,
@@ -326,7 +327,8 @@ class _Search:
         metres, radians = difference(placed.pose, self.prior)
         numbers = {"metres": metres, "degrees": float(np.degrees(radians))}
         off = f"{metres:.1f} m and {numbers['degrees']:.0f} degrees"
-        if metres > self.placement.max_prior_distance or not self._odds_are_clear(placed):
+        sure = placed.log_odds is not None and placed.log_odds >= odds_of(OVERCOMES)
+        if metres > self.placement.max_prior_distance or not sure:
             raise rejected(
                 self.scan.name,
                 placed.hypothesis,
