@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Path, Query, Response
 from fastapi import Request as HttpRequest
@@ -51,11 +51,29 @@ class CarrierRequest(Request):
     ]
 
 
+class PlacementRequest(Request):
+    """What it takes for a survey's poses to be believed; what is left out keeps its default."""
+
+    min_confidence: Annotated[
+        float | None,
+        Field(gt=0, lt=1, description="of a survey's poses; below it the survey is in doubt (0.7)"),
+    ] = None
+    scale: Annotated[
+        Literal["warn", "refuse"] | None,
+        Field(
+            description="what becomes of a scan whose lengths are off by more than 0.7%; from 1.5% on it is left out"
+        ),
+    ] = None
+
+
 class MapSettings(Request):
     """What of a map can be set. Voxel and tile size belong to the model, and so to its card."""
 
     registration: RegistrationRequest = RegistrationRequest()
     carrier: Annotated[CarrierRequest | None, Field(description="left out: 0.7 m")] = None
+    placement: Annotated[
+        PlacementRequest | None, Field(description="left out: in doubt under 0.7, a wrong scale is a warning")
+    ] = None
     alarms_per_survey: Annotated[
         float,
         Field(

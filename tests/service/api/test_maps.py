@@ -66,6 +66,29 @@ def test_a_map_of_known_scans_is_accepted_and_its_job_submitted(
     assert client.get(answer.headers["location"]).json()["map_id"] == "lobby"
 
 
+def test_what_becomes_of_a_survey_in_doubt_or_off_in_scale_is_a_setting_of_the_map(
+    client: TestClient, catalog: Catalog
+) -> None:
+    scan = add_scan(catalog)
+    asked = {"min_confidence": 0.9, "scale": "refuse"}
+    body = {"id": "hall", "scan_ids": [scan.scan_id], "settings": {"placement": asked}}
+    assert client.post("/maps", json=body).status_code == 202
+    assert client.get("/maps/hall").json()["settings"]["placement"] == asked
+    kept = PipelineSettings.model_validate({"placement": asked}).placement
+    assert (kept.min_confidence, kept.scale) == (0.9, "refuse")
+
+
+@pytest.mark.parametrize("placement", [{"min_confidence": 1}, {"scale": "mend"}, {"scales": "warn"}])
+def test_an_unknown_setting_of_the_placement_is_refused(
+    client: TestClient, catalog: Catalog, placement: dict[str, object]
+) -> None:
+    scan = add_scan(catalog)
+    body = {"scan_ids": [scan.scan_id], "settings": {"placement": placement}}
+    answer = client.post("/maps", json=body)
+    assert answer.status_code == 422
+    assert "placement" in answer.text
+
+
 def test_a_map_of_files_keeps_them_as_scans_in_their_order(client: TestClient, catalog: Catalog) -> None:
     known = add_scan(catalog, "known")
     files = [("scans", (f"{name}.ply", ply(name))) for name in ("b", "a", "b")]
