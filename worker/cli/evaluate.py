@@ -101,6 +101,9 @@ def placement(
     processes: Annotated[int, typer.Option(min=1, max=2, help="That register side by side.")] = 2,
     real: Annotated[Path | None, typer.Option(help="Folder of real scans: see docs/test-data.md.")] = None,
     pictures: Annotated[int, typer.Option(min=0, help="Of impostors, with what contradicts them.")] = 0,
+    all_impostors: Annotated[
+        bool, typer.Option("--all-impostors", help="Leave none of these out, whatever --trials says.")
+    ] = False,
     reasons: Annotated[
         bool, typer.Option(help="Look for why refused scans found no place; without, they cost half.")
     ] = True,
@@ -137,6 +140,7 @@ def placement(
         part=part,
         only=KINDS if only is None else kinds_named(only),
         trials=trials,
+        all_impostors=all_impostors,
         processes=processes,
         real=real,
         pictures=pictures,

@@ -25,6 +25,7 @@ class PlacementBenchmarkSettings:
     part: Part = "figures"
     only: tuple[Kind, ...] = KINDS
     trials: int | None = None  #: of each row of the table at most; None: all
+    all_impostors: bool = False  #: whatever `trials` says
     processes: int = PROCESSES
     real: Path | None = None  #: folder of real scans
     pictures: int = 0  #: of impostors, at most
@@ -58,6 +59,12 @@ def evaluate(settings: PlacementBenchmarkSettings, progress: Progress = no_progr
 
 def run(settings: PlacementBenchmarkSettings, progress: Progress = no_progress) -> tuple[Answered, ...]:
     """Answer the trials, or find their answers. Raises as `evaluate` does."""
-    planned = trials(settings.made, settings.part, only=settings.only, most=settings.trials)
+    planned = trials(
+        settings.made,
+        settings.part,
+        only=settings.only,
+        most=settings.trials,
+        all_impostors=settings.all_impostors,
+    )
     said = answers_of(planned, settings.made, settings.out, processes=settings.processes, progress=progress)
     return tuple(Answered(trial=trial, answer=answer) for trial, answer in zip(planned, said, strict=True))

@@ -215,10 +215,11 @@ def trials(
     *,
     only: tuple[Kind, ...] = KINDS,
     most: int | None = None,
+    all_impostors: bool = False,
 ) -> tuple[Trial, ...]:
     """Plan the trials of a part, place after place; of each row of the table at most so many, spread over the places.
 
-    A trial is the same one whatever is asked for beside it.
+    With `all_impostors` none of these is left out. A trial is the same one whatever is asked for beside it.
     """
     planned = [
         trial
@@ -231,6 +232,9 @@ def trials(
     chosen: set[Trial] = set()
     for row in dict.fromkeys(trial.row for trial in planned):
         some = [trial for trial in planned if trial.row == row]
+        if all_impostors and some[0].impostor:
+            chosen.update(some)
+            continue
         chosen.update(some[max(1, len(some) // most) * number] for number in range(min(most, len(some))))
     return tuple(trial for trial in planned if trial in chosen)
 

@@ -91,3 +91,18 @@ def test_kinds_are_named_with_commas():
     assert kinds_named("twin, mixed-1+1") == ("twin", "mixed-1+1")
     with pytest.raises(ValueError, match="no kind of trial foreign; there are right"):
         kinds_named("foreign")
+
+
+def test_all_impostors_are_drawn_whatever_the_limit_of_a_row() -> None:
+    settings = PlacementSettings(sites=4)
+    few = trials(settings, "validation", most=1, all_impostors=True)
+    everything = trials(settings, "validation")
+    assert [trial for trial in few if trial.impostor] == [trial for trial in everything if trial.impostor]
+    others = [trial.row for trial in few if not trial.impostor]
+    assert len(others) == len(set(others))
+
+
+def test_trials_without_reasons_are_laid_on_the_same_maps() -> None:
+    settings = PlacementSettings()
+    assert settings.without_reasons().fingerprint == settings.fingerprint
+    assert settings.without_reasons().survey_fingerprint != settings.survey_fingerprint
