@@ -23,7 +23,8 @@ from worker.cloud.poses import difference
 from worker.cloud.types import Bools, Floats, Matrix4
 from worker.pipeline.placement.belief import FEWEST, Line, shares
 from worker.pipeline.placement.contradictions import Place
-from worker.pipeline.placement.scan_placement import PlacedScan, poses_tried
+from worker.pipeline.placement.placed_scan import PlacedScan
+from worker.pipeline.placement.scan_placement import poses_tried
 from worker.pipeline.registration.preprocessing import prepare
 from worker.pipeline.registration.results import ScanRejected, with_carrier
 from worker.processes import open_processes

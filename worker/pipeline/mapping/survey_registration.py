@@ -20,24 +20,27 @@ from worker.errors import ScanError
 from worker.pipeline.mapping.multiview_refinement import Refined, refine_jointly, uncertainties
 from worker.pipeline.mapping.settings import JointRegistrationSettings
 from worker.pipeline.mapping.tasks import (
-    Folder,
+    ExplainTask,
     LinearizedPair,
+    PlaceTask,
     PrepareTask,
     ValidScan,
     Workspace,
     downsample,
+    explain_one,
     lay_together,
     open_workspace,
+    place_one,
     read_and_prepare,
 )
 from worker.pipeline.placement.belief import confidence, log_odds
 from worker.pipeline.placement.contradictions import Held, Place
-from worker.pipeline.placement.explanations import Refused, diagnose
-from worker.pipeline.placement.scan_placement import PlacedScan, believed_by, other_place, place_scan
+from worker.pipeline.placement.placed_scan import PlacedScan, other_place
+from worker.pipeline.placement.scan_placement import CLEAR
 from worker.pipeline.registration.diagnosis import Diagnosis, Reason
 from worker.pipeline.registration.hypothesis import Hypothesis
 from worker.pipeline.registration.icp import normal_equations
-from worker.pipeline.registration.preprocessing import PreparedScan, prepare
+from worker.pipeline.registration.preprocessing import PreparedScan
 from worker.pipeline.registration.results import (
     ScanFile,
     ScanRejected,
@@ -102,74 +105,6 @@ def register_survey_scans(
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class _PlaceTask:
-    """One scan to be placed in a map that lies beside it."""
-
-    folder: Folder
-    map_index: int
-    index: int
-    prior: Matrix4 | None  #: map_from_scan
-    settings: JointRegistrationSettings
-
-    def run(self, place: Place, *, tick: Callable[[], None] = lambda: None) -> PlacedScan | ScanRejected:
-        """Return the scan's place in the map, or why it has none."""
-        try:
-            return place_scan(
-                self.folder.load(self.index),
-                place,
-                prior=self.prior,
-                registration=self.settings.registration,
-                placement=self.settings.placement,
-                tick=tick,
-            )
-        except ScanRejected as error:
-            return error
-
-
-def _place_one(task: _PlaceTask) -> tuple[int, PlacedScan | ScanRejected]:
-    return task.index, task.run(_place_of(task.folder, task.map_index))
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class _ExplainTask:
-    """One scan that found no place, to find out why."""
-
-    folder: Folder
-    map_index: int
-    index: int
-    file: ScanFile
-    hypotheses: tuple[Hypothesis, ...]
-    settings: JointRegistrationSettings
-
-    def run(self, place: Place, *, tick: Callable[[], None] = lambda: None) -> Diagnosis | None:
-        """Return the explanation that holds; None where none does. The file is read again, for the order of points."""
-        settings = self.settings
-        prepared = self.folder.load(self.index) if self.hypotheses else None
-        case = Refused(
-            scan=self.file.read(max_points=settings.max_points),
-            prepared=prepared,
-            hypotheses=self.hypotheses,
-            target=place.surface,
-            settings=settings.registration,
-            prepare=functools.partial(prepare, settings=settings.registration, with_sights=True),
-            believed=believed_by(place),
-            max_searches=settings.placement.max_searches if self.hypotheses else 0,
-            tick=tick,
-        )
-        return diagnose(case)
-
-
-def _explain_one(task: _ExplainTask) -> tuple[int, Diagnosis | None]:
-    return task.index, task.run(_place_of(task.folder, task.map_index))
-
-
-@functools.lru_cache(maxsize=2)
-def _place_of(folder: Folder, map_index: int) -> Place:
-    laid = folder.load(map_index)
-    return Place(surface=laid.surface, sights=laid.sights)
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
 class _Visit:
     """The scans of one visit: the inputs, each step as a method, and who is left out on the way."""
 
@@ -229,7 +164,7 @@ class _Visit:
         if priors and self.workspace.processes.count > 1:
             self.workspace.folder.save_map(map_index, place.surface, place.sights)
         tasks = [
-            _PlaceTask(
+            PlaceTask(
                 folder=self.workspace.folder,
                 map_index=map_index,
                 index=index,
@@ -249,11 +184,11 @@ class _Visit:
         return dict(sorted(placed.items()))
 
     def _placing(
-        self, tasks: Sequence[_PlaceTask], place: Place
+        self, tasks: Sequence[PlaceTask], place: Place
     ) -> Iterator[tuple[int, PlacedScan | ScanRejected]]:
         """Run the tasks; in this process every iteration of ICP can be stopped by what reports the progress."""
         if self.workspace.processes.count > 1:
-            yield from self.workspace.processes.map_unordered(_place_one, tasks)
+            yield from self.workspace.processes.map_unordered(place_one, tasks)
             return
         for count, task in enumerate(tasks):
             yield task.index, task.run(place, tick=self._tick(count / len(tasks)))
@@ -268,7 +203,11 @@ class _Visit:
         the others should be looked for.
         """
         expected = {index: self._expected(index, placed, priors) for index in priors}
-        again = {index: pose for index, pose in expected.items() if index not in placed and pose is not None}
+        again = {
+            index: pose
+            for index, pose in expected.items()
+            if index not in placed and pose is not None and not self._is_near(pose, _known(priors[index]))
+        }
         placed |= self._place(again, self.place, MAP)
         for index, scan in list(placed.items()):
             pose = expected[index]
@@ -281,7 +220,7 @@ class _Visit:
         """Look for better reasons why scans found no place: mirrored, scaled, moved, and so on."""
         settings = self.workspace.settings
         tasks = [
-            _ExplainTask(
+            ExplainTask(
                 folder=self.workspace.folder,
                 map_index=MAP,
                 index=index,
@@ -298,9 +237,9 @@ class _Visit:
                 fitness, inlier_rmse = error.fitness, error.inlier_rmse
                 self.errors[index] = ScanRejected(diagnosis, fitness=fitness, inlier_rmse=inlier_rmse)
 
-    def _explaining(self, tasks: Sequence[_ExplainTask]) -> Iterator[tuple[int, Diagnosis | None]]:
+    def _explaining(self, tasks: Sequence[ExplainTask]) -> Iterator[tuple[int, Diagnosis | None]]:
         if self.workspace.processes.count > 1:
-            yield from self.workspace.processes.map_unordered(_explain_one, tasks)
+            yield from self.workspace.processes.map_unordered(explain_one, tasks)
             return
         for task in tasks:
             yield task.index, task.run(self.place, tick=self._tick(1.0))
@@ -391,14 +330,17 @@ class _Visit:
                 return Refined(poses={}, uncertainties={}, free_space_violation={})
 
     def _least_believed(self, disagreeing: Sequence[int], placed: Placed, refined: Refined) -> list[int]:
-        """Return who goes: what speaks most against; both of two of which nothing tells who is wrong."""
-        if any(placed[index].log_odds is None for index in disagreeing):
-            return [max(disagreeing, key=lambda i: self._disagreement(i, placed[i].hypothesis, refined))]
-        odds = {index: placed[index].log_odds or 0.0 for index in disagreeing}
-        worst = min(odds, key=lambda index: odds[index])
-        ratio = np.log(self.workspace.settings.placement.min_rival_ratio)
-        tie = len(placed) == 2 and len(odds) == 2 and max(odds.values()) - odds[worst] < ratio
-        return list(odds) if tie else [worst]
+        """Return who goes: the least believed where others are clear, else who disagrees most.
+
+        Of the only two scans of a survey, of which nothing tells who is wrong, both go.
+        """
+        sure = {index: placed[index].confidence for index in disagreeing}
+        told = {index: value for index, value in sure.items() if value is not None}
+        if told and min(told.values()) < _LIKELY and max(told.values()) >= CLEAR:
+            return [min(told, key=lambda index: told[index])]
+        if len(placed) == len(told) == 2:
+            return list(told)
+        return [max(disagreeing, key=lambda i: self._disagreement(i, placed[i].hypothesis, refined))]
 
     def _alone(self, placed: Placed) -> Refined:
         """Keep the registration of one scan, or of none, to the map; it gives its uncertainty."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +17,13 @@ from worker.cloud.types import Floats, Matrix4, Points
 from worker.cloud.voxels import Voxels
 from worker.errors import ScanError
 from worker.pipeline.mapping.settings import JointRegistrationSettings
+from worker.pipeline.placement.contradictions import Place
+from worker.pipeline.placement.explanations import Refused, diagnose
+from worker.pipeline.placement.placed_scan import PlacedScan
+from worker.pipeline.placement.scan_placement import believed_by, place_scan
 from worker.pipeline.registration import bev_correlation
+from worker.pipeline.registration.diagnosis import Diagnosis
+from worker.pipeline.registration.hypothesis import Hypothesis
 from worker.pipeline.registration.icp import NormalEquations, normal_equations
 from worker.pipeline.registration.preprocessing import PreparedScan, prepare
 from worker.pipeline.registration.refinement import CoarsePose, by_score
@@ -111,6 +117,76 @@ def read_and_prepare(task: PrepareTask) -> tuple[int, ValidScan | ScanError | Sc
     prepared.save(task.folder.path(task.index))
     prior = task.file.prior(scan.sensor_pose)
     return task.index, ValidScan(points=downsample(prepared.surface.points), prior=prior)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class PlaceTask:
+    """One scan to be placed in a map that lies beside it."""
+
+    folder: Folder
+    map_index: int
+    index: int
+    prior: Matrix4 | None  #: map_from_scan
+    settings: JointRegistrationSettings
+
+    def run(self, place: Place, *, tick: Callable[[], None] = lambda: None) -> PlacedScan | ScanRejected:
+        """Return the scan's place in the map, or why it has none."""
+        try:
+            return place_scan(
+                self.folder.load(self.index),
+                place,
+                prior=self.prior,
+                registration=self.settings.registration,
+                placement=self.settings.placement,
+                tick=tick,
+            )
+        except ScanRejected as error:
+            return error
+
+
+def place_one(task: PlaceTask) -> tuple[int, PlacedScan | ScanRejected]:
+    """Place a scan in the map that lies beside it; return its index with the result."""
+    return task.index, task.run(_place_of(task.folder, task.map_index))
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ExplainTask:
+    """One scan that found no place, to find out why."""
+
+    folder: Folder
+    map_index: int
+    index: int
+    file: ScanFile
+    hypotheses: tuple[Hypothesis, ...]
+    settings: JointRegistrationSettings
+
+    def run(self, place: Place, *, tick: Callable[[], None] = lambda: None) -> Diagnosis | None:
+        """Return the explanation that holds; None where none does. The file is read again, for the order of points."""
+        settings = self.settings
+        prepared = self.folder.load(self.index) if self.hypotheses else None
+        case = Refused(
+            scan=self.file.read(max_points=settings.max_points),
+            prepared=prepared,
+            hypotheses=self.hypotheses,
+            target=place.surface,
+            settings=settings.registration,
+            prepare=functools.partial(prepare, settings=settings.registration, with_sights=True),
+            believed=believed_by(place),
+            max_searches=settings.placement.max_searches if self.hypotheses else 0,
+            tick=tick,
+        )
+        return diagnose(case)
+
+
+def explain_one(task: ExplainTask) -> tuple[int, Diagnosis | None]:
+    """Explain why a scan has no place in the map that lies beside it; return its index with the explanation."""
+    return task.index, task.run(_place_of(task.folder, task.map_index))
+
+
+@functools.lru_cache(maxsize=2)
+def _place_of(folder: Folder, map_index: int) -> Place:
+    laid = folder.load(map_index)
+    return Place(surface=laid.surface, sights=laid.sights)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -7,7 +7,7 @@ win against its rivals; a prior breaks ties, and never lowers the bar.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
@@ -15,17 +15,14 @@ import numpy as np
 
 from worker.cloud.poses import difference, skew
 from worker.cloud.types import Floats, Matrix4
-from worker.pipeline.placement.belief import confidence, log_odds, odds_of
+from worker.pipeline.placement.belief import log_odds, odds_of
 from worker.pipeline.placement.contradictions import (
-    BUILDING,
-    THINGS,
-    Contradictions,
-    Held,
     Place,
     contradictions,
     counted,
     held_both_ways,
 )
+from worker.pipeline.placement.placed_scan import NotPlaced, PlacedScan, other_place
 from worker.pipeline.placement.scale import estimate_scale
 from worker.pipeline.placement.settings import PlacementSettings
 from worker.pipeline.placement.variants import up_axis
@@ -61,47 +58,10 @@ _APART = (0.3, 0.17)  # metres, radians: poses nearer to each other are one
 _SCALE_SIGMAS = 4.0  # that a scale has to be off to be told
 _UP = 3  # the number of z among the axes
 _WEAK = 1.8  # times the best held direction's error, from which on the pose may have slid along another
+_FREE = 20.0  # likewise, from which on nothing there can tell one pose from another
 _SLIDE = 0.2  # metres, that it is pushed to either side
 _SLID = 0.04  # metres; what comes to rest nearer than this has come back
 _SLIDE_DISTANCE, _SLIDE_ITERATIONS, _SLIDE_POINTS = 0.1, 15, 2500  # metres; of the ICP that tells
-
-
-class NotPlaced(ScanRejected):
-    """A scan that was looked for everywhere and has no place; the poses that came nearest stand beside the reason."""
-
-    def __init__(self, refused: ScanRejected | Diagnosis, hypotheses: Sequence[Hypothesis] = ()) -> None:
-        if isinstance(refused, ScanRejected):
-            fitness, inlier_rmse = refused.fitness, refused.inlier_rmse
-            super().__init__(refused.diagnosis, fitness=fitness, inlier_rmse=inlier_rmse)
-        else:  # as an exception is read that came from another process
-            super().__init__(refused)
-        self.hypotheses = tuple(hypotheses)  #: best first
-
-
-@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
-class PlacedScan:
-    """A pose of a scan with what speaks for it and against it."""
-
-    hypothesis: Hypothesis
-    told: Contradictions | None  #: None where no rays are known, of the scan or of the map
-    log_odds: float | None  #: None where both visits saw too little of each other
-    held: tuple[Held, Held] | None = None  #: the points behind it, both ways
-    warnings: tuple[Diagnosis, ...] = ()
-
-    @property
-    def pose(self) -> Matrix4:
-        """(4, 4) map_from_scan."""
-        return self.hypothesis.target_from_source
-
-    @property
-    def confidence(self) -> float | None:
-        """0..1, None as `log_odds` is."""
-        return None if self.log_odds is None else confidence(self.log_odds)
-
-    @property
-    def rank(self) -> tuple[float, float]:
-        """What poses of one scan are sorted by: the odds, then the score."""
-        return (-np.inf if self.log_odds is None else self.log_odds, self.hypothesis.score)
 
 
 def place_scan(
@@ -204,7 +164,7 @@ class _Search:
 
     def _require_handed(self, hypothesis: Hypothesis) -> None:
         """Raise ScanRejected where the mirror image of the scan lies better on the map than the scan itself."""
-        image = replace(self._free, source=reflected(self.scan.surface))
+        image = replace(self._free, source=self.scan.surface.reflected())
         starts = bev_candidates(image.source, image.target, count=_BEV_CANDIDATES)
         coarse = by_score(coarse_alignment(image.source, image.target, start) for start in starts)
         found = [image.from_start(pose.target_from_source).score for pose in coarse[:_MIRRORED]]
@@ -434,48 +394,13 @@ class _Search:
         return self._told(self._free.final(placed.hypothesis))
 
 
-def other_place(name: str, placed: PlacedScan) -> ScanRejected:
-    """Return the error of a scan that rays contradict at its best pose."""
-    numbers = numbers_of(placed)
-    return rejected(
-        name,
-        placed.hypothesis,
-        "other_place",
-        f"it fits the map's surfaces, but rays went through {numbers['building_seen_through']:.1%} of the walls, "
-        f"floor and ceiling and {numbers['things_seen_through']:.0%} of the things that both visits looked at "
-        f"(confidence {placed.confidence or 0.0:.2f}); it is of another place, or too much has changed",
-        **numbers,
-    )
-
-
-def reflected(surface: Surface) -> Surface:
-    """Return the mirror image, x negated, to be moved."""
-    flip = np.array([-1.0, 1.0, 1.0])
-    return Surface.of(surface.points * flip, surface.normals * flip, surface.oriented)
-
-
-def numbers_of(placed: PlacedScan) -> dict[str, float]:
-    """Return what diagnoses tell of a pose: shares contradicted and the confidence, 0..1, and how many things."""
-    told = placed.told
-    if told is None:
-        return {}
-    judged, through = told.judged.sum(axis=0), told.through.sum(axis=0)
-    numbers = {
-        "building_seen_through": float(through[BUILDING] / max(judged[BUILDING], 1)),
-        "things_seen_through": float(through[THINGS] / max(judged[THINGS], 1)),
-        "things_that_agree": float(told.things[:, 0].sum()),
-        "things_denied": float(told.things[:, 1].sum()),
-    }
-    return numbers if placed.confidence is None else {**numbers, "confidence": placed.confidence}
-
-
 def _same(a: Matrix4, b: Matrix4) -> bool:
     metres, radians = difference(a, b)
     return metres < _APART[0] and radians < _APART[1]
 
 
 def _weak_direction(source: Surface, target: Surface, pose: Matrix4) -> Floats | None:
-    """Return the unit vector (3,) along which the sensor's place is held worst, None where that is about as well.
+    """Return the unit vector (3,) along which the sensor's place is held worst; None where as well, or not at all.
 
     A corridor holds a scan along itself by what stands there alone; ICP may stop a decimetre off.
     """
@@ -483,4 +408,5 @@ def _weak_direction(source: Surface, target: Surface, pose: Matrix4) -> Floats |
     information = equations.information + 1e-6 * np.trace(equations.information) * np.eye(6)
     arm = np.hstack([-skew(pose[:3, 3]), np.eye(3)])
     variances, directions = np.linalg.eigh(arm @ np.linalg.inv(information) @ arm.T)
-    return directions[:, -1] if np.sqrt(variances[-1] / variances[0]) > _WEAK else None
+    weakness = np.sqrt(variances[-1] / variances[0])
+    return directions[:, -1] if _WEAK < weakness < _FREE else None

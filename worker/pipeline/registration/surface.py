@@ -40,6 +40,11 @@ class Surface:
             points=self.points[rows], normals=self.normals[rows], oriented=self.oriented[rows], tree=self.tree
         )
 
+    def reflected(self) -> Surface:
+        """Return the mirror image: x negated."""
+        flip = np.array([-1.0, 1.0, 1.0])
+        return Surface.of(self.points * flip, self.normals * flip, self.oriented)
+
     def nearest(self, points: Floats, *, within: float = np.inf) -> tuple[Floats, NDArray[np.intp]]:
         """Return distance (N,) in metres and index (N,) of the nearest point; inf and M where none is near enough."""
         threads = query_threads() if len(points) > _WORTH_A_THREAD else 1

@@ -10,7 +10,8 @@ from tests.worker.pipeline.placement.conftest import prepared
 from worker.cloud.poses import difference, exponential
 from worker.cloud.types import Matrix4
 from worker.pipeline.placement.contradictions import Place
-from worker.pipeline.placement.scan_placement import PlacedScan, place_scan
+from worker.pipeline.placement.placed_scan import PlacedScan
+from worker.pipeline.placement.scan_placement import place_scan
 from worker.pipeline.placement.settings import PlacementSettings
 from worker.pipeline.registration.preprocessing import PreparedScan, prepare
 from worker.pipeline.registration.results import ScanRejected
