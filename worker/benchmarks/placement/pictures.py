@@ -118,7 +118,7 @@ def impostor_figure(
         axes.plot(shown[:, 0], shown[:, 1], ".", color=color, markersize=size, markeredgewidth=0)
     axes.plot(origin[0], origin[1], "^", color=INK, markersize=7)
     plots.entitle(axes, f"{title}\n{_said(said)}")
-    figure.legend(handles=_legend(held), loc="outside lower center", ncols=2, fontsize=8, frameon=False)
+    figure.legend(handles=_legend(held), loc="outside lower center", ncols=1, fontsize=8, frameon=False)
     return figure
 
 
