@@ -61,7 +61,7 @@ class PlacementRequest(Request):
     scale: Annotated[
         Literal["warn", "refuse"] | None,
         Field(
-            description="what becomes of a scan whose lengths are off by more than 0.7%; from 1.5% on it is left out"
+            description="what becomes of a scan whose lengths are off by more than 0.6%; from 1.25% on it is left out"
         ),
     ] = None
 

@@ -53,6 +53,7 @@ _BEV_CANDIDATES, _NEAR_PRIOR = (
 _BEST_CANDIDATES = 4  # of those that get a full ICP
 _RIVAL = 0.93  # of the best coarse score, from which on another candidate is refined as well
 _MIRRORED = 2  # candidates of the mirror image that get a full ICP
+_HANDED = 1.1  # times the score of the scan that its mirror image has to have: a bare corridor is its own
 _WORTH = 0.3  # coarse score of an FPFH candidate that gets a full ICP; right ones have 0.5 and more
 _APART = (0.3, 0.17)  # metres, radians: poses nearer to each other are one
 _SCALE_SIGMAS = 4.0  # that a scale has to be off to be told
@@ -137,6 +138,8 @@ class _Search:
         if not self._is_clear():
             self._everywhere()
         chosen = self._chosen()
+        if self.prior is None and (self.scan.sights is None or self.place.sights is None):
+            self._require_handed(chosen.hypothesis)
         source, target = self.scan.surface, self.place.surface
         require_constrained(self.scan.name, source, target, chosen.hypothesis, self.registration)
         around = replace(self._free.narrow(), prior=chosen.pose, tick=lambda: None)
@@ -159,16 +162,20 @@ class _Search:
         hypothesis = register(
             self.scan, self.place.surface, prior=self.prior, settings=self.registration, tick=self.tick
         )
-        self._require_handed(hypothesis)
+        if self.prior is None:
+            self._require_handed(hypothesis)
         return self._measured(PlacedScan(hypothesis=hypothesis, told=None, log_odds=None))
 
     def _require_handed(self, hypothesis: Hypothesis) -> None:
         """Raise ScanRejected where the mirror image of the scan lies better on the map than the scan itself."""
         image = replace(self._free, source=self.scan.surface.reflected())
         starts = bev_candidates(image.source, image.target, count=_BEV_CANDIDATES)
+        if not starts:  # no walls whose seen side is known
+            resolutions = self.registration.search_resolutions
+            starts = list(fpfh_candidates(image.source, image.target, resolutions=resolutions, seeds=1))
         coarse = by_score(coarse_alignment(image.source, image.target, start) for start in starts)
         found = [image.from_start(pose.target_from_source).score for pose in coarse[:_MIRRORED]]
-        if max(found, default=0.0) > hypothesis.score:
+        if max(found, default=0.0) > _HANDED * hypothesis.score:
             raise rejected(
                 self.scan.name,
                 hypothesis,
@@ -201,7 +208,8 @@ class _Search:
             (itself,) = self._coarse([best])
             self._refine_best(quarter_turns(self.scan.surface, best), least=_RIVAL * itself.score)
         if not self._is_clear():
-            self._refine_features(thoroughly=not any(map(self._is_accepted, self.found)))
+            thoroughly = not any(map(self._is_accepted, self.found))
+            self._refine_features(thoroughly=thoroughly, alone=not starts)
 
     def _refine_best(self, starts: Iterator[Matrix4] | list[Matrix4], *, least: float = 0.0) -> None:
         """Refine the best starts; once a pose is clear, only those that come near it in coarse alignment."""
@@ -214,10 +222,15 @@ class _Search:
     def _coarse(self, starts: Iterator[Matrix4] | list[Matrix4]) -> list[CoarsePose]:
         return by_score(coarse_alignment(self.scan.surface, self.place.surface, start) for start in starts)
 
-    def _refine_features(self, *, thoroughly: bool) -> None:
-        """Try what local features name: one draw, or one at each of two resolutions where surfaces refuse all so far."""
-        resolutions = self.registration.search_resolutions[: 2 if thoroughly else 1]
-        for pose in fpfh_candidates(self.scan.surface, self.place.surface, resolutions=resolutions, seeds=1):
+    def _refine_features(self, *, thoroughly: bool, alone: bool) -> None:
+        """Try what local features name: one draw, two where surfaces refuse all so far, all where nothing else does."""
+        resolutions = self.registration.search_resolutions
+        if not alone:
+            resolutions = resolutions[: 2 if thoroughly else 1]
+        seeds = self.registration.search_seeds if alone else 1
+        for pose in fpfh_candidates(
+            self.scan.surface, self.place.surface, resolutions=resolutions, seeds=seeds
+        ):
             (coarse,) = self._coarse([pose])
             if coarse.score >= _WORTH and not self._is_known(coarse.target_from_source):
                 self._note(self._free.from_start(coarse.target_from_source))
@@ -270,7 +283,8 @@ class _Search:
         return placed.log_odds is not None and placed.log_odds >= odds_of(CLEAR)
 
     def _is_known(self, pose: Matrix4) -> bool:
-        return any(_same(placed.pose, pose) for placed in self.found)
+        """Tell whether a pose that fits was found there; where ICP got stuck, another start may do better."""
+        return any(_same(placed.pose, pose) for placed in self.found if self._is_accepted(placed))
 
     def _is_near_prior(self, pose: Matrix4) -> bool:
         return replace(self._free, prior=self.prior).is_near_prior(pose)

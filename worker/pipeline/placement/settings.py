@@ -33,7 +33,7 @@ class PlacementSettings(StrictModel):
         0.006, gt=0, lt=1, description="of a scan against the map, that is not told"
     )
     refused_scale_error: float = Field(
-        0.018,
+        0.0125,
         gt=0,
         lt=1,
         description="of a scan against the map, from which on it is left out whatever `scale` says",
