@@ -176,6 +176,22 @@ def test_a_scan_that_the_others_would_have_elsewhere_is_left_out_and_named(folde
         assert off(registered(outcome).map_from_scan, np.eye(4)) < 0.03
 
 
+def test_of_two_scans_that_disagree_and_are_believed_alike_both_are_left_out_and_named(folder: Path) -> None:
+    stays = {"min_eigenvalue": 0.0, "coarse_distances": (), "max_iterations": 2}
+    lenient = joint_settings(PRIORS_ONLY.registration.model_copy(update=stays))
+    bare = Voxels.of(corridor_points(ends=False, seed=9, half=8.0), size=0.05, origin=np.zeros(3))
+    target = surface_of(bare, lenient.registration)
+    files = []
+    for number, off_by in enumerate((0.0, 0.13)):
+        path = folder / f"tie-{number}.pcd"
+        write_pcd(path, corridor_points(ends=True, seed=number))
+        files.append(ScanFile(name=path.name, path=path, pose=shifted(off_by)))
+    outcomes = register(files, target, lenient)
+    assert [outcome.registration for outcome in outcomes] == [None, None]
+    assert all(outcome.diagnosis and outcome.diagnosis.reason == "disagrees" for outcome in outcomes)
+    assert all(file.name in str(outcome.reason) for file, outcome in zip(files, outcomes, strict=True))
+
+
 def test_a_foreign_scan_is_left_out_and_moves_no_other(
     room: Room, files: tuple[ScanFile, ...], folder: Path
 ) -> None:
