@@ -89,22 +89,28 @@ def test_without_any_rays_nothing_is_said(room: Room, right: PreparedScan) -> No
     assert log_odds(told) is None
 
 
-def test_walls_floor_and_ceiling_are_the_building_and_a_table_is_a_thing() -> None:
+def test_walls_floor_and_lamps_are_the_building_and_a_table_is_a_thing() -> None:
     across, up = (axis.ravel() for axis in np.meshgrid(np.arange(0, 4, 0.05), np.arange(0, 2.5, 0.05)))
     wall = np.column_stack([across, np.zeros_like(across), up])
     top = np.array([[x, y, 0.7] for x in np.arange(1, 2, 0.05) for y in np.arange(1, 2, 0.05)])
     front = np.array([[x, 1.0, z] for x in np.arange(1, 2, 0.05) for z in np.arange(0.2, 0.7, 0.05)])
-    points = np.concatenate([wall, top, front])
+    floor = np.array([[x, y, 0.02] for x in np.arange(0, 4, 0.1) for y in np.arange(0.1, 3, 0.1)])
+    lamp = np.array([[x, 2.0, 2.2] for x in np.arange(1, 2, 0.05)])
+    points = np.concatenate([wall, floor, lamp, top, front])
     normals = np.concatenate(
         [
             np.tile([0.0, 1.0, 0.0], (len(wall), 1)),
+            np.tile([0.0, 0.0, 1.0], (len(floor), 1)),
+            np.tile([0.0, 0.0, -1.0], (len(lamp), 1)),
             np.tile([0.0, 0.0, 1.0], (len(top), 1)),
             np.tile([0.0, -1.0, 0.0], (len(front), 1)),
         ]
     )
     building = building_of(points, normals)
+    things = len(top) + len(front)
     assert building[: len(wall)].mean() > 0.95
-    assert not building[len(wall) :].any()
+    assert building[len(wall) : -things].all()
+    assert not building[-things:].any()
 
 
 def test_shares_grow_with_what_speaks_against_a_pose_and_few_points_prove_little() -> None:
