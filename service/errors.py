@@ -8,7 +8,14 @@ ServiceError
 ├── ScanUnreadable       scan_unreadable      an uploaded file that is neither PLY nor PCD
 ├── TooLarge             too_large            a body over the limit
 ├── WrongMediaType       wrong_media_type     neither a scan nor JSON
-└── QueueUnavailable     queue_unavailable    Redis does not answer; nothing was recorded
+├── DiskFull             disk_full            less space than the reserve is left, or none
+├── QueueFull            queue_full           as many jobs wait as may
+├── Unauthorized         unauthorized         no API key, or one that is not known
+├── Forbidden            forbidden            the key, the host or the origin of the request may not do this
+└── Unavailable          unavailable          a part that is needed does not answer; try again
+    ├── QueueUnavailable       queue_unavailable        Redis
+    ├── DatabaseUnavailable    database_unavailable     the database, or its lock was not to be had in time
+    └── BlobsUnavailable       blobs_unavailable        the blob store
 """
 
 from __future__ import annotations
@@ -48,5 +55,33 @@ class WrongMediaType(ServiceError):
     code = "wrong_media_type"
 
 
-class QueueUnavailable(ServiceError):
+class DiskFull(ServiceError):
+    code = "disk_full"
+
+
+class QueueFull(ServiceError):
+    code = "queue_full"
+
+
+class Unauthorized(ServiceError):
+    code = "unauthorized"
+
+
+class Forbidden(ServiceError):
+    code = "forbidden"
+
+
+class Unavailable(ServiceError):
+    code = "unavailable"
+
+
+class QueueUnavailable(Unavailable):
     code = "queue_unavailable"
+
+
+class DatabaseUnavailable(Unavailable):
+    code = "database_unavailable"
+
+
+class BlobsUnavailable(Unavailable):
+    code = "blobs_unavailable"

@@ -370,10 +370,43 @@ class Job(Base):
     message: Mapped[str]
     progress: Mapped[int]
     problem: Mapped[dict[str, Any] | None]
-    attempts: Mapped[int] = mapped_column(server_default="0")
+    step: Mapped[str] = mapped_column(server_default="")  #: that is due or runs, see steps.py
+    attempts: Mapped[int] = mapped_column(server_default="0")  #: of this step, lost by its own fault
+    interruptions: Mapped[int] = mapped_column(server_default="0")  #: of this step, from outside
+    due: Mapped[datetime | None]  #: since when, or from when on, the step may begin
+    begun: Mapped[datetime | None]  #: when a worker began the step; None while it waits
+    owner: Mapped[str | None]  #: who shares the workers with others: a device
     created: Mapped[datetime]
     started: Mapped[datetime | None]
     finished: Mapped[datetime | None]
     updated: Mapped[datetime]
 
     __table_args__ = (Index(None, "created", "id"),)
+
+
+class Key(Base):
+    """An API key; of its secret only the digest is kept."""
+
+    __tablename__ = "keys"
+
+    key_id: Mapped[str] = mapped_column("id", primary_key=True)
+    name: Mapped[str]
+    digest: Mapped[str]  #: SHA-256 of the secret, hexadecimal
+    scopes: Mapped[list[str]]
+    maps: Mapped[list[str] | None]  #: ids of the maps that it is bound to; None: all
+    created: Mapped[datetime]
+    expires: Mapped[datetime | None]
+    revoked: Mapped[datetime | None]
+
+    __table_args__ = (Index("ix_keys_digest", "digest", unique=True),)
+
+
+class Tally(Base):
+    """A count and a sum under a name and labels, for metrics that outlive processes."""
+
+    __tablename__ = "tallies"
+
+    name: Mapped[str] = mapped_column(primary_key=True)
+    labels: Mapped[str] = mapped_column(primary_key=True)  #: JSON object, keys in order
+    count: Mapped[int] = mapped_column(BigInteger)
+    total: Mapped[float]
