@@ -139,7 +139,8 @@ def add_handlers(app: FastAPI) -> None:
 
 def _service_error(_request: Request, error: Exception) -> Response:
     code = error.code if isinstance(error, ServiceError) and error.code in PROBLEMS else "internal"
-    return response(code, str(error))
+    headers = {"WWW-Authenticate": 'Bearer realm="spicd"'} if code == "unauthorized" else None  # RFC 6750, 3
+    return response(code, str(error), headers=headers)
 
 
 def _invalid(_request: Request, error: Exception) -> Response:
