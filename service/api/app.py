@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 from collections.abc import AsyncIterator
 from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
 from typing import Any
 
 from fastapi import Depends, FastAPI
@@ -40,6 +42,8 @@ and `GET /jobs/{id}` says how far it is.
 Every error is a problem document (RFC 9457) with a stable `type`.
 """
 
+
+_SWEEP_EVERY_S = 600.0
 
 #: What FastAPI does not see, for it is read or written by hand: bodies of requests, problems, features.
 UNSEEN: dict[JsonSchemaMode, tuple[type[BaseModel], ...]] = {
@@ -120,7 +124,7 @@ def _lifespan(settings: Settings, queue: Queue | None) -> Any:
             raise ValueError("no SPICD_REDIS_URL: `spicd up` starts an embedded server and sets it")
         used = queue or JobQueue(settings.redis_url or "", timeout_s=settings.job_timeout_s)
         catalog = await run_in_threadpool(open_catalog, settings)
-        await run_in_threadpool(sweep, settings.data_dir / INCOMING)
+        sweeping = asyncio.create_task(_sweep(settings.data_dir / INCOMING))
         app.state.services = Services(
             settings=settings, catalog=catalog, queue=used, cards=Cards(settings.model_store, catalog.models)
         )
@@ -128,9 +132,17 @@ def _lifespan(settings: Settings, queue: Queue | None) -> Any:
         try:
             yield
         finally:
+            sweeping.cancel()
             catalog.close()
 
     return lifespan
+
+
+async def _sweep(incoming: Path) -> None:
+    """Remove what uploads of killed processes left, now and from time to time."""
+    while True:
+        await run_in_threadpool(sweep, incoming)
+        await asyncio.sleep(_SWEEP_EVERY_S)
 
 
 def _version() -> str:

@@ -29,6 +29,7 @@ from service.catalog.keys import open_keys
 from service.queue import JobQueue
 from service.settings import Settings
 from service.up.children import WorkerPool
+from service.up.connections import Limits, limited_protocol, limits_of
 from service.up.embedded_redis import EmbeddedRedis, LaunchFailed
 
 log = logging.getLogger("spicd")
@@ -75,6 +76,7 @@ def up(
         if settings.redis_url is None:
             redis = stack.enter_context(EmbeddedRedis(settings.data_dir / "redis"))
             sweep_scratch(settings.scratch_dir())  # the folder is ours alone now
+            sweep_scratch(settings.data_dir / "incoming")
             _release_claims(redis)
         settings = _resolve(settings, redis, listening)
         _migrate(settings)
@@ -86,7 +88,7 @@ def up(
         )
         stack.enter_context(pool)
         stop.then = pool.kill
-        api = stack.enter_context(_serve((create_app or _app)(settings), listening))
+        api = stack.enter_context(_serve((create_app or _app)(settings), listening, limits_of(settings)))
         on_ready(_running(settings, redis, pool))
         while not stop.asked:
             pool.check()
@@ -101,7 +103,10 @@ def up(
 def sweep_scratch(folder: Path) -> None:
     """Remove what steps left that were killed; only while no worker runs on this folder."""
     for left in folder.iterdir() if folder.is_dir() else ():
-        shutil.rmtree(left, ignore_errors=True)
+        if left.is_dir():
+            shutil.rmtree(left, ignore_errors=True)
+        else:
+            left.unlink(missing_ok=True)
 
 
 def _release_claims(redis: EmbeddedRedis) -> None:
@@ -158,9 +163,17 @@ def _listen(host: str, port: int) -> Iterator[socket.socket]:
 
 
 @contextmanager
-def _serve(app: FastAPI, listening: socket.socket) -> Iterator[threading.Thread]:
+def _serve(app: FastAPI, listening: socket.socket, limits: Limits) -> Iterator[threading.Thread]:
     """Serve the API in a thread, from its first answer on."""
-    config = uvicorn.Config(app, log_config=None, access_log=False, timeout_graceful_shutdown=2)
+    config = uvicorn.Config(
+        app,
+        http=limited_protocol(limits),
+        ws="none",
+        log_config=None,
+        access_log=False,
+        server_header=False,
+        timeout_graceful_shutdown=2,
+    )
     server = uvicorn.Server(config)
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listening]}, name="api", daemon=True)
     thread.start()
