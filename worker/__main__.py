@@ -6,6 +6,7 @@ import argparse
 import contextlib
 import importlib
 import logging
+import os
 import sys
 
 from redis import Redis
@@ -15,6 +16,7 @@ from service.catalog.jobs import Jobs
 from service.catalog.records import Problem
 from service.catalog.steps import ALLOWED_FUNCTIONS
 from service.logs import set_up_logging
+from service.permissions import PRIVATE_UMASK
 from service.settings import Settings
 from service.up.lifetime import end_with_parent
 from worker.rq_workers import GeometryWorker, InferenceWorker
@@ -32,6 +34,7 @@ def main(arguments: list[str] | None = None) -> int:
     options = _parse(arguments)
     if options.parent:
         end_with_parent(options.parent)
+    os.umask(PRIVATE_UMASK)
     settings = Settings()
     set_up_logging(settings.log_level)
     if settings.redis_url is None:

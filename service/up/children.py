@@ -87,7 +87,8 @@ class WorkerPool:
 
     def _start(self, worker: WorkerProcess) -> None:
         options = ["--parent", str(os.getpid()), "--grace", str(GRACE_S)]
-        worker.process = subprocess.Popen(
+        # our own program, and a list: no shell reads it
+        worker.process = subprocess.Popen(  # noqa: S603  # nosec B603
             [*self._program, worker.queue, *options],
             env=self._environment,
             stdin=subprocess.DEVNULL,

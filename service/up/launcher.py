@@ -7,6 +7,7 @@ process and end with it, also when it is killed.
 from __future__ import annotations
 
 import importlib.util
+import ipaddress
 import json
 import logging
 import os
@@ -26,6 +27,7 @@ from fastapi import FastAPI
 
 from service.catalog.database import Database
 from service.catalog.keys import open_keys
+from service.permissions import make_private, private_files
 from service.queue import JobQueue
 from service.settings import Settings
 from service.up.children import WorkerPool
@@ -71,8 +73,10 @@ def up(
     _require_worker_packages(settings)
     with ExitStack() as stack:
         stop = stack.enter_context(_Signals())
+        stack.enter_context(private_files())
         listening = stack.enter_context(_listen(settings.host, settings.port))
         redis = None
+        _make_private(settings.data_dir)
         if settings.redis_url is None:
             redis = stack.enter_context(EmbeddedRedis(settings.data_dir / "redis"))
             sweep_scratch(settings.scratch_dir())  # the folder is ours alone now
@@ -98,6 +102,15 @@ def up(
             if not api.is_alive():
                 raise LaunchFailed("the API ended by itself; the log says why")
             time.sleep(_LOOK_S)
+
+
+def _make_private(data_dir: Path) -> None:
+    try:
+        make_private(data_dir)
+    except OSError as error:
+        raise LaunchFailed(
+            f"the data folder {data_dir} cannot be used ({error.strerror}); name another with SPICD_DATA_DIR"
+        ) from error
 
 
 def sweep_scratch(folder: Path) -> None:
@@ -244,8 +257,7 @@ def _require_a_key(settings: Settings) -> None:
 
 
 def _running(settings: Settings, redis: EmbeddedRedis | None, pool: WorkerPool) -> Running:
-    wildcard = {"0.0.0.0": "127.0.0.1", "::": "[::1]"}  # what a browser can open
-    host = wildcard.get(settings.host) or (f"[{settings.host}]" if ":" in settings.host else settings.host)
+    host = _reachable(settings.host)
     url = f"http://{host}:{settings.port}"
     return Running(
         url=url,
@@ -256,3 +268,14 @@ def _running(settings: Settings, redis: EmbeddedRedis | None, pool: WorkerPool) 
         redis_pid=redis.pid if redis else None,
         workers=[{"queue": worker.queue, "pid": worker.pid} for worker in pool.workers],
     )
+
+
+def _reachable(host: str) -> str:
+    """Return the address that was listened on as a browser can open it."""
+    try:
+        address = ipaddress.ip_address(host)
+    except ValueError:
+        return host
+    if address.is_unspecified:
+        return "127.0.0.1" if address.version == 4 else "[::1]"
+    return host if address.version == 4 else f"[{host}]"

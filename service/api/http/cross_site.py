@@ -26,7 +26,6 @@ SAFE_METHODS = frozenset(
 )  #: change nothing (RFC 9110, Section 9.2.1), here as well
 EXPOSED_HEADERS = ("Location", "Content-Disposition", "ETag", "Retry-After", "WWW-Authenticate")
 _HOST = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[^\s:\[\]/@]+)(?::\d*)?")
-_WILDCARDS = frozenset({"0.0.0.0", "::", ""})
 
 
 def add_cross_site_checks(app: FastAPI, settings: Settings) -> None:
@@ -52,7 +51,7 @@ def allowed_hosts(settings: Settings) -> frozenset[str] | None:
         return None if "*" in named else frozenset(named)
     if settings.requires_key():
         return None
-    return frozenset({"localhost", socket.gethostname().lower(), settings.host.lower()}) - _WILDCARDS
+    return frozenset({"localhost", socket.gethostname().lower(), settings.host.lower()})
 
 
 class CrossSiteMiddleware:
