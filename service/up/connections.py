@@ -5,7 +5,7 @@ connection (as mod_reqtimeout has them for Apache, `client_header_timeout` and `
 
 | state | limit |
 | --- | --- |
-| waiting for a request's header | `header_s` in all, however slowly it comes |
+| waiting for a request's header | `header_s` in all, however slowly it comes, and `header_bytes` |
 | receiving a body | `body_bytes` in each `body_window_s`: a robot with bad Wi-Fi passes, a byte a second does not |
 | answered, and the client still sends | `linger_s` |
 | sending an answer that nobody reads | `write_s` until the buffer has room again |
@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import re
 import socket
 import time
 from collections.abc import Callable
@@ -31,6 +32,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 from service.settings import Settings
 
 log = logging.getLogger("spicd")
+_END_OF_HEADER = re.compile(rb"\n\r?\n")
 _WARN_EVERY_S = 60.0
 _warned = [-_WARN_EVERY_S]  #: when the log was told last, monotonic seconds
 
@@ -41,6 +43,7 @@ class Limits:
 
     connections: int = 400
     header_s: float = 10.0
+    header_bytes: int = 16 * 1024
     body_window_s: float = 60.0
     body_bytes: int = (
         32 * 1024
@@ -76,6 +79,9 @@ class LimitedProtocol(H11Protocol):
     def data_received(self, data: bytes) -> None:
         """Take what came, and look which clock has to run now."""
         self._window_bytes += len(data)
+        if self.conn.their_state is h11.IDLE and self._is_too_long(data):
+            self._refuse(b"431 Request Header Fields Too Large")
+            return
         super().data_received(data)
         self._look(received=True)
 
@@ -121,6 +127,12 @@ class LimitedProtocol(H11Protocol):
             self._wait_for_header()  # an empty line alone begins a request as well
         else:
             self._stop()  # the request is here, and it is for the app to answer; or it was answered
+
+    def _is_too_long(self, data: bytes) -> bool:
+        """Tell whether a header goes on behind `header_bytes`; h11 looks only where it has not ended yet."""
+        begun = self.conn.trailing_data[0] + data[: self.limits.header_bytes]
+        longest = self.limits.header_bytes
+        return len(begun) >= longest and _END_OF_HEADER.search(begun, 0, longest) is None
 
     def _wait_for_header(self) -> None:
         self._run("header", self.limits.header_s, self._refuse)

@@ -190,7 +190,7 @@ def _disconnected(_request: Request, _error: Exception) -> Response:
 
 def _unexpected(request: Request, error: Exception) -> Response:
     instance = uuid4().urn
-    log.error("%s %s failed, %s", request.method, request.url.path, instance, exc_info=error)
+    log.error("%s %r failed, %s", request.method, request.url.path, instance, exc_info=error)
     return response(
         "internal",
         "the service failed on this request; its log says why under this instance",
