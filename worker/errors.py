@@ -10,7 +10,8 @@ PipelineError
 ├── ProcessLost              process_lost           a process that shared the work ended without a word (often: no memory)
 ├── NoSpaceLeft              disk_full              the disk is full; the step can be run again
 ├── DetectorUnavailable      detector_unavailable   no such model, or its files do not match its card
-└── Cancelled                cancelled              somebody dismissed the job
+└── Cancelled                cancelled              somebody dismissed the job, or another worker has the step
+    └── GaveWay              cancelled              the step goes on later: others go first
 """
 
 from __future__ import annotations
@@ -56,6 +57,10 @@ class DetectorUnavailable(PipelineError):
 
 class Cancelled(PipelineError):
     code = "cancelled"
+
+
+class GaveWay(Cancelled):
+    """Not an error: what was done is kept, and the step is run again."""
 
 
 class NoSpaceLeft(PipelineError):
