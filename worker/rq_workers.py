@@ -28,8 +28,10 @@ from rq.serializers import JSONSerializer
 from rq.timeouts import JobTimeoutException
 from rq.worker.base import BaseWorker
 
+from service.settings import Settings
 from service.up.lifetime import end_with_parent
 from worker.errors import PipelineError
+from worker.memory import limit_memory
 from worker.rq_jobs import FunctionRefused, StepJob, step_job
 
 log = logging.getLogger("worker")
@@ -148,6 +150,7 @@ class GeometryWorker(_StepWorker, Worker):  # type: ignore[misc]
     def main_work_horse(self, job: StepJob, queue: Queue) -> None:
         """Run the step in the forked process, which ends with the worker, whatever ends that."""
         end_with_parent(self.pid)
+        limit_memory(Settings().step_memory_bytes)
         super().main_work_horse(job, queue)
 
     def kill_horse(self, sig: signal.Signals = signal.SIGKILL) -> None:

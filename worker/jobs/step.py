@@ -16,6 +16,7 @@ from service.catalog.records import JobRecord, Problem
 from service.catalog.steps import JobKind
 from service.settings import Settings
 from worker.errors import Cancelled, PipelineError
+from worker.memory import as_out_of_memory
 from worker.reporting import Reporter
 
 log = logging.getLogger("worker.jobs")
@@ -87,7 +88,8 @@ def step(run: Callable[[Context], None]) -> Callable[[str], None]:
                 lambda stage, share: catalog.jobs.report(job_id, message=stage, progress=share),
             )
             try:
-                run(Context(settings=settings, catalog=catalog, job=job, report=report, scratch=scratch))
+                with as_out_of_memory(f"a step of job {job_id}"):
+                    run(Context(settings=settings, catalog=catalog, job=job, report=report, scratch=scratch))
             except Cancelled:
                 log.info("job %s was dismissed", job_id)
             except PipelineError as error:

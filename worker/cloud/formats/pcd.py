@@ -232,7 +232,7 @@ def _decompress(packed: memoryview, size: int) -> NDArray[np.uint8]:
     if size == 0:
         return unpacked
     try:
-        filled = len(imagecodecs.lzf_decode(packed, out=unpacked.data))
+        filled = len(imagecodecs.lzf_decode(packed, out=unpacked.data))  # type: ignore[arg-type]  # any buffer
     except imagecodecs.LzfError as error:
         raise ScanError(f"compressed data is damaged ({error}); upload it again") from None
     if filled != size:  # the decoder stops early without complaint
