@@ -107,7 +107,8 @@ def _pieces(raw: RawCloud) -> Iterator[slice]:
 
 def _positions(columns: Columns, rows: slice | NDArray[np.intp]) -> NDArray[np.floating[Any]]:
     """Return positions (K, 3) of some rows, in the file's type and this machine's byte order."""
-    positions = np.stack([columns[axis][rows] for axis in "xyz"], axis=1)
+    with np.errstate(invalid="ignore"):  # of a signalling NaN, which is no more than another one
+        positions = np.stack([columns[axis][rows] for axis in "xyz"], axis=1)
     return positions.astype(positions.dtype.newbyteorder("="), copy=False)
 
 
