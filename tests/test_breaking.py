@@ -9,13 +9,16 @@ import random
 import signal
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from tests.breaking import fuzz_api, fuzz_readers
+from tests.breaking import fuzz_api, fuzz_readers, load, soak
 from tests.breaking.fuzz_readers import Fuzz, declared_points, run_batch, what_is_wrong
-from tests.breaking.requests import Request
+from tests.breaking.requests import Request, Requests
 from tests.breaking.scan_mutations import N, samples
+from tests.support.footprints import Footprint, footprints
+from tests.support.traffic import throttled
 from worker.cloud.formats.scan import read_scan
 
 FILES, CASES = 3000, 600
@@ -48,7 +51,7 @@ def test_a_case_is_the_same_each_time() -> None:
     ("fault", "kind"),
     [
         (lambda: os.kill(os.getpid(), signal.SIGSEGV), "crash"),
-        (lambda: {}["missing"], "exception"),
+        (lambda: 1 / 0, "exception"),
         (lambda: time.sleep(1), "hang"),
         (lambda: mmap.mmap(-1, 3 * 1024**3, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS), "exception"),
     ],
@@ -82,7 +85,7 @@ def test_requests_of_every_kind_get_an_answer_that_the_document_names(tmp_path: 
 
 
 def test_an_answer_that_the_document_does_not_name_is_found() -> None:
-    document = {"paths": {"/maps": {"get": {"responses": {"200": {}, "503": {}}}}}}
+    document: dict[str, Any] = {"paths": {"/maps": {"get": {"responses": {"200": {}, "503": {}}}}}}
     problem = bytearray(b'{"type": "a", "title": "b", "detail": "c"}')
 
     def kinds(status: int | None, body: bytearray = problem, operation=("GET", "/maps")) -> list[str]:
@@ -98,10 +101,48 @@ def test_an_answer_that_the_document_does_not_name_is_found() -> None:
 
 
 def test_requests_are_the_same_for_the_same_seed() -> None:
-    document = {"paths": {"/maps/{map_id}": {"get": {"responses": {}}, "delete": {"responses": {}}}}}
+    document: dict[str, Any] = {
+        "paths": {"/maps/{map_id}": {"get": {"responses": {}}, "delete": {"responses": {}}}}
+    }
 
     def made() -> list[Request]:
-        requests = fuzz_api.Requests(document, {"map_id": ["lobby"]})
+        requests = Requests(document, {"map_id": ["lobby"]})
         return [requests.make(random.Random(i)) for i in range(100)]
 
     assert made() == made()
+
+
+def _samples(resident: list[float], *, files: int = 10, aside: int = 1) -> list[soak.Sample]:
+    taken = [Footprint(resident=int(1e6 * size), files=files, threads=4) for size in resident]
+    return [soak.Sample(30.0 * i, {"API and launcher": each}, aside) for i, each in enumerate(taken)]
+
+
+def test_growth_beyond_noise_is_told_and_noise_is_not() -> None:
+    rng = random.Random(1)
+    level = [200 + rng.uniform(-4, 4) for _ in range(60)]
+    assert soak.growth(_samples(level)) == []
+    assert soak.growth(_samples([100, 150, *level])) == []  # while it warms up
+    leaking = [size + i for i, size in enumerate(level)]
+    assert "API and launcher grew from" in soak.growth(_samples(leaking))[0]
+    assert abs(soak.slope(_samples(leaking), "API and launcher") - 120e6) < 20e6  # 1 MB in half a minute
+    assert "lie in scratch" in soak.growth(_samples(level, aside=9))[0]
+
+
+def test_a_client_is_throttled_to_its_rate() -> None:
+    begun = time.monotonic()
+    assert b"".join(throttled(b"a" * 50_000, 100_000)) == b"a" * 50_000
+    assert 0.3 < time.monotonic() - begun < 2
+
+
+def test_the_footprint_of_a_process_is_that_of_the_system() -> None:
+    taken = sum(footprints(os.getpid()).values(), Footprint(0, 0, 0, 0))
+    assert taken.processes >= 1
+    assert taken.resident > 10e6
+    assert taken.files >= 3
+    assert taken.threads >= 1
+
+
+def test_a_percentile_is_a_value_that_was_measured() -> None:
+    assert load.percentile([3.0, 1.0, 2.0], 50) == 2.0
+    assert load.percentile([float(i) for i in range(1, 201)], 99) == 198.0
+    assert load.percentile([5.0], 99) == 5.0
