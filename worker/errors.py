@@ -8,6 +8,7 @@ PipelineError
 ├── MapFailed                map_failed             nothing to tile, no point left
 ├── TrainingFailed           training_failed        a map too small to train on, a loss that is no number
 ├── ProcessLost              process_lost           a process that shared the work ended without a word (often: no memory)
+├── OutOfMemory          out_of_memory          the step would take more memory than it may
 ├── NoSpaceLeft              disk_full              the disk is full; the step can be run again
 ├── DetectorUnavailable      detector_unavailable   no such model, or its files do not match its card
 └── Cancelled                cancelled              somebody dismissed the job, or another worker has the step
@@ -49,6 +50,10 @@ class TrainingFailed(PipelineError):
 
 class ProcessLost(PipelineError):
     code = "process_lost"
+
+
+class OutOfMemory(PipelineError):
+    code = "out_of_memory"
 
 
 class DetectorUnavailable(PipelineError):

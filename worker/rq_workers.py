@@ -32,8 +32,10 @@ from rq.timeouts import JobTimeoutException, UnixSignalDeathPenalty
 from rq.utils import now
 from rq.worker.base import BaseWorker, WorkerStatus
 
+from service.settings import Settings
 from service.up.lifetime import end_with_parent
 from worker.errors import PipelineError
+from worker.memory import limit_memory
 from worker.rq_jobs import FunctionRefused, StepJob, step_job
 from worker.watch import Watch
 
@@ -237,6 +239,7 @@ class GeometryWorker(_StepWorker, Worker):  # type: ignore[misc]
         """Run the step in the forked process, which ends with the worker, whatever ends that."""
         try:
             end_with_parent(self.pid)
+            limit_memory(Settings().step_memory_bytes)
             random.seed()
             self.setup_work_horse_signals()
             self._is_horse = True

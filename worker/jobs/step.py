@@ -17,6 +17,7 @@ from service.catalog.steps import STEPS, JobKind, step_of
 from service.errors import NotFound, Unavailable, is_disk_full
 from service.settings import Settings
 from worker.errors import Cancelled, GaveWay, NoSpaceLeft, PipelineError
+from worker.memory import as_out_of_memory
 from worker.reporting import Reporter, Turn
 from worker.scratch import scratch_folder
 
@@ -89,7 +90,8 @@ def step(run: Callable[[Context], None]) -> Callable[[str], None]:
             try:
                 scratch = stack.enter_context(scratch_folder(folder, f"{job_id}-{begun.step}"))
                 report = _reporter(catalog, job, begun)
-                run(Context(settings=settings, catalog=catalog, job=job, report=report, scratch=scratch))
+                with as_out_of_memory(f"a step of job {job_id}"):
+                    run(Context(settings=settings, catalog=catalog, job=job, report=report, scratch=scratch))
                 catalog.jobs.advance(begun)
             except Exception as error:
                 _ended(catalog, begun, error)
