@@ -23,12 +23,13 @@ class Turn:
         self._others_wait, self._clock = others_wait, clock
         self._due = clock() + _TURN_S
 
-    def over(self) -> bool:
-        """Tell whether it is time; asks at most once a second."""
+    def check(self) -> None:
+        """Raise GaveWay when it is time; asks at most once a second. To be called where what was done is kept."""
         if self._clock() < self._due:
-            return False
+            return
         self._due = self._clock() + 1.0
-        return self._others_wait()
+        if self._others_wait():
+            raise GaveWay("others go first")
 
 
 class Reporter:
@@ -39,11 +40,11 @@ class Reporter:
         spans: Mapping[str, tuple[float, float]],
         write: Callable[[str, float], bool],
         *,
-        give_way: Mapping[str, Turn] | None = None,
+        give_way: Mapping[str, Callable[[], None]] | None = None,
     ) -> None:
         """Take of each stage its part of the job, 0..1; `write(stage, share)` says whether to go on.
 
-        `give_way` names the stages that keep what they did, and so may be left when their turn is over.
+        `give_way` names the stages that keep what they did, and what is called within them: it may raise GaveWay.
         """
         self._spans = spans
         self._write = write
@@ -59,5 +60,5 @@ class Reporter:
         begin, end = self._spans[stage]
         if not self._write(stage, begin + (end - begin) * share):
             raise Cancelled("the job was dismissed")
-        if 0 < share < 1 and stage in self._give_way and self._give_way[stage].over():
-            raise GaveWay("others go first")
+        if 0 < share < 1 and stage in self._give_way:
+            self._give_way[stage]()

@@ -13,6 +13,7 @@ from service.catalog import blob_keys
 from service.catalog.jobs import Jobs, Run
 from service.catalog.records import JobRecord, Placement, ScanRecord
 from service.catalog.steps import STEPS, JobKind
+from service.errors import DatabaseUnavailable
 from service.settings import Settings
 from tests.support.house import MAP, MODEL, OTHER_CUT, SAME_CUT, SEEN_TO, House, Material, run
 from worker import jobs
@@ -361,3 +362,36 @@ def test_the_steps_that_the_queue_names_are_those_of_the_worker() -> None:
     assert {step.function.removeprefix("worker.jobs.") for steps in STEPS.values() for step in steps} <= set(
         jobs.__all__
     )
+
+
+def test_a_build_gives_way_to_a_survey_and_goes_on_with_the_pairs_it_had(
+    house: House, visited: JobRecord, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scans = [house.add(f"hall-{number}.pcd", scan) for number, scan in enumerate(house.material.before)]
+    build = house.map_of(*scans, house.add("hall-2.pcd", house.material.after), map_id="hall")
+    monkeypatch.setattr("worker.reporting._TURN_S", 0.0)
+    run(build, "register")
+    job = house.catalog.jobs.get(build.job_id)
+    assert (job.status, job.step, job.attempts, job.interruptions) == ("running", "register", 0, 0)
+    assert job.message == "gave way to a survey; goes on after it"
+    kept = house.catalog.blobs.under(blob_keys.map_work(build.job_id))
+    assert kept
+    house.catalog.jobs.dismiss(visited.job_id)
+    run(build)
+    assert house.catalog.jobs.get(build.job_id).status == "successful"
+
+
+def test_a_step_that_the_database_leaves_waits_and_is_run_again(
+    house: House, visited: JobRecord, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def away(*_: object, **__: object) -> None:
+        raise DatabaseUnavailable("the database does not answer")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("worker.jobs.surveys.locate_survey", away)
+        run(visited, "register")
+    job = house.catalog.jobs.get(visited.job_id)
+    assert (job.status, job.attempts, job.interruptions) == ("running", 0, 1)
+    assert "does not answer" in job.message
+    run(visited)
+    assert house.catalog.jobs.get(visited.job_id).status == "successful"

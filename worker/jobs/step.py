@@ -66,6 +66,7 @@ class Context:
     catalog: Catalog
     job: JobRecord
     report: Reporter
+    give_way: Callable[[], None]  #: called where what was done is kept; may raise GaveWay
     scratch: Path
 
 
@@ -89,9 +90,9 @@ def step(run: Callable[[Context], None]) -> Callable[[str], None]:
             folder = settings.scratch_dir()  # on the blobs' own disk
             try:
                 scratch = stack.enter_context(scratch_folder(folder, f"{job_id}-{begun.step}"))
-                report = _reporter(catalog, job, begun)
+                context = _context(settings, catalog, job, begun, scratch)
                 with as_out_of_memory(f"a step of job {job_id}"):
-                    run(Context(settings=settings, catalog=catalog, job=job, report=report, scratch=scratch))
+                    run(context)
                 catalog.jobs.advance(begun)
             except Exception as error:
                 _ended(catalog, begun, error)
@@ -109,13 +110,18 @@ def _begun(catalog: Catalog, job_id: str, function: str) -> Run | None:
     return catalog.jobs.begin(job_id, next(names, ""))
 
 
-def _reporter(catalog: Catalog, job: JobRecord, run: Run) -> Reporter:
-    """Return what reports the stages of a step; a build gives way to surveys that wait."""
-    write = functools.partial(_report, catalog, run)
-    if job.kind != "map":
-        return Reporter(STAGES[job.kind], write)
-    turn = Turn(lambda: catalog.jobs.surveys_wait(step_of(job.kind, run.step).queue))
-    return Reporter(STAGES[job.kind], write, give_way={"registering": turn})
+def _context(settings: Settings, catalog: Catalog, job: JobRecord, run: Run, scratch: Path) -> Context:
+    """Return what a step works with; builds and trainings give way to surveys that wait for the same workers."""
+    queue = step_of(job.kind, run.step).queue
+    turn = Turn(lambda: job.kind != "survey" and catalog.jobs.surveys_wait(queue))
+    report = Reporter(
+        STAGES[job.kind],
+        functools.partial(_report, catalog, run),
+        give_way={"registering": turn.check} if job.kind == "map" else {},
+    )
+    return Context(
+        settings=settings, catalog=catalog, job=job, report=report, give_way=turn.check, scratch=scratch
+    )
 
 
 def _report(catalog: Catalog, run: Run, stage: str, share: float) -> bool:
