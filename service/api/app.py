@@ -2,24 +2,31 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 from collections.abc import AsyncIterator
 from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
 from typing import Any
 
-from fastapi import FastAPI
+from fastapi import Depends, FastAPI
 from fastapi.concurrency import run_in_threadpool
 from fastapi.openapi.utils import get_openapi
 from pydantic import BaseModel
 from pydantic.json_schema import JsonSchemaMode, models_json_schema
+from starlette.types import ASGIApp
 
 from service.api import changes, health, jobs, maps, models, objects, scans, surveys, versions
 from service.api.features import TileCollection
 from service.api.http import problems
+from service.api.http.access import authorize, secured
 from service.api.http.bodies import INCOMING
 from service.api.http.cards import Cards
+from service.api.http.cross_site import add_cross_site_checks
 from service.api.http.dependencies import Queue, Services
+from service.api.http.docs_pages import add_pages
 from service.api.http.metrics import Metrics, MetricsMiddleware
+from service.api.http.security_headers import SecurityHeadersMiddleware
 from service.api.http.submission import Ticker
 from service.api.http.uploads import sweep
 from service.catalog.catalog import open_catalog
@@ -36,6 +43,8 @@ and `GET /jobs/{id}` says how far it is.
 Every error is a problem document (RFC 9457) with a stable `type`.
 """
 
+
+_SWEEP_EVERY_S = 600.0
 
 #: What FastAPI does not see, for it is read or written by hand: bodies of requests, problems, features.
 UNSEEN: dict[JsonSchemaMode, tuple[type[BaseModel], ...]] = {
@@ -58,7 +67,11 @@ UNSEEN: dict[JsonSchemaMode, tuple[type[BaseModel], ...]] = {
 
 
 class Api(FastAPI):
-    """FastAPI with our own description of itself."""
+    """FastAPI with our own description of itself, and with security headers on every answer."""
+
+    def build_middleware_stack(self) -> ASGIApp:
+        """Return the app; the headers lie around it all, for unexpected errors are answered outside of middleware."""
+        return SecurityHeadersMiddleware(super().build_middleware_stack())
 
     def openapi(self) -> dict[str, Any]:
         """Return the OpenAPI document: what FastAPI derives, and the bodies that are read by hand."""
@@ -78,6 +91,7 @@ class Api(FastAPI):
                 schemas.update(derived["$defs"])
             for replaced in ("HTTPValidationError", "ValidationError"):  # by problems
                 schemas.pop(replaced, None)
+            secured(document, problems.documented("unauthorized", "forbidden"))
             self.openapi_schema = document
         return self.openapi_schema
 
@@ -90,10 +104,15 @@ def create_app(settings: Settings, *, queue: Queue | None = None) -> FastAPI:
         summary="LiDAR scans in, changed tiles and a coloured cloud out",
         description=DESCRIPTION,
         lifespan=_lifespan(settings, queue),
+        docs_url=None,
+        redoc_url=None,
+        dependencies=[Depends(authorize)],
     )
     app.state.metrics = Metrics()
+    add_cross_site_checks(app, settings)
     app.add_middleware(MetricsMiddleware, metrics=app.state.metrics)
     problems.add_handlers(app)
+    add_pages(app)
     for part in (scans, maps, versions, surveys, changes, objects, jobs, models, health):
         app.include_router(part.router)
     return app
@@ -106,8 +125,8 @@ def _lifespan(settings: Settings, queue: Queue | None) -> Any:
             raise ValueError("no SPICD_REDIS_URL: `spicd up` starts an embedded server and sets it")
         used = queue or JobQueue(settings.redis_url or "", timeout_s=settings.job_timeout_s)
         catalog = await run_in_threadpool(open_catalog, settings)
-        await run_in_threadpool(sweep, settings.data_dir / INCOMING)
         dispatcher = Dispatcher(catalog.jobs, used)
+        sweeping = asyncio.create_task(_sweep(settings.data_dir / INCOMING))
         app.state.services = Services(
             settings=settings,
             catalog=catalog,
@@ -121,9 +140,17 @@ def _lifespan(settings: Settings, queue: Queue | None) -> Any:
             yield
         finally:
             await run_in_threadpool(ticker.__exit__)
+            sweeping.cancel()
             catalog.close()
 
     return lifespan
+
+
+async def _sweep(incoming: Path) -> None:
+    """Remove what uploads of killed processes left, now and from time to time."""
+    while True:
+        await run_in_threadpool(sweep, incoming)
+        await asyncio.sleep(_SWEEP_EVERY_S)
 
 
 def _version() -> str:

@@ -12,6 +12,7 @@ import functools
 import json
 import logging
 import os
+import subprocess
 import sys
 import time
 from collections.abc import Callable
@@ -162,7 +163,7 @@ def finish(context: Context) -> None:
 @stage
 def stray(context: Context) -> None:
     """Start a process that outlives the step."""
-    pid = os.spawnlp(os.P_NOWAIT, "sleep", "sleep", "60")
+    pid = subprocess.Popen(["/bin/sleep", "60"]).pid
     record("stray", context.job.job_id, str(pid))
 
 

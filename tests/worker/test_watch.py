@@ -70,7 +70,7 @@ def test_a_step_that_is_stopped_is_told_so_after_a_while_and_not_once_it_goes_on
 
 
 def test_a_step_that_uses_no_processor_for_long_is_told_so(clock: Clock) -> None:
-    with subprocess.Popen(["sleep", "60"], start_new_session=True) as process:
+    with subprocess.Popen(["/bin/sleep", "60"], start_new_session=True) as process:
         until(lambda: state(process.pid) == "S")
         watch = Watch(process.pid, idle_s=100, clock=clock)
         assert watch.trouble() is None
@@ -82,7 +82,7 @@ def test_a_step_that_uses_no_processor_for_long_is_told_so(clock: Clock) -> None
 
 
 def test_of_a_process_that_is_gone_nothing_is_said(clock: Clock) -> None:
-    process = subprocess.Popen(["true"], start_new_session=True)
+    process = subprocess.Popen(["/bin/true"], start_new_session=True)
     process.wait()
     assert process_state(process.pid) is None
     assert Watch(process.pid, clock=clock).trouble() is None

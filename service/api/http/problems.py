@@ -19,6 +19,7 @@ from service.errors import ServiceError
 
 log = logging.getLogger(__name__)
 
+MAX_ERRORS = 20  #: values that one answer complains of
 MEDIA_TYPE = "application/problem+json"
 
 #: code -> (HTTP status, title). A status of None is that of a failed job, which no request answers with.
@@ -30,6 +31,7 @@ PROBLEMS: dict[str, tuple[int | None, str]] = {
     "invalid_request": (422, "The request does not match the API"),
     "scan_unreadable": (422, "The file is no sound scan"),
     "too_large": (413, "The body is too large"),
+    "too_slow": (408, "The body took too long"),
     "wrong_media_type": (415, "The media type is not taken here"),
     "unauthorized": (401, "An API key is needed"),
     "forbidden": (403, "This may not be done here"),
@@ -94,7 +96,7 @@ def problem_of(problem: Problem | None) -> ProblemDocument | None:
 JobProblem = Annotated[ProblemDocument | None, BeforeValidator(problem_of)]
 
 #: What may be wrong with any body; documented in this order.
-BODY = ("incomplete_body", "too_large", "wrong_media_type", "bad_request", "invalid_request")
+BODY = ("incomplete_body", "too_slow", "too_large", "wrong_media_type", "bad_request", "invalid_request")
 
 
 def response(
@@ -140,12 +142,13 @@ def add_handlers(app: FastAPI) -> None:
 
 def _service_error(_request: Request, error: Exception) -> Response:
     code = error.code if isinstance(error, ServiceError) and error.code in PROBLEMS else "internal"
-    return response(code, str(error))
+    headers = {"WWW-Authenticate": 'Bearer realm="spicd"'} if code == "unauthorized" else None  # RFC 6750, 3
+    return response(code, str(error), headers=headers)
 
 
 def _invalid(_request: Request, error: Exception) -> Response:
     entries: Sequence[Any] = error.errors() if isinstance(error, RequestValidationError) else ()
-    errors = [_invalid_value(entry) for entry in entries]
+    errors = [_invalid_value(entry) for entry in entries[:MAX_ERRORS]]
     first = errors[0] if errors else {"place": "request", "detail": "it does not match"}
     return response("invalid_request", f"{first['place']}: {first['detail']}", errors=errors)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import socket
 import subprocess
@@ -14,6 +15,7 @@ from typing import Any
 import httpx
 import pytest
 
+from service.api.http.uploads import ABANDONED_S, sweep
 from tests.support.samples import settings_in
 
 PIECE = bytes(range(256)) * 4096  #: 1 MiB
@@ -108,7 +110,7 @@ def test_a_connection_that_breaks_within_the_body_leaves_nothing(server: Any) ->
     incoming = data_dir / "incoming"
     with socket.create_connection((client.base_url.host, client.base_url.port)) as connection:
         connection.sendall(
-            b"POST /scans HTTP/1.1\r\nHost: here\r\nContent-Type: application/octet-stream\r\n"
+            b"POST /scans HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/octet-stream\r\n"
             b"Content-Length: 9000000\r\n\r\n" + HEAD + 3 * PIECE
         )
         _until(lambda: incoming.exists() and any(path.stat().st_size for path in incoming.iterdir()))
@@ -122,3 +124,12 @@ def _until(true: Callable[[], bool]) -> None:
             return
         time.sleep(0.05)
     raise AssertionError("it did not come about")
+
+
+def test_what_a_killed_process_left_goes_after_an_hour_and_what_is_written_stays(tmp_path: Path) -> None:
+    old, new = tmp_path / "old.part", tmp_path / "new.part"
+    old.touch()
+    new.touch()
+    os.utime(old, (time.time() - ABANDONED_S - 1,) * 2)
+    sweep(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["new.part"]
