@@ -27,9 +27,10 @@ from service.api.http.dependencies import Queue, Services
 from service.api.http.docs_pages import add_pages
 from service.api.http.metrics import Metrics, MetricsMiddleware
 from service.api.http.security_headers import SecurityHeadersMiddleware
-from service.api.http.submission import resubmit
+from service.api.http.submission import Ticker
 from service.api.http.uploads import sweep
 from service.catalog.catalog import open_catalog
+from service.dispatch import Dispatcher
 from service.queue import JobQueue
 from service.settings import Settings
 
@@ -124,14 +125,21 @@ def _lifespan(settings: Settings, queue: Queue | None) -> Any:
             raise ValueError("no SPICD_REDIS_URL: `spicd up` starts an embedded server and sets it")
         used = queue or JobQueue(settings.redis_url or "", timeout_s=settings.job_timeout_s)
         catalog = await run_in_threadpool(open_catalog, settings)
+        dispatcher = Dispatcher(catalog.jobs, used)
         sweeping = asyncio.create_task(_sweep(settings.data_dir / INCOMING))
         app.state.services = Services(
-            settings=settings, catalog=catalog, queue=used, cards=Cards(settings.model_store, catalog.models)
+            settings=settings,
+            catalog=catalog,
+            queue=used,
+            dispatcher=dispatcher,
+            cards=Cards(settings.model_store, catalog.models),
         )
-        await run_in_threadpool(resubmit, app.state.services)
+        ticker = Ticker(dispatcher)
+        await run_in_threadpool(ticker.__enter__)
         try:
             yield
         finally:
+            await run_in_threadpool(ticker.__exit__)
             sweeping.cancel()
             catalog.close()
 

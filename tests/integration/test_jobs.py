@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import json
-import tempfile
+from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 from service.catalog import blob_keys
-from service.catalog.jobs import Jobs
+from service.catalog.jobs import Jobs, Run
 from service.catalog.records import JobRecord, Placement, ScanRecord
 from service.catalog.steps import STEPS, JobKind
+from service.errors import DatabaseUnavailable
 from service.settings import Settings
 from tests.support.house import MAP, MODEL, OTHER_CUT, SAME_CUT, SEEN_TO, House, Material, run
 from worker import jobs
@@ -25,6 +25,7 @@ from worker.errors import DetectorUnavailable, MapFailed, ScanError
 from worker.jobs.surveys import scoring
 from worker.pipeline.flow import NoScanAccepted
 from worker.pipeline.registration.diagnosis import REASONS
+from worker.scratch import scratch_folder
 
 
 @pytest.fixture
@@ -207,9 +208,9 @@ def test_a_job_dismissed_while_a_step_works_stops_there(
         run(visited, earlier)
     real, files = Jobs.report, house.files()
 
-    def dismissed_meanwhile(self: Jobs, job_id: str, *, message: str, progress: float) -> bool:
-        self.dismiss(job_id)
-        return real(self, job_id, message=message, progress=progress)
+    def dismissed_meanwhile(self: Jobs, of: Run, *, message: str, progress: float) -> bool:
+        self.dismiss(of.job_id)
+        return real(self, of, message=message, progress=progress)
 
     monkeypatch.setattr(Jobs, "report", dismissed_meanwhile)
     run(visited, name)
@@ -347,18 +348,50 @@ def test_what_a_step_is_in_the_middle_of_lies_in_the_scratch_folder(
 ) -> None:
     folders: list[Path] = []
 
-    def noting(**given: Any) -> tempfile.TemporaryDirectory[str]:
-        folders.append(Path(given["dir"]))
-        return tempfile.TemporaryDirectory(**given)
+    def noting(parent: Path, name: str) -> AbstractContextManager[Path]:
+        folders.append(parent)
+        return scratch_folder(parent, name)
 
-    monkeypatch.setattr("worker.jobs.step.TemporaryDirectory", noting)
+    monkeypatch.setattr("worker.jobs.step.scratch_folder", noting)
     run(house.map_of(house.add("one.pcd", house.material.before[1]), map_id="hall"))
     assert set(folders) == {Settings().scratch_dir()}
     assert list(Settings().scratch_dir().iterdir()) == []
 
 
-def test_the_last_step_of_a_map_that_an_earlier_build_queued_is_the_one_of_today() -> None:
-    assert jobs.describe_map is jobs.encode_map
+def test_the_steps_that_the_queue_names_are_those_of_the_worker() -> None:
     assert {step.function.removeprefix("worker.jobs.") for steps in STEPS.values() for step in steps} <= set(
         jobs.__all__
     )
+
+
+def test_a_build_gives_way_to_a_survey_and_goes_on_with_the_pairs_it_had(
+    house: House, visited: JobRecord, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scans = [house.add(f"hall-{number}.pcd", scan) for number, scan in enumerate(house.material.before)]
+    build = house.map_of(*scans, house.add("hall-2.pcd", house.material.after), map_id="hall")
+    monkeypatch.setattr("worker.reporting._TURN_S", 0.0)
+    run(build, "register")
+    job = house.catalog.jobs.get(build.job_id)
+    assert (job.status, job.step, job.attempts, job.interruptions) == ("running", "register", 0, 0)
+    assert job.message == "gave way to a survey; goes on after it"
+    kept = house.catalog.blobs.under(blob_keys.map_work(build.job_id))
+    assert kept
+    house.catalog.jobs.dismiss(visited.job_id)
+    run(build)
+    assert house.catalog.jobs.get(build.job_id).status == "successful"
+
+
+def test_a_step_that_the_database_leaves_waits_and_is_run_again(
+    house: House, visited: JobRecord, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def away(*_: object, **__: object) -> None:
+        raise DatabaseUnavailable("the database does not answer")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("worker.jobs.surveys.locate_survey", away)
+        run(visited, "register")
+    job = house.catalog.jobs.get(visited.job_id)
+    assert (job.status, job.attempts, job.interruptions) == ("running", 0, 1)
+    assert "does not answer" in job.message
+    run(visited)
+    assert house.catalog.jobs.get(visited.job_id).status == "successful"

@@ -215,6 +215,7 @@ def context(house: House, job: JobRecord) -> Context:
         settings=house.settings,
         catalog=house.catalog,
         job=job,
+        give_way=lambda: None,
         report=Reporter({}, lambda *_: True),
         scratch=house.folder,
     )

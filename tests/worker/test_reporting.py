@@ -3,8 +3,8 @@ from __future__ import annotations
 import pytest
 
 from worker import reporting
-from worker.errors import Cancelled
-from worker.reporting import Reporter
+from worker.errors import Cancelled, GaveWay
+from worker.reporting import Reporter, Turn
 
 SPANS = {"registering": (0.0, 0.25), "tiling": (0.25, 0.5), "scoring": (0.5, 1.0)}
 
@@ -86,3 +86,33 @@ def test_a_job_that_nobody_waits_for_is_cancelled_at_the_next_write(clock: Clock
 def test_an_unknown_stage_is_a_fault_and_not_a_guess(clock: Clock) -> None:
     with pytest.raises(KeyError):
         Reporter(SPANS, Written())("dreaming", 0.5)
+
+
+def test_a_turn_lasts_twenty_seconds_and_longer_where_nobody_waits() -> None:
+    now, asked, waiting = [0.0], [], [False]
+
+    def others_wait() -> bool:
+        asked.append(now[0])
+        return waiting[0]
+
+    turn = Turn(others_wait, clock=lambda: now[0])
+    for instant in (0.0, 19.9, 20.0, 20.5, 21.0):
+        now[0] = instant
+        turn.check()
+    assert asked == [20.0, 21.0]  # once a second
+    waiting[0], now[0] = True, 22.0
+    with pytest.raises(GaveWay):
+        turn.check()
+
+
+def test_a_step_gives_way_within_the_stages_that_keep_what_they_did_and_not_at_their_ends() -> None:
+    def give_way() -> None:
+        raise GaveWay("others go first")
+
+    spans = {"registering": (0.0, 0.5), "fusing": (0.5, 1.0)}
+    report = Reporter(spans, lambda _stage, _share: True, give_way={"registering": give_way})
+    report("registering", 0.0)
+    report("registering", 1.0)
+    report("fusing", 0.5)
+    with pytest.raises(GaveWay):
+        report("registering", 0.5)

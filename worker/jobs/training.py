@@ -14,7 +14,7 @@ from service.catalog.records import ModelRecord, VersionRecord
 from worker.detectors.card import Card
 from worker.detectors.registry import trainable_detectors
 from worker.detectors.store import make_detector, read_card, resolve_device, settings_of, weights_of
-from worker.errors import Cancelled, TrainingFailed
+from worker.errors import Cancelled, GaveWay, TrainingFailed
 from worker.jobs import voxel_training
 from worker.jobs.maps import encode_reference
 from worker.jobs.models import card_that_fits, kept_detector, pipeline_settings
@@ -71,6 +71,8 @@ def train_model(context: Context) -> None:
     except (FloatingPointError, ValueError) as error:  # no number, or files of an earlier release
         context.catalog.blobs.delete_prefix(work)
         raise TrainingFailed(str(error)) from error
+    except GaveWay:
+        raise
     except Cancelled:
         context.catalog.blobs.delete_prefix(work)
         raise
@@ -228,6 +230,7 @@ def _scans(context: Context, version: VersionRecord) -> Iterator[RegisteredScan]
 def _keep(context: Context, folder: Path) -> None:
     for name in (*(name for name in KEPT if (folder / name).exists()), *voxel_training.kept_files(folder)):
         context.catalog.blobs.put_file(blob_keys.model_checkpoint(context.job.job_id, name), folder / name)
+    context.give_way()
 
 
 def _fetch(context: Context, folder: Path) -> None:

@@ -16,7 +16,7 @@ from worker.cloud import npz
 from worker.cloud.seen import Seen
 from worker.cloud.types import Indices
 from worker.detectors.detector import Detector
-from worker.errors import MapFailed
+from worker.errors import GaveWay, MapFailed
 from worker.jobs.pair_cache import StoredPairCache
 from worker.jobs.scans import kept_scans, save_scans, scan_files, scan_outcomes, seen_by
 from worker.jobs.step import Context, load, put
@@ -113,7 +113,11 @@ def _first(context: Context, version: VersionRecord, settings: PipelineSettings)
         files = scan_files(context, version.scans, stack, settings)
         with _recorded_anyway(context, version.scans):
             pairs = StoredPairCache(context.catalog.blobs, context.job.job_id)
-            built = build_map(files, settings=settings, pairs=pairs, progress=context.report)
+            try:
+                built = build_map(files, settings=settings, pairs=pairs, progress=context.report)
+            except GaveWay:
+                pairs.flush()
+                raise
         save_scans(context, version.scans, files, built.outcomes, _key_of(context))
     return Made(built=built, outcomes=scan_outcomes(version.scans, built.outcomes))
 

@@ -110,6 +110,7 @@ def test_each_of_its_scopes_admits_to_a_route(guarded: TestClient, method: str, 
 @pytest.mark.parametrize(
     "value",
     ["", "Bearer", "Bearer ", "Basic c3BpY2Q6", "Bearer nonsense", f"Bearer {new_secret()}", "Bearer \xff"],
+    ids=["empty", "scheme", "scheme and space", "basic", "nonsense", "unknown", "not ASCII"],
 )
 def test_what_is_no_key_is_not_let_in(guarded: TestClient, value: str) -> None:
     answer = guarded.get("/maps", headers={"Authorization": value.encode("latin-1")})
