@@ -126,6 +126,7 @@ def _lifespan(settings: Settings, queue: Queue | None) -> Any:
         used = queue or JobQueue(settings.redis_url or "", timeout_s=settings.job_timeout_s)
         catalog = await run_in_threadpool(open_catalog, settings)
         dispatcher = Dispatcher(catalog.jobs, used)
+        await run_in_threadpool(sweep, settings.data_dir / INCOMING)
         sweeping = asyncio.create_task(_sweep(settings.data_dir / INCOMING))
         app.state.services = Services(
             settings=settings,
@@ -147,10 +148,11 @@ def _lifespan(settings: Settings, queue: Queue | None) -> Any:
 
 
 async def _sweep(incoming: Path) -> None:
-    """Remove what uploads of killed processes left, now and from time to time."""
+    """Remove what uploads of killed processes left, from time to time."""
     while True:
-        await run_in_threadpool(sweep, incoming)
         await asyncio.sleep(_SWEEP_EVERY_S)
+        with contextlib.suppress(OSError):  # the disk is away; next time
+            await run_in_threadpool(sweep, incoming)
 
 
 def _version() -> str:
