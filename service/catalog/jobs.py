@@ -8,12 +8,14 @@ attempt ends so; or the machine's, and then the next one does not.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from datetime import datetime
 from typing import Any, cast
 
 from sqlalchemy import CursorResult, func, select, update
 from sqlalchemy.orm import Session
 
-from service.catalog import history, tables
+from service.catalog import history, tables, tallies
 from service.catalog.database import Database
 from service.catalog.records import JobRecord, JobStatus, Page, Position, Problem
 from service.catalog.steps import JobKind
@@ -24,6 +26,17 @@ MAX_ATTEMPTS = 3  #: of a whole job, whichever of its steps they are lost in
 WORKER_DIED = "worker_died"  #: code of the problem of a job that is given up
 
 _OPEN = tables.Job.status.in_(("accepted", "running"))
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class OpenSteps:
+    """Steps of one name that wait, or that run."""
+
+    kind: JobKind
+    step: str  #: empty: the first one
+    waits: bool
+    count: int
+    since: datetime  #: when the oldest came due, or began
 
 
 class Jobs:
@@ -67,6 +80,18 @@ class Jobs:
         query = select(tables.Job.status, func.count()).group_by(tables.Job.status)
         with self._database.read() as session:
             return dict(session.execute(query).all())
+
+    def open_steps(self) -> tuple[OpenSteps, ...]:
+        """Count the steps that wait and those that run, by kind of job and step, with the oldest of each."""
+        table = tables.Job
+        waits, since = table.begun.is_(None), func.min(func.coalesce(table.begun, table.due, table.created))
+        query = select(table.kind, table.step, waits, func.count(), since).where(_OPEN)
+        with self._database.read() as session:
+            rows = session.execute(query.group_by(table.kind, table.step, waits)).all()
+        return tuple(
+            OpenSteps(kind=kind, step=step, waits=bool(waits), count=count, since=since)
+            for kind, step, waits, count, since in rows
+        )
 
     def start(self, job_id: str) -> bool:
         """Mark the job as running; False when it has ended or gone, and the step has nothing to do."""
@@ -145,6 +170,7 @@ class Jobs:
                 session, job_id, {**values, "status": status, "finished": instant, "updated": instant}
             ):
                 return False
+            tallies.tally_job(session, kind=job.kind, status=status, problem=values.get("problem"))
             subject = _subject(session, job)
             if subject is not None:
                 subject.status = "ready" if status == "successful" else "failed"

@@ -179,6 +179,11 @@ def outcome_columns(outcome: ScanOutcome) -> dict[str, Any]:
     return outcome.model_dump(mode="json", exclude={"scan_id"})
 
 
+def known_outcomes(rows: Iterable[Row]) -> list[str]:
+    """Return the ids of the scans of which it is known what became of them."""
+    return [row.scan_id for row in rows if row.accepted is not None]
+
+
 def write_outcomes(rows: Iterable[Row], outcomes: Iterable[ScanOutcome]) -> None:
     """Put `outcomes` on the rows of the same scans. Raises ValueError for a scan that was not asked for."""
     by_scan = {row.scan_id: row for row in rows}
