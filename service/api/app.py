@@ -15,6 +15,7 @@ from pydantic.json_schema import JsonSchemaMode, models_json_schema
 
 from service.api import changes, health, jobs, maps, models, objects, scans, surveys, versions
 from service.api.features import TileCollection
+from service.api.housekeeping import housekeeping
 from service.api.http import problems
 from service.api.http.bodies import INCOMING
 from service.api.http.cards import Cards
@@ -111,7 +112,8 @@ def _lifespan(settings: Settings, queue: Queue | None) -> Any:
         )
         await run_in_threadpool(resubmit, app.state.services)
         try:
-            yield
+            async with housekeeping(app.state.services):
+                yield
         finally:
             catalog.close()
 

@@ -89,7 +89,7 @@ class Jobs:
         with self._database.read() as session:
             rows = session.execute(query.group_by(table.kind, table.step, waits)).all()
         return tuple(
-            OpenSteps(kind=kind, step=step, waits=bool(waits), count=count, since=since)
+            OpenSteps(kind=cast("JobKind", kind), step=step, waits=bool(waits), count=count, since=since)
             for kind, step, waits, count, since in rows
         )
 

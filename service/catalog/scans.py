@@ -121,6 +121,13 @@ class Scans:
         with contextlib.suppress(IntegrityError):
             self._forget(tables.Scan.key == added.key, tables.Scan.resent.is_(None))
 
+    def forget(self, scan_id: str, condition: ColumnElement[bool]) -> bool:
+        """Delete a scan with its file if a condition on its row holds; False where not, or where something uses it."""
+        try:
+            return self._forget(tables.Scan.scan_id == scan_id, condition)
+        except IntegrityError:
+            return False
+
     def _insert(self, row: tables.Scan) -> tuple[ScanRecord, bool]:
         """Record a scan whose file is kept, unless the same upload came a moment earlier. Raises Conflict."""
         scan_id, key = row.scan_id, row.key

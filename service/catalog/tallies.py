@@ -91,6 +91,11 @@ TILES = Measure(
     labels=("model",),
     summary=True,
 )
+SWEPT = Measure(
+    name="spicd_swept",
+    help="Surveys, scans and folders of files that retention removed",
+    labels=("what",),
+)
 #: Everything that is tallied, in the order of `/metrics`.
 MEASURES = (
     JOBS_ENDED,
@@ -103,6 +108,7 @@ MEASURES = (
     RMSE,
     OBSERVED,
     TILES,
+    SWEPT,
 )
 
 

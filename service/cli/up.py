@@ -43,7 +43,7 @@ def up(
     if end_with_parent:
         end(os.getppid())
     terminal: Terminal = ctx.obj
-    settings = _settings(
+    settings = settings_given(
         host=host,
         port=port,
         data_dir=data_dir,
@@ -73,7 +73,7 @@ def _write_ready_file(running: Running, path: Path) -> None:
         raise LaunchFailed(f"the ready file {path} cannot be written ({error.strerror})") from error
 
 
-def _settings(**given: Any) -> Settings:
+def settings_given(**given: Any) -> Settings:
     """Return the settings, with what was given in place of what SPICD_* says. Raises `LaunchFailed`."""
     try:
         return Settings(**{name: value for name, value in given.items() if value is not None})
