@@ -33,6 +33,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "service.api.http": (
         "service.catalog",
         "service.errors",
+        "service.logs",
         "service.settings",
     ),
     "service.api": (
@@ -121,7 +122,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
         "worker.progress",
     ),
     "worker.rq_jobs": (),
-    "worker.rq_workers": ("service.up.lifetime", "worker.rq_jobs", "worker.errors"),
+    "worker.rq_workers": ("service.logs", "service.up.lifetime", "worker.rq_jobs", "worker.errors"),
     "worker.jobs": (
         "service.catalog",
         "service.settings",

@@ -28,6 +28,7 @@ from rq.serializers import JSONSerializer
 from rq.timeouts import JobTimeoutException
 from rq.worker.base import BaseWorker
 
+from service.logs import about
 from service.up.lifetime import end_with_parent
 from worker.errors import PipelineError
 from worker.rq_jobs import FunctionRefused, StepJob, step_job
@@ -78,9 +79,10 @@ class _StepWorker(BaseWorker):  # type: ignore[misc]  # rq is untyped here
 
     def execute_job(self, job: StepJob, queue: Queue) -> None:
         begun = time.monotonic()
-        log.info("%s: %s started", self.queues[0].name, job.id)
-        super().execute_job(job, queue)
-        log.info("%s: %s ended after %.1f s", self.queues[0].name, job.id, time.monotonic() - begun)
+        with about(job_id=job.catalog_id):  # a process that is forked for the step inherits it
+            log.info("%s: %s started", self.queues[0].name, job.id)
+            super().execute_job(job, queue)
+            log.info("%s: %s ended after %.1f s", self.queues[0].name, job.id, time.monotonic() - begun)
 
     def handle_exception(self, job: StepJob, *exc_info: Any) -> None:
         """Log a user's error in one line and ours with its traceback, then record it."""

@@ -12,6 +12,7 @@ from fastapi.concurrency import run_in_threadpool
 from fastapi.openapi.utils import get_openapi
 from pydantic import BaseModel
 from pydantic.json_schema import JsonSchemaMode, models_json_schema
+from starlette.types import ASGIApp
 
 from service.api import changes, health, jobs, maps, models, objects, scans, surveys, versions
 from service.api.features import TileCollection
@@ -21,6 +22,7 @@ from service.api.http.bodies import INCOMING
 from service.api.http.cards import Cards
 from service.api.http.dependencies import Queue, Services
 from service.api.http.metrics import Metrics, MetricsMiddleware
+from service.api.http.requests import RequestLog
 from service.api.http.submission import resubmit
 from service.api.http.uploads import sweep
 from service.catalog.catalog import open_catalog
@@ -58,7 +60,11 @@ UNSEEN: dict[JsonSchemaMode, tuple[type[BaseModel], ...]] = {
 
 
 class Api(FastAPI):
-    """FastAPI with our own description of itself."""
+    """FastAPI with our own description of itself, and with a line in the log for each request."""
+
+    def build_middleware_stack(self) -> ASGIApp:
+        """Return everything that a request passes; the log is outside of what answers an unexpected error."""
+        return RequestLog(super().build_middleware_stack())
 
     def openapi(self) -> dict[str, Any]:
         """Return the OpenAPI document: what FastAPI derives, and the bodies that are read by hand."""

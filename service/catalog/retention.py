@@ -12,7 +12,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from datetime import datetime, timedelta
 
-from sqlalchemy import ColumnElement, Select, and_, exists, or_, select
+from sqlalchemy import ColumnElement, Select, and_, exists, false, or_, select
 from sqlalchemy.orm import Session
 
 from service.catalog import blob_keys, tallies
@@ -92,7 +92,7 @@ def remove(catalog: Catalog, policy: Policy, leftovers: Leftovers) -> dict[str, 
 def _surveys(policy: Policy) -> Select[str]:
     """Return a query for the surveys that go: old, over, and taken over by no version."""
     if policy.surveys_before is None:
-        return select(Survey.survey_id).where(False)
+        return select(Survey.survey_id).where(false())
     taken = exists().where(MapVersion.map_id == Survey.map_id, MapVersion.survey_id == Survey.survey_id)
     works = exists().where(Job.survey_id == Survey.survey_id, Job.status.in_(("accepted", "running")))
     over = and_(Survey.status != "running", ~works)
@@ -103,7 +103,7 @@ def _surveys(policy: Policy) -> Select[str]:
 def _scans(policy: Policy) -> Select[str]:
     """Return a query for the scans that go: old, and in nothing but surveys that go."""
     if policy.scans_before is None:
-        return select(Scan.scan_id).where(False)
+        return select(Scan.scan_id).where(false())
     of_version = exists().where(VersionScan.scan_id == Scan.scan_id)
     stays = SurveyScan.survey_id.not_in(_surveys(policy).order_by(None))
     of_survey = exists().where(SurveyScan.scan_id == Scan.scan_id, stays)

@@ -19,6 +19,7 @@ from service.api.http.fields import DeviceId, Id, Instant, names_from_text
 from service.catalog.catalog import Catalog
 from service.catalog.records import JobRecord, ScanRecord
 from service.errors import QueueUnavailable, ServiceError
+from service.logs import about
 
 log = logging.getLogger(__name__)
 
@@ -69,6 +70,8 @@ def submit(services: Services, job: JobRecord, *, forget: Callable[[], None]) ->
     except BaseException:
         forget()
         raise
+    with about(job_id=job.job_id):  # the one line that has the ids of request and job
+        log.info("the %s job was submitted", job.kind)
 
 
 def resubmit(services: Services) -> None:

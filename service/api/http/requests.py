@@ -1,0 +1,99 @@
+"""The id of a request and its line in the log.
+
+The id is the client's `X-Request-ID`, where that is one, or made here. It is in the answer, and in every line that is
+logged on the way. The line of a request names its route and not its path, and no query, header or body: what a client
+sends may be secret.
+"""
+
+from __future__ import annotations
+
+import logging
+import re
+import time
+from uuid import uuid4
+
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from service.logs import about, fields
+
+log = logging.getLogger("spicd.requests")
+
+HEADER = "X-Request-ID"
+_ID = re.compile(r"[A-Za-z0-9._-]{1,64}")
+_QUIET = frozenset({"/health/live", "/health/ready", "/metrics"})  #: asked by machines every few seconds
+_METHOD = re.compile(r"[A-Z]{1,10}")
+
+
+class RequestLog:
+    """Names each request, and logs one line when it has been answered; the outermost of the app (ASGI)."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass a request on under its id."""
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        request = _Request(scope, receive, send)
+        with about(request_id=request.id):
+            try:
+                await self._app(scope, request.receive, request.send)
+            finally:
+                request.log()
+
+
+class _Request:
+    """One request while it is answered."""
+
+    def __init__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        self.id = _id_of(scope)
+        self._scope, self._receive, self._send = scope, receive, send
+        self._status: int | None = None
+        self._received = self._sent = 0
+        self._begun = time.perf_counter()
+
+    async def receive(self) -> Message:
+        """Receive what the client sends, and count its bytes."""
+        message = await self._receive()
+        self._received += len(message.get("body", b""))
+        return message
+
+    async def send(self, message: Message) -> None:
+        """Send the answer with the id, and count its bytes."""
+        if message["type"] == "http.response.start":
+            self._status = message["status"]
+            MutableHeaders(scope=message)[HEADER] = self.id
+        self._sent += len(message.get("body", b""))
+        await self._send(message)
+
+    def log(self) -> None:
+        """Log the line; what machines ask every few seconds is of interest when it goes wrong."""
+        route = getattr(self._scope.get("route"), "path", "none")
+        quiet = route in _QUIET and self._status == 200
+        method = self._scope["method"] if _METHOD.fullmatch(self._scope["method"]) else "other"
+        line = {
+            "method": method,
+            "route": route,
+            "status": self._status,
+            "ms": round(1000 * (time.perf_counter() - self._begun), 1),
+            "received_bytes": self._received,
+            "sent_bytes": self._sent,
+        }
+        if key := self._scope.get("state", {}).get("key_id"):
+            line["key_id"] = key
+        words = (
+            "%(method)s %(route)s %(status)s, %(ms).1f ms, %(received_bytes)d bytes in, %(sent_bytes)d out"
+        )
+        log.log(
+            logging.DEBUG if quiet else logging.INFO,
+            words + (", key %(key_id)s" if key else ""),
+            line,
+            extra=fields(**line),
+        )
+
+
+def _id_of(scope: Scope) -> str:
+    given = Headers(scope=scope).get(HEADER, "")
+    return given if _ID.fullmatch(given) else uuid4().hex
