@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import ipaddress
+import re
 from pathlib import Path
 from typing import Literal
 
-from pydantic import Field
+from pydantic import Field, field_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 
@@ -15,6 +17,9 @@ def _model_store() -> Path:
     return beside if beside.is_dir() else Path("model_store")
 
 
+_ORIGIN = re.compile(r"https?://[a-z0-9.\[\]:_-]+")
+
+
 class Settings(BaseSettings):
     """Read once where a process starts and passed on; nothing else reads the environment."""
 
@@ -22,6 +27,20 @@ class Settings(BaseSettings):
 
     host: str = Field("127.0.0.1", description="address that the API listens on")
     port: int = Field(8000, ge=0, le=65535, description="port of the API; 0 takes a free one")
+    auth: Literal["auto", "required", "none"] = Field(
+        "auto",
+        description="whether requests need an API key; `auto`: unless the API listens on loopback, "
+        "`none`: never, for something in front asks who it is",
+    )
+    allowed_hosts: str | None = Field(
+        None,
+        description="names that `Host` may bear beside addresses, with commas between; unset: localhost, the machine's "
+        "and that listened on, and any where a key is needed",
+    )
+    allowed_origins: str | None = Field(
+        None,
+        description="origins of dashboards on other sites, with commas between: `https://dash.example.org`",
+    )
     data_dir: Path = Field(Path("data"), description="everything that the embedded parts keep")
     redis_url: str | None = Field(
         None, description="Redis or Valkey; unset: an embedded server in the data folder"
@@ -62,6 +81,28 @@ class Settings(BaseSettings):
         "text", description="lines for people, or a JSON object a line"
     )
 
+    @field_validator("allowed_origins")
+    @classmethod
+    def _origins_are_whole(cls, value: str | None) -> str | None:
+        for origin in _names(value):
+            if not _ORIGIN.fullmatch(origin):
+                raise ValueError(
+                    f"{origin!r} is no origin; name each as scheme://host[:port], `*` is not taken"
+                )
+        return value
+
+    def requires_key(self) -> bool:
+        """Tell whether requests need an API key: as soon as another machine can reach the API, unless told."""
+        return self.auth == "required" or (self.auth == "auto" and not _is_loopback(self.host))
+
+    def hosts(self) -> tuple[str, ...] | None:
+        """Return the names that `allowed_hosts` lists, in small letters; None where it is unset."""
+        return None if self.allowed_hosts is None else _names(self.allowed_hosts)
+
+    def origins(self) -> tuple[str, ...]:
+        """Return the origins that `allowed_origins` lists, in small letters."""
+        return _names(self.allowed_origins)
+
     def resolved_database_url(self) -> str:
         """Return the database that is used, embedded or not."""
         if self.database_url is not None:
@@ -82,3 +123,14 @@ class Settings(BaseSettings):
     def scratch_dir(self) -> Path:
         """Return where steps write aside: on the disk of embedded blobs, so that keeping a file is a rename."""
         return self.data_dir.absolute() / "scratch"
+
+
+def _names(text: str | None) -> tuple[str, ...]:
+    return tuple(name.strip().lower() for name in (text or "").split(",") if name.strip())
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host.lower() == "localhost"

@@ -20,9 +20,12 @@ from service.api.housekeeping import housekeeping
 from service.api.http import problems
 from service.api.http.bodies import INCOMING
 from service.api.http.cards import Cards
+from service.api.http.cross_site import add_cross_site_checks
 from service.api.http.dependencies import Queue, Services
+from service.api.http.docs_pages import add_pages
 from service.api.http.metrics import Metrics, MetricsMiddleware
 from service.api.http.requests import RequestLog
+from service.api.http.security_headers import SecurityHeadersMiddleware
 from service.api.http.submission import resubmit
 from service.api.http.uploads import sweep
 from service.catalog.catalog import open_catalog
@@ -60,11 +63,11 @@ UNSEEN: dict[JsonSchemaMode, tuple[type[BaseModel], ...]] = {
 
 
 class Api(FastAPI):
-    """FastAPI with our own description of itself, and with a line in the log for each request."""
+    """FastAPI with our own description of itself, a line in the log for each request, and security headers."""
 
     def build_middleware_stack(self) -> ASGIApp:
-        """Return everything that a request passes; the log is outside of what answers an unexpected error."""
-        return RequestLog(super().build_middleware_stack())
+        """Return the app; log and headers lie around it all, for unexpected errors are answered outside of middleware."""
+        return RequestLog(SecurityHeadersMiddleware(super().build_middleware_stack()))
 
     def openapi(self) -> dict[str, Any]:
         """Return the OpenAPI document: what FastAPI derives, and the bodies that are read by hand."""
@@ -96,10 +99,14 @@ def create_app(settings: Settings, *, queue: Queue | None = None) -> FastAPI:
         summary="LiDAR scans in, changed tiles and a coloured cloud out",
         description=DESCRIPTION,
         lifespan=_lifespan(settings, queue),
+        docs_url=None,
+        redoc_url=None,
     )
     app.state.metrics = Metrics()
+    add_cross_site_checks(app, settings)
     app.add_middleware(MetricsMiddleware, metrics=app.state.metrics)
     problems.add_handlers(app)
+    add_pages(app)
     for part in (scans, maps, versions, surveys, changes, objects, jobs, models, health):
         app.include_router(part.router)
     return app

@@ -37,7 +37,7 @@ class Service:
 
     def open_api(self, steps: tuple[tuple[str, Queue], ...] = STEPS) -> None:
         self.queue = self.bench.queue(*steps)
-        self.api = TestClient(create_app(self.settings, queue=self.queue))
+        self.api = TestClient(create_app(self.settings, queue=self.queue), base_url="http://localhost")
         self.api.__enter__()
 
     def close_api(self) -> None:

@@ -117,7 +117,7 @@ def survey_modules() -> set[str]:
         app = app_module.create_app(settings, queue=_NoQueue())
         crossed: set[str] = set()
         _watch(crossed)  # before the threads that answer requests begin
-        with TestClient(app) as client:
+        with TestClient(app, base_url="http://localhost") as client:
             scan = _scan(client, _room_points(seed=0), "before.ply")
             _run(client.post("/maps", json={"id": "room", "scan_ids": [scan]}).json(), "map")
             scan = _scan(client, _room_points(seed=1), "after.ply")

@@ -100,7 +100,8 @@ def fresh_database() -> str | None:
 @contextlib.contextmanager
 def running(settings: Settings, queue: RememberingQueue) -> Iterator[TestClient]:
     """The API as its clients see it: an unexpected error is an answer, not an exception."""
-    with TestClient(create_app(settings, queue=queue), raise_server_exceptions=False) as client:
+    app = create_app(settings, queue=queue)
+    with TestClient(app, base_url="http://localhost", raise_server_exceptions=False) as client:
         yield client
 
 
