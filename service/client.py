@@ -9,6 +9,7 @@ ClientError                  base; `str()` is one sentence
 from __future__ import annotations
 
 import json
+import os
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -60,10 +61,21 @@ def sentence(problem: Document) -> str:
 class Client:
     """Calls of the API; a context manager. Every method raises `ClientError` and returns the API's JSON."""
 
-    def __init__(self, url: str = DEFAULT_URL, *, transport: httpx.BaseTransport | None = None) -> None:
+    def __init__(
+        self,
+        url: str = DEFAULT_URL,
+        *,
+        key: str | None = None,
+        transport: httpx.BaseTransport | None = None,
+    ) -> None:
+        """Take the secret of an API key as `key`; None: that of the environment (SPICD_KEY), "": none."""
         self.url = url.rstrip("/")
         timeout = httpx.Timeout(60, connect=5)
-        self._http = httpx.Client(base_url=self.url, timeout=timeout, transport=transport)
+        secret = (os.environ.get("SPICD_KEY", "") if key is None else key).strip()
+        if not secret.isascii() or not secret.isprintable():
+            raise ClientError("the API key has letters that no key has; look at SPICD_KEY")
+        headers = {"Authorization": f"Bearer {secret}"} if secret else {}
+        self._http = httpx.Client(base_url=self.url, timeout=timeout, transport=transport, headers=headers)
 
     def __enter__(self) -> Self:
         return self

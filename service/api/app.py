@@ -7,7 +7,7 @@ from collections.abc import AsyncIterator
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
-from fastapi import FastAPI
+from fastapi import Depends, FastAPI
 from fastapi.concurrency import run_in_threadpool
 from fastapi.openapi.utils import get_openapi
 from pydantic import BaseModel
@@ -18,6 +18,7 @@ from service.api import changes, health, jobs, maps, models, objects, scans, sur
 from service.api.features import TileCollection
 from service.api.housekeeping import housekeeping
 from service.api.http import problems
+from service.api.http.access import authorize, secured
 from service.api.http.bodies import INCOMING
 from service.api.http.cards import Cards
 from service.api.http.cross_site import add_cross_site_checks
@@ -87,6 +88,7 @@ class Api(FastAPI):
                 schemas.update(derived["$defs"])
             for replaced in ("HTTPValidationError", "ValidationError"):  # by problems
                 schemas.pop(replaced, None)
+            secured(document, problems.documented("unauthorized", "forbidden"))
             self.openapi_schema = document
         return self.openapi_schema
 
@@ -101,6 +103,7 @@ def create_app(settings: Settings, *, queue: Queue | None = None) -> FastAPI:
         lifespan=_lifespan(settings, queue),
         docs_url=None,
         redoc_url=None,
+        dependencies=[Depends(authorize)],
     )
     app.state.metrics = Metrics()
     add_cross_site_checks(app, settings)

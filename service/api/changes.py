@@ -17,7 +17,7 @@ from service.api.features import FeatureResponse, feature_response
 from service.api.http.dependencies import Provided
 from service.api.http.documents import Link, Request, link
 from service.api.http.fields import Id, instant
-from service.api.http.paging import Cursor, decoded, encoded, next_link
+from service.api.http.paging import Cursor, decoded, encoded, finite, next_link
 from service.api.http.problems import documented
 from service.catalog.changes import ChangeFilter, ChangePosition
 from service.catalog.records import Bounds, rfc3339
@@ -163,4 +163,4 @@ def position_of(cursor: str | None) -> ChangePosition | None:
     """Return where to go on. Raises BadRequest."""
     if cursor is None:
         return None
-    return ChangePosition(*decoded(cursor, instant, str, float.fromhex, str))
+    return ChangePosition(*decoded(cursor, instant, str, finite, str))

@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 from fastapi import APIRouter, Path, Query, Request
 from pydantic import Field
 
+from service.api.http.access import maps_of_key
 from service.api.http.dependencies import Provided
 from service.api.http.documents import Document, Link, link
 from service.api.http.fields import Id
@@ -49,9 +50,13 @@ class JobList(Document):
 
 @router.get("/jobs", summary="List jobs", responses=LISTED)
 def list_jobs(request: Request, services: Provided, asked: Annotated[JobsRequest, Query()]) -> JobList:
-    """Newest first."""
+    """Newest first; a key that is bound to maps sees those of its maps."""
     page = services.catalog.jobs.page(
-        status=asked.status, map_id=asked.map_id, after=asked.after(), limit=asked.limit
+        status=asked.status,
+        map_id=asked.map_id,
+        only_maps=maps_of_key(request),
+        after=asked.after(),
+        limit=asked.limit,
     )
     links = list_links(request, page, lambda job: (job.created, job.job_id))
     return JobList(jobs=[job_document(job, request) for job in page.items], links=links)

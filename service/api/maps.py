@@ -10,6 +10,7 @@ from fastapi.concurrency import run_in_threadpool
 from pydantic import BeforeValidator, Field
 
 from service.api.http import bodies, files
+from service.api.http.access import maps_of_key, require_map
 from service.api.http.bodies import Body
 from service.api.http.dependencies import Provided, Services
 from service.api.http.documents import Document, Link, Request, checked, link
@@ -156,6 +157,7 @@ async def create_map(request: HttpRequest, response: Response, services: Provide
     """From scans uploaded before (`scan_ids`) or sent here (`scans`); their poses, where given, set the frame of the map."""
     async with bodies.received(request, services.settings) as body:
         wanted = checked(MapRequest, body.fields)
+        require_map(request, wanted.id)
         record, job = await run_in_threadpool(_create, services, wanted, body)
     links = [link(request, f"/maps/{record.map_id}", "self"), monitor(request, response, job)]
     return AcceptedMap(map_id=record.map_id, job_id=job.job_id, status=record.status, links=links)
@@ -163,8 +165,8 @@ async def create_map(request: HttpRequest, response: Response, services: Provide
 
 @router.get("/maps", summary="List maps", responses=LISTED)
 def list_maps(request: HttpRequest, services: Provided, asked: Annotated[PageRequest, Query()]) -> MapList:
-    """Newest first."""
-    page = services.catalog.maps.page(after=asked.after(), limit=asked.limit)
+    """Newest first; a key that is bound to maps sees those."""
+    page = services.catalog.maps.page(only=maps_of_key(request), after=asked.after(), limit=asked.limit)
     links = list_links(request, page, lambda record: (record.created, record.map_id))
     return MapList(maps=[map_document(record, request) for record in page.items], links=links)
 

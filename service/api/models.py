@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Path, Query, Response
@@ -10,6 +11,7 @@ from fastapi.concurrency import run_in_threadpool
 from pydantic import Field
 
 from service.api.http import bodies
+from service.api.http.access import maps_of_key
 from service.api.http.dependencies import Provided, Services
 from service.api.http.documents import Document, Link, Request, checked, link
 from service.api.http.fields import Id, Model
@@ -86,7 +88,7 @@ async def train_model(
     """
     async with bodies.received(request, services.settings, takes=(bodies.JSON,)) as body:
         wanted = checked(TrainingRequest, body.fields)
-    record, job = await run_in_threadpool(_create, services, map_id, wanted)
+    record, job = await run_in_threadpool(_create, services, map_id, wanted, maps_of_key(request))
     return AcceptedModel(
         model=record.model,
         map_id=map_id,
@@ -99,9 +101,12 @@ async def train_model(
 
 
 @router.get("/models", summary="List models")
-def list_models(services: Provided) -> ModelList:
-    """Every card: what a model is, how it was made and measured, and what it needs."""
-    return ModelList(models=services.cards.all(), default=services.settings.model)
+def list_models(request: HttpRequest, services: Provided) -> ModelList:
+    """Every card: what a model is, how it was made and measured, and what it needs.
+
+    A key that is bound to maps sees the released ones, and those that were trained on its maps.
+    """
+    return ModelList(models=services.cards.all(maps_of_key(request)), default=services.settings.model)
 
 
 @router.get(
@@ -110,13 +115,18 @@ def list_models(services: Provided) -> ModelList:
     responses=documented("not_found", "not_ready", "invalid_request"),
 )
 def get_model(
-    services: Provided, name: Annotated[Part, Path()], asked: Annotated[ModelRequest, Query()]
+    request: HttpRequest,
+    services: Provided,
+    name: Annotated[Part, Path()],
+    asked: Annotated[ModelRequest, Query()],
 ) -> dict[str, Any]:
     """The card of a model."""
-    return services.cards.of(name, asked.version)
+    return services.cards.of(name, asked.version, maps_of_key(request))
 
 
-def _create(services: Services, map_id: str, wanted: TrainingRequest) -> tuple[ModelRecord, JobRecord]:
+def _create(
+    services: Services, map_id: str, wanted: TrainingRequest, maps: Collection[str] | None
+) -> tuple[ModelRecord, JobRecord]:
     catalog, most = services.catalog, services.settings.most_training_minutes()
     minutes = min(services.settings.training_minutes, most) if wanted.minutes is None else wanted.minutes
     if minutes > most:
@@ -128,7 +138,7 @@ def _create(services: Services, map_id: str, wanted: TrainingRequest) -> tuple[M
     record, job = catalog.models.create(
         map_id,
         name=name,
-        base=None if wanted.base is None else services.cards.check(wanted.base),
+        base=None if wanted.base is None else services.cards.check(wanted.base, maps),
         minutes=minutes,
         epochs=wanted.epochs,
     )

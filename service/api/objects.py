@@ -29,7 +29,7 @@ from service.api.geodesy import ToWgs84, to_wgs84
 from service.api.http.dependencies import Provided
 from service.api.http.documents import Document, Link, Request, link
 from service.api.http.fields import Id, instant
-from service.api.http.paging import Cursor, decoded, encoded, next_link
+from service.api.http.paging import Cursor, count, decoded, encoded, next_link
 from service.api.http.problems import MADE, documented
 from service.catalog.objects import ObjectFilter, SightingFilter
 from service.catalog.records import (
@@ -278,7 +278,7 @@ def get_survey_objects(
         )
     convert = _converter(catalog.maps.get(survey.map_id).anchor)
     wanted = SightingFilter(survey_id=survey_id, kind=asked.kind, min_probability=asked.min_probability)
-    after = None if asked.cursor is None else int(decoded(asked.cursor, int)[0])
+    after = None if asked.cursor is None else int(decoded(asked.cursor, count)[0])
     page = catalog.objects.of_survey(wanted, after=after, limit=asked.limit)
     links = _links(request, None if page.following is None else encoded(str(page.following)))
     links.append(link(request, f"/surveys/{survey_id}", "survey"))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import Annotated
 
 from fastapi import APIRouter, Path, Query, Response
@@ -12,6 +13,7 @@ from pydantic import Field
 from service.api import features
 from service.api.features import FeatureResponse, feature_response
 from service.api.http import bodies, files
+from service.api.http.access import maps_of_key
 from service.api.http.bodies import Body
 from service.api.http.dependencies import Provided, Services
 from service.api.http.documents import Document, Link, checked, link
@@ -77,7 +79,9 @@ async def create_survey(
     reference = await run_in_threadpool(services.catalog.maps.ready, map_id)  # before a long upload
     async with bodies.received(request, services.settings) as body:
         wanted = checked(SurveyRequest, body.fields)
-        record, job = await run_in_threadpool(_create, services, reference, wanted, body)
+        record, job = await run_in_threadpool(
+            _create, services, reference, wanted, body, maps_of_key(request)
+        )
     return AcceptedSurvey(
         survey_id=record.survey_id,
         map_id=map_id,
@@ -176,10 +180,14 @@ def _refused(survey: SurveyRecord) -> bool:
 
 
 def _create(
-    services: Services, reference: MapRecord, wanted: SurveyRequest, body: Body
+    services: Services,
+    reference: MapRecord,
+    wanted: SurveyRequest,
+    body: Body,
+    maps: Collection[str] | None,
 ) -> tuple[SurveyRecord, JobRecord]:
     catalog = services.catalog
-    model = services.cards.check(wanted.model or reference.model)
+    model = services.cards.check(wanted.model or reference.model, maps)
     with kept_scans(catalog, body, wanted) as scan_ids:
         record, job = catalog.surveys.create(
             reference.map_id,

@@ -9,6 +9,7 @@ from service.catalog.blobs import Blobs
 from service.catalog.changes import Changes
 from service.catalog.database import Database
 from service.catalog.jobs import Jobs
+from service.catalog.keys import Keys
 from service.catalog.maps import Maps
 from service.catalog.models import Models
 from service.catalog.objects import Objects
@@ -32,6 +33,7 @@ class Catalog:
     changes: Changes
     objects: Objects
     jobs: Jobs
+    keys: Keys
 
     def close(self) -> None:
         """Let go of every connection."""
@@ -59,4 +61,5 @@ def open_catalog(settings: Settings, *, migrate: bool = True) -> Catalog:
         changes=Changes(database),
         objects=Objects(database),
         jobs=Jobs(database),
+        keys=Keys(database),
     )

@@ -8,6 +8,7 @@ attempt ends so; or the machine's, and then the next one does not.
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from datetime import datetime
 from typing import Any, cast
@@ -55,15 +56,18 @@ class Jobs:
         *,
         status: JobStatus | None = None,
         map_id: str | None = None,
+        only_maps: Collection[str] | None = None,
         after: Position | None = None,
         limit: int = 100,
     ) -> Page[JobRecord]:
-        """Return jobs, newest first."""
+        """Return jobs, newest first; of `only_maps` where these are given."""
         query = select(tables.Job)
         if status is not None:
             query = query.where(tables.Job.status == status)
         if map_id is not None:
             query = query.where(tables.Job.map_id == map_id)
+        if only_maps is not None:
+            query = query.where(tables.Job.map_id.in_(only_maps))
         created, key = tables.Job.created, tables.Job.job_id
         return self._database.page(query, created, key, JobRecord.of_row, after=after, limit=limit)
 

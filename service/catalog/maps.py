@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 from sqlalchemy import select
@@ -76,10 +76,13 @@ class Maps:
         check_ready(record.status, f"map {map_id!r}", record.job_id)
         return record
 
-    def page(self, *, after: Position | None = None, limit: int = 100) -> Page[MapRecord]:
-        """Return maps, newest first."""
+    def page(
+        self, *, only: Collection[str] | None = None, after: Position | None = None, limit: int = 100
+    ) -> Page[MapRecord]:
+        """Return maps, newest first; `only` those of these ids where that is given."""
         created, key = tables.Map.created, tables.Map.map_id
-        return self._database.page(versions_in_use(), created, key, _record, after=after, limit=limit)
+        query = versions_in_use() if only is None else versions_in_use().where(key.in_(only))
+        return self._database.page(query, created, key, _record, after=after, limit=limit)
 
     def set_anchor(self, map_id: str, anchor: Anchor | None) -> MapRecord:
         """Say where the map lies on the Earth, or that nobody knows. Raises NotFound."""

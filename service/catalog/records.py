@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Annotated, Any, Generic, Literal, Self, TypeVar
@@ -45,6 +45,8 @@ ScanReason = Literal[
     "disagrees",
 ]
 ScanFormat = Literal["ply", "pcd"]
+#: What an API key may do; `admin` is everything.
+Scope = Literal["scans:write", "surveys:write", "maps:write", "changes:read", "admin"]
 Vector2 = tuple[float, float]
 Vector3 = tuple[float, float, float]
 Row4 = tuple[float, float, float, float]
@@ -398,6 +400,22 @@ class JobRecord(Record):
     survey_id: str | None
     model: str | None = Field(description="that a training makes", examples=[None])  #: `name/version`
     problem: Problem | None
+
+
+class KeyRecord(Record):
+    """An API key, without its secret."""
+
+    key_id: str
+    name: str
+    scopes: tuple[Scope, ...]
+    maps: tuple[str, ...] | None  #: that it is bound to; None: all
+    created: Utc
+    expires: Utc | None
+    revoked: Utc | None
+
+    def may(self, scopes: Collection[Scope]) -> bool:
+        """Tell whether the key has one of these scopes."""
+        return "admin" in self.scopes or not set(scopes).isdisjoint(self.scopes)
 
 
 class ChangeRecord(Record):

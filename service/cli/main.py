@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from service.cli import jobs, maps, models, objects, scans, surveys, sweep, up, versions
+from service.cli import jobs, keys, maps, models, objects, scans, surveys, sweep, up, versions
 from service.cli.terminal import Terminal
 from service.client import DEFAULT_URL, ClientError
 from service.up.embedded_redis import LaunchFailed
@@ -47,6 +47,7 @@ def _commands() -> typer.Typer:
     commands.command()(surveys.changes)
     commands.command()(objects.objects)
     commands.command()(jobs.jobs)
+    _add_group(commands, "keys", "API keys: who may ask the service.", keys.add, keys.list_, keys.revoke)
     of_models = _add_group(commands, "models", "Models that score tiles; alone, it lists them.", models.train)
     of_models.info.no_args_is_help = False
     of_models.callback(invoke_without_command=True)(models.list_)

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.table import Table
 
+from service.cli.settings import read_settings
 from service.cli.terminal import Terminal
-from service.cli.up import settings_given
 from service.settings import Settings
 from service.up.embedded_redis import LaunchFailed
 
@@ -33,7 +33,7 @@ def sweep(
     from service.catalog.tables import now  # noqa: PLC0415
 
     terminal: Terminal = ctx.obj
-    settings = settings_given(data_dir=data_dir)
+    settings = read_settings(data_dir=data_dir)
     _require_database(settings)
     catalog = open_catalog(settings, migrate=False)
     try:

@@ -9,11 +9,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from pydantic import ValidationError
 from rich.table import Table
 
+from service.cli.settings import read_settings
 from service.cli.terminal import Terminal
-from service.settings import Settings
 from service.up.embedded_redis import LaunchFailed
 
 if TYPE_CHECKING:
@@ -43,7 +42,7 @@ def up(
     if end_with_parent:
         end(os.getppid())
     terminal: Terminal = ctx.obj
-    settings = settings_given(
+    settings = read_settings(
         host=host,
         port=port,
         data_dir=data_dir,
@@ -71,16 +70,6 @@ def _write_ready_file(running: Running, path: Path) -> None:
         running.write(path)
     except OSError as error:
         raise LaunchFailed(f"the ready file {path} cannot be written ({error.strerror})") from error
-
-
-def settings_given(**given: Any) -> Settings:
-    """Return the settings, with what was given in place of what SPICD_* says. Raises `LaunchFailed`."""
-    try:
-        return Settings(**{name: value for name, value in given.items() if value is not None})
-    except ValidationError as error:
-        first = error.errors()[0]
-        name = "SPICD_" + "_".join(str(part) for part in first["loc"]).upper().removeprefix("SPICD_")
-        raise LaunchFailed(f"{name}: {first['msg']} (it is {first['input']!r})") from error
 
 
 def _table(running: dict[str, Any]) -> Table:

@@ -25,6 +25,7 @@ import uvicorn
 from fastapi import FastAPI
 
 from service.catalog.database import Database
+from service.catalog.keys import open_keys
 from service.queue import JobQueue
 from service.settings import Settings
 from service.up.children import WorkerPool
@@ -77,6 +78,7 @@ def up(
             _release_claims(redis)
         settings = _resolve(settings, redis, listening)
         _migrate(settings)
+        _require_a_key(settings)
         pool = WorkerPool(
             geometry=settings.geometry_workers,
             inference=settings.inference_workers,
@@ -112,7 +114,8 @@ def _release_claims(redis: EmbeddedRedis) -> None:
 def environment_of(settings: Settings) -> dict[str, str]:
     """Return this process's environment with every setting spelled out, for the workers."""
     values = settings.model_dump(mode="json", exclude_none=True)
-    return {**os.environ, **{f"SPICD_{name.upper()}": str(value) for name, value in values.items()}}
+    kept = {name: value for name, value in os.environ.items() if name != "SPICD_KEY"}  # a client's
+    return {**kept, **{f"SPICD_{name.upper()}": str(value) for name, value in values.items()}}
 
 
 class _Signals:
@@ -212,6 +215,19 @@ def _migrate(settings: Settings) -> None:
         database.close()
     except Exception as error:  # whatever the driver raises
         raise LaunchFailed(f"the database cannot be opened: {' '.join(str(error).split())}") from error
+
+
+def _require_a_key(settings: Settings) -> None:
+    """Raise LaunchFailed where others than this machine would reach an API that nobody could ask."""
+    if not settings.requires_key():
+        return
+    with open_keys(settings) as keys:
+        if keys.any_valid():
+            return
+    raise LaunchFailed(
+        f"requests to {settings.host} need an API key, and there is none: make one on this data folder or database with "
+        "`spicd keys add NAME --scope admin`, or set SPICD_AUTH=none where something in front asks who it is"
+    )
 
 
 def _running(settings: Settings, redis: EmbeddedRedis | None, pool: WorkerPool) -> Running:

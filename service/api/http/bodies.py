@@ -7,7 +7,6 @@ framework's own form would keep every file in a spool of its own and only then h
 from __future__ import annotations
 
 import contextlib
-import json
 from collections.abc import AsyncIterator, Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, field
@@ -20,6 +19,7 @@ from pydantic import BaseModel
 from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import MultipartParser, parse_options_header
 
+from service.api.http.json_text import read_json
 from service.api.http.uploads import Incoming, Upload
 from service.errors import BadRequest, TooLarge, WrongMediaType
 from service.settings import Settings
@@ -27,6 +27,7 @@ from service.settings import Settings
 PIECE = 1 << 20  #: bytes handed to the disk at a time
 MAX_JSON_BYTES = 1 << 20
 MAX_FIELDS_BYTES = 1 << 20  #: of all fields of a form together
+MAX_BOUNDARY = 70  #: letters
 MAX_PARTS = 2000  #: of a form
 INCOMING = (
     "incoming"  #: folder in the data folder; on the disk of the blobs, so that keeping a file is a rename
@@ -71,10 +72,14 @@ async def received(
         if media_type == JSON:
             text = bytearray()
             await _pour(request, text.extend, limit=limit)
-            yield Body(fields=_json(bytes(text)))
+            yield Body(fields=await run_in_threadpool(_json, bytes(text)))
         elif media_type == FORM:
             if not options.get(b"boundary"):
                 raise BadRequest("the Content-Type names no boundary; let the HTTP library write this header")
+            if len(options[b"boundary"]) > MAX_BOUNDARY:
+                raise BadRequest(
+                    f"the boundary has more than {MAX_BOUNDARY} letters (RFC 2046, Section 5.1.1)"
+                )
             form = Form(options[b"boundary"], folder, kept, frozenset({files}))
             await _pour(request, form.feed, limit=limit)
             form.finish()
@@ -141,8 +146,8 @@ def _json(text: bytes) -> dict[str, Any]:
     if not text.strip():
         raise BadRequest("the body is empty; send a JSON object")
     try:
-        fields = json.loads(text)
-    except (ValueError, RecursionError) as error:
+        fields = read_json(text)
+    except ValueError as error:
         raise BadRequest(f"the body is not JSON: {error}") from error
     if not isinstance(fields, dict):
         raise BadRequest(f"the body is a JSON {type(fields).__name__}; send an object")

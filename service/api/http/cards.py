@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import re
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -29,18 +30,22 @@ class Cards:
             card for path in sorted(self._folder.glob("*/*/card.json"), key=_order) if (card := _read(path))
         ]
 
-    def all(self) -> list[Card]:
-        """Return the cards of the model store, then those of the site's own models."""
-        return [*self.released(), *(model.card for model in self._models.ready() if model.card is not None)]
+    def all(self, maps: Collection[str] | None = None) -> list[Card]:
+        """Return the cards of the model store, then those that the site trained, on these `maps` or on any."""
+        trained = (model for model in self._models.ready() if maps is None or model.map_id in maps)
+        return [*self.released(), *(model.card for model in trained if model.card is not None)]
 
-    def of(self, name: str, version: str | None = None) -> Card:
-        """Return one card, by default of the newest version. Raises NotFound, and NotReady for a model in training."""
+    def of(self, name: str, version: str | None = None, maps: Collection[str] | None = None) -> Card:
+        """Return one card, by default of the newest version. Raises NotFound, and NotReady for a model in training.
+
+        With `maps` a model that was trained on another one is not found.
+        """
         for card in self.released():
             if card.get("name") == name and version in (None, str(card.get("version"))):
                 return card
         number = None if version is None else _number(version)
         model = None if number == 0 else self._models.find(name, number)
-        if model is None:
+        if model is None or (maps is not None and model.map_id not in maps):
             wanted = name if version is None else f"{name}/{version}"
             raise NotFound(f"no model {wanted!r}; GET /models lists those there are")
         if model.status == "ready" and model.card is not None:
@@ -48,12 +53,13 @@ class Cards:
         state = "is still in training" if model.status == "training" else "was not made"
         raise NotReady(f"model {model.model!r} {state}; look at job {model.job_id}")
 
-    def check(self, model: str) -> str:
+    def check(self, model: str, maps: Collection[str] | None = None) -> str:
         """Return `model` (`name/version`) if it can be used. Raises NotReady, and BadRequest naming those there are."""
+        name, version = model.split("/", 1)
         try:
-            self.of(*model.split("/", 1))
+            self.of(name, version, maps)
         except NotFound:
-            raise BadRequest(f"no model {model!r}; there is {_listed(self.all())}") from None
+            raise BadRequest(f"no model {model!r}; there is {_listed(self.all(maps))}") from None
         return model
 
     def check_released(self, model: str) -> str:

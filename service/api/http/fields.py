@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import re
 from datetime import UTC, datetime
@@ -10,9 +9,11 @@ from typing import Annotated, Any
 
 from pydantic import AfterValidator, BeforeValidator, Field, WithJsonSchema
 
+from service.api.http.json_text import read_json
 from service.catalog.records import Matrix
 
 RIGID_TOLERANCE = 1e-3  #: of R Rᵀ against the identity; poses written with four decimals pass
+MAX_LISTED = 1000  #: names in one list of a request
 LARGEST_SHIFT = 10_000.0  #: metres; further out the workers take no point of a scan either
 
 _RFC3339 = re.compile(r"\d{4}-\d\d-\d\d[Tt ]\d\d:\d\d:\d\d(\.\d+)?([Zz]|[+-]\d\d:\d\d)")
@@ -35,18 +36,24 @@ def from_text(value: Any) -> Any:
     if not isinstance(value, str):
         return value
     try:
-        return json.loads(value)
+        return read_json(value)
     except ValueError as error:
         raise ValueError(f"this is not JSON: {error}") from error
 
 
 def names_from_text(value: Any) -> Any:
-    """Read a list of names in a form: repeated fields, a JSON list, or names with commas between."""
-    if not isinstance(value, str):
-        return value
-    if value.lstrip().startswith("["):
-        return from_text(value)
-    return [name.strip() for name in value.split(",") if name.strip()]
+    """Read a list of names in a form: repeated fields, a JSON list, or names with commas between.
+
+    Raises ValueError for more than `MAX_LISTED`, before any of them is looked at.
+    """
+    if isinstance(value, str):
+        if value.lstrip().startswith("["):
+            value = from_text(value)
+        else:
+            value = [name.strip() for name in value.split(",") if name.strip()]
+    if isinstance(value, list) and len(value) > MAX_LISTED:
+        raise ValueError(f"a list of {len(value)} names, more than {MAX_LISTED}")
+    return value
 
 
 def rigid(matrix: Matrix) -> Matrix:

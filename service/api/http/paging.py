@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
+import math
 from collections.abc import Callable, Sequence
 from typing import Annotated, Any
 
@@ -12,6 +13,7 @@ from pydantic import Field
 
 from service.api.http.documents import Link, Request, link
 from service.api.http.fields import instant
+from service.api.http.json_text import read_json
 from service.catalog.records import Page, Position, rfc3339
 from service.errors import BadRequest
 
@@ -56,10 +58,32 @@ def encoded(*parts: str) -> str:
 def decoded(cursor: str, *readers: Callable[[str], Any]) -> Sequence[Any]:
     """Return the parts of a cursor, each as its reader reads it. Raises BadRequest."""
     try:
-        parts = json.loads(base64.urlsafe_b64decode(cursor + "=" * (-len(cursor) % 4)))
-        return [read(part) for read, part in zip(readers, parts, strict=True)]
-    except (ValueError, TypeError, RecursionError) as error:
+        parts = read_json(base64.urlsafe_b64decode(cursor + "=" * (-len(cursor) % 4)))
+        return [read(_plain(part)) for read, part in zip(readers, parts, strict=True)]
+    except (ValueError, TypeError, OverflowError) as error:
         raise BadRequest(f"cursor {cursor[:40]!r} is none of ours; follow a `next` link") from error
+
+
+def finite(text: str) -> float:
+    """Read a number as `float.hex` writes it. Raises ValueError and OverflowError."""
+    number = float.fromhex(text)
+    if not math.isfinite(number):
+        raise ValueError(f"{text} is no number of ours")
+    return number
+
+
+def count(text: str) -> int:
+    """Read a number of something, as a database keeps it. Raises ValueError."""
+    if not text.isdigit() or len(text) > 9:
+        raise ValueError(f"{text[:20]} is no number of ours")
+    return int(text)
+
+
+def _plain(part: object) -> str:
+    """Return a part of a cursor: ours have letters of ASCII. Lone surrogates and NUL are none for a database."""
+    if not isinstance(part, str) or not part.isascii() or not part.isprintable():
+        raise ValueError("a part of it is no text of ours")
+    return part
 
 
 def _path(request: HttpRequest) -> str:

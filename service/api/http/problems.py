@@ -19,6 +19,7 @@ from service.errors import ServiceError
 
 log = logging.getLogger(__name__)
 
+MAX_ERRORS = 20  #: values that one answer complains of
 MEDIA_TYPE = "application/problem+json"
 
 #: code -> (HTTP status, title). A status of None is that of a failed job, which no request answers with.
@@ -139,12 +140,13 @@ def add_handlers(app: FastAPI) -> None:
 
 def _service_error(_request: Request, error: Exception) -> Response:
     code = error.code if isinstance(error, ServiceError) and error.code in PROBLEMS else "internal"
-    return response(code, str(error))
+    headers = {"WWW-Authenticate": 'Bearer realm="spicd"'} if code == "unauthorized" else None  # RFC 6750, 3
+    return response(code, str(error), headers=headers)
 
 
 def _invalid(_request: Request, error: Exception) -> Response:
     entries: Sequence[Any] = error.errors() if isinstance(error, RequestValidationError) else ()
-    errors = [_invalid_value(entry) for entry in entries]
+    errors = [_invalid_value(entry) for entry in entries[:MAX_ERRORS]]
     first = errors[0] if errors else {"place": "request", "detail": "it does not match"}
     return response("invalid_request", f"{first['place']}: {first['detail']}", errors=errors)
 

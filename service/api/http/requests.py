@@ -81,7 +81,7 @@ class _Request:
             "received_bytes": self._received,
             "sent_bytes": self._sent,
         }
-        if key := self._scope.get("state", {}).get("key_id"):
+        if key := self._scope.get("state", {}).get("key"):
             line["key_id"] = key
         words = (
             "%(method)s %(route)s %(status)s, %(ms).1f ms, %(received_bytes)d bytes in, %(sent_bytes)d out"

@@ -15,7 +15,7 @@ from pydantic import BeforeValidator, Field
 from service.api.http.bodies import Body
 from service.api.http.dependencies import Services
 from service.api.http.documents import Link, Request, link
-from service.api.http.fields import DeviceId, Id, Instant, names_from_text
+from service.api.http.fields import MAX_LISTED, DeviceId, Id, Instant, names_from_text
 from service.catalog.catalog import Catalog
 from service.catalog.records import JobRecord, ScanRecord
 from service.errors import QueueUnavailable, ServiceError
@@ -27,7 +27,7 @@ log = logging.getLogger(__name__)
 class ScansRequest(Request):
     """Scans that were uploaded before; others may come with the request."""
 
-    scan_ids: Annotated[tuple[Id, ...], BeforeValidator(names_from_text), Field(max_length=1000)] = ()
+    scan_ids: Annotated[tuple[Id, ...], BeforeValidator(names_from_text), Field(max_length=MAX_LISTED)] = ()
     captured_at: Annotated[Instant | None, Field(description="of the files in this request")] = None
     device_id: Annotated[DeviceId | None, Field(description="of the files in this request")] = None
 

@@ -108,7 +108,7 @@ def test_a_connection_that_breaks_within_the_body_leaves_nothing(server: Any) ->
     incoming = data_dir / "incoming"
     with socket.create_connection((client.base_url.host, client.base_url.port)) as connection:
         connection.sendall(
-            b"POST /scans HTTP/1.1\r\nHost: here\r\nContent-Type: application/octet-stream\r\n"
+            b"POST /scans HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/octet-stream\r\n"
             b"Content-Length: 9000000\r\n\r\n" + HEAD + 3 * PIECE
         )
         _until(lambda: incoming.exists() and any(path.stat().st_size for path in incoming.iterdir()))

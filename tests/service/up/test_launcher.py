@@ -1,0 +1,71 @@
+"""`spicd up` before anything of it runs: it does not listen where nobody could ask."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from service.catalog.keys import open_keys
+from service.settings import Settings
+from service.up.embedded_redis import LaunchFailed
+from service.up.launcher import Running, environment_of, up
+
+
+class Started(Exception):
+    """It got as far as being ready."""
+
+
+def launch(folder: Path, **given: Any) -> None:
+    """Start the API alone, without a queue, and end once it is ready."""
+
+    def ready(_: Running) -> None:
+        raise Started
+
+    settings = Settings(
+        data_dir=folder,
+        port=0,
+        redis_url="redis://127.0.0.1:1/0",
+        geometry_workers=0,
+        inference_workers=0,
+        **given,
+    )
+    up(settings, on_ready=ready)
+
+
+def test_beyond_loopback_it_does_not_start_without_a_key_and_says_how_one_is_made(tmp_path: Path) -> None:
+    with pytest.raises(LaunchFailed, match=r"spicd keys add .* SPICD_AUTH=none"):
+        launch(tmp_path, host="0.0.0.0")
+
+
+def test_a_key_that_was_revoked_is_none(tmp_path: Path) -> None:
+    with open_keys(Settings(data_dir=tmp_path)) as keys:
+        keys.revoke(keys.add("first", scopes=["admin"])[0].key_id)
+    with pytest.raises(LaunchFailed, match="there is none"):
+        launch(tmp_path, host="0.0.0.0")
+
+
+def test_with_a_key_it_starts(tmp_path: Path) -> None:
+    with open_keys(Settings(data_dir=tmp_path)) as keys:
+        keys.add("first", scopes=["admin"])
+    with pytest.raises(Started):
+        launch(tmp_path, host="0.0.0.0")
+
+
+@pytest.mark.parametrize("given", [{}, {"host": "0.0.0.0", "auth": "none"}])
+def test_on_loopback_or_behind_something_that_asks_it_needs_none(
+    tmp_path: Path, given: dict[str, str]
+) -> None:
+    with pytest.raises(Started):
+        launch(tmp_path, **given)
+
+
+def test_loopback_may_be_told_to_need_one(tmp_path: Path) -> None:
+    with pytest.raises(LaunchFailed, match="spicd keys add"):
+        launch(tmp_path, auth="required")
+
+
+def test_workers_do_not_inherit_the_key_of_a_client(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SPICD_KEY", "spicd_secret")
+    assert "spicd_secret" not in environment_of(Settings()).values()
