@@ -25,6 +25,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "service.errors": (),
     "service.settings": (),
     "service.logs": (),
+    "service.tracing": (),
     "service.client": (),
     "service.tile_features": (),
     "service.object_features": ("service.tile_features",),
@@ -34,6 +35,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
         "service.catalog",
         "service.errors",
         "service.logs",
+        "service.tracing",
         "service.settings",
     ),
     "service.api": (
@@ -126,6 +128,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "worker.jobs": (
         "service.catalog",
         "service.settings",
+        "service.tracing",
         "worker.pipeline",
         "worker.training",
         "worker.detectors",
@@ -202,6 +205,7 @@ ONLY_IN = {
     "sqlalchemy": ("service.catalog",),
     "obstore": ("service.catalog",),
     "fastapi": ("service.api", "service.up"),
+    "opentelemetry": ("service.tracing",),
 }
 
 #: The files of the worker that know the service; the demo and the rest are in ROOMS.

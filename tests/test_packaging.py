@@ -15,6 +15,8 @@ from tests.test_imports import ROOT, read_imports, within
 
 #: Required though no line imports them: SQLAlchemy loads the driver that a URL names.
 LOADED_BY_NAME = {"psycopg"}
+#: Imported only where a collector of traces is named: the extra `otel`.
+OPTIONAL = {"opentelemetry"}
 #: Imported though another package is required, which hands them on as its own.
 HANDED_ON = {"pydantic-core": "pydantic", "starlette": "fastapi", "psycopg-binary": "psycopg"}
 
@@ -45,7 +47,7 @@ def imported(package: str) -> set[str]:
         if within(name, (package,))
         for other in others
     }
-    outside = tops - {"service", "worker", *sys.stdlib_module_names}
+    outside = tops - {"service", "worker", *OPTIONAL, *sys.stdlib_module_names}
     names = {canonicalize_name(found[top][0] if top in found else top) for top in outside}
     return {HANDED_ON.get(name, name) for name in names}
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TypeVar
 
+from service import tracing
 from service.catalog.catalog import Catalog, open_catalog
 from service.catalog.records import JobRecord, Problem
 from service.catalog.steps import JobKind
@@ -72,7 +73,7 @@ def step(run: Callable[[Context], None]) -> Callable[[str], None]:
     @functools.wraps(run)
     def call(job_id: str) -> None:
         settings = Settings()
-        with ExitStack() as stack:
+        with tracing.step(job_id, run.__name__), ExitStack() as stack:
             catalog = open_catalog(settings, migrate=False)
             stack.callback(catalog.close)
             if not catalog.jobs.start(job_id):
@@ -82,10 +83,7 @@ def step(run: Callable[[Context], None]) -> Callable[[str], None]:
             folder = settings.scratch_dir()  # on the blobs' own disk, and swept when the service starts
             folder.mkdir(parents=True, exist_ok=True)
             scratch = Path(stack.enter_context(TemporaryDirectory(prefix="spicd-step-", dir=folder)))
-            report = Reporter(
-                STAGES[job.kind],
-                lambda stage, share: catalog.jobs.report(job_id, message=stage, progress=share),
-            )
+            report = Reporter(STAGES[job.kind], functools.partial(_report, catalog, job_id))
             try:
                 run(Context(settings=settings, catalog=catalog, job=job, report=report, scratch=scratch))
             except Cancelled:
@@ -95,6 +93,11 @@ def step(run: Callable[[Context], None]) -> Callable[[str], None]:
                 raise
 
     return call
+
+
+def _report(catalog: Catalog, job_id: str, stage: str, share: float) -> bool:
+    tracing.stage(stage)
+    return catalog.jobs.report(job_id, message=stage, progress=share)
 
 
 def load(context: Context, key: str, read: Callable[[Path], T]) -> T:

@@ -15,6 +15,7 @@ from uuid import uuid4
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from service import tracing
 from service.logs import about, fields
 
 log = logging.getLogger("spicd.requests")
@@ -37,11 +38,12 @@ class RequestLog:
             await self._app(scope, receive, send)
             return
         request = _Request(scope, receive, send)
-        with about(request_id=request.id):
+        with about(request_id=request.id), tracing.request(Headers(scope=scope)) as trace:
             try:
                 await self._app(scope, request.receive, request.send)
             finally:
                 request.log()
+                trace.answered(request.method, request.route, request.status, request.id)
 
 
 class _Request:
@@ -50,9 +52,20 @@ class _Request:
     def __init__(self, scope: Scope, receive: Receive, send: Send) -> None:
         self.id = _id_of(scope)
         self._scope, self._receive, self._send = scope, receive, send
-        self._status: int | None = None
+        self.status: int | None = None
         self._received = self._sent = 0
         self._begun = time.perf_counter()
+
+    @property
+    def method(self) -> str:
+        """The client's word, where it is one."""
+        given: str = self._scope["method"]
+        return given if _METHOD.fullmatch(given) else "other"
+
+    @property
+    def route(self) -> str:
+        """The template of its route, once that is known."""
+        return getattr(self._scope.get("route"), "path", "none")
 
     async def receive(self) -> Message:
         """Receive what the client sends, and count its bytes."""
@@ -63,20 +76,18 @@ class _Request:
     async def send(self, message: Message) -> None:
         """Send the answer with the id, and count its bytes."""
         if message["type"] == "http.response.start":
-            self._status = message["status"]
+            self.status = message["status"]
             MutableHeaders(scope=message)[HEADER] = self.id
         self._sent += len(message.get("body", b""))
         await self._send(message)
 
     def log(self) -> None:
         """Log the line; what machines ask every few seconds is of interest when it goes wrong."""
-        route = getattr(self._scope.get("route"), "path", "none")
-        quiet = route in _QUIET and self._status == 200
-        method = self._scope["method"] if _METHOD.fullmatch(self._scope["method"]) else "other"
+        quiet = self.route in _QUIET and self.status == 200
         line = {
-            "method": method,
-            "route": route,
-            "status": self._status,
+            "method": self.method,
+            "route": self.route,
+            "status": self.status,
             "ms": round(1000 * (time.perf_counter() - self._begun), 1),
             "received_bytes": self._received,
             "sent_bytes": self._sent,

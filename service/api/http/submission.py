@@ -12,6 +12,7 @@ from fastapi import Request as HttpRequest
 from fastapi import Response
 from pydantic import BeforeValidator, Field
 
+from service import tracing
 from service.api.http.bodies import Body
 from service.api.http.dependencies import Services
 from service.api.http.documents import Link, Request, link
@@ -70,6 +71,7 @@ def submit(services: Services, job: JobRecord, *, forget: Callable[[], None]) ->
     except BaseException:
         forget()
         raise
+    tracing.link_job(job.job_id)
     with about(job_id=job.job_id):  # the one line that has the ids of request and job
         log.info("the %s job was submitted", job.kind)
 
