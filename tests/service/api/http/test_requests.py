@@ -12,7 +12,8 @@ from fastapi.testclient import TestClient
 from service.catalog.catalog import Catalog
 from service.catalog.jobs import Jobs
 from service.logs import _note_about
-from tests.support.samples import add_map, ply
+from service.settings import Settings
+from tests.support.samples import RememberingQueue, add_map, catalog_of, ply, running
 
 
 class Lines(logging.Handler):
@@ -112,3 +113,16 @@ def test_one_line_has_the_ids_of_request_and_job(client: TestClient, catalog: Ca
     ).json()["job_id"]
     (line,) = lines.of("service.api.http.submission")
     assert line.about == {"request_id": "abc", "job_id": job_id}
+
+
+def test_the_line_names_the_key_by_its_id_alone(
+    settings: Settings, queue: RememberingQueue, lines: Lines
+) -> None:
+    with running(settings.model_copy(update={"auth": "required"}), queue) as client:
+        record, secret = catalog_of(client).keys.add("robot", scopes=["changes:read"])
+        assert client.get("/maps", headers={"Authorization": f"Bearer {secret}"}).status_code == 200
+        assert client.get("/maps").status_code == 401
+    named, nameless = lines.of("spicd.requests")
+    assert named.fields["key_id"] == record.key_id
+    assert named.getMessage().endswith(f", key {record.key_id}")
+    assert "key_id" not in nameless.fields
