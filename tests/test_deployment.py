@@ -23,6 +23,7 @@ import pytest
 import yaml
 from fastapi.testclient import TestClient
 
+from service.catalog.tallies import FAULTS
 from service.settings import Settings
 from tests.support.samples import RememberingQueue, running, settings_in
 from tests.test_imports import ROOT
@@ -243,7 +244,7 @@ def test_each_container_gets_settings_that_are_read(name: str, monkeypatch: pyte
     assert settings.resolved_blob_url() == "s3://spicd/blobs"
     assert settings.log_format == "json"
     targets = {v["target"] if isinstance(v, dict) else v.split(":")[1] for v in SERVICES[name]["volumes"]}
-    assert str(settings.data_dir) in targets
+    assert str(settings.data_dir.parent) in targets
     files = {value for key, value in environment.items() if key.endswith("_FILE")}
     assert files == {f"/run/secrets/{secret}" for secret in SERVICES[name]["secrets"]}
 
@@ -450,6 +451,11 @@ def test_an_alert_says_what_to_do(rule: dict[str, Any]) -> None:
     grouped = re.findall(r"by \(([^)]*)\)", rule["expr"])
     if grouped:
         assert set(shown) <= {label.strip() for group in grouped for label in group.split(",")}
+
+
+def test_the_faults_that_somebody_is_called_for_are_told_before_they_happen() -> None:
+    (rule,) = [rule for rule in RULES if rule["alert"] == "SpicdJobsFail"]
+    assert f'outcome=~"{"|".join(FAULTS)}"' in rule["expr"]
 
 
 def test_the_board_has_a_panel_in_each_place() -> None:

@@ -9,6 +9,7 @@ their keys: no two transactions wait for each other crosswise, and a row that ev
 
 from __future__ import annotations
 
+import itertools
 import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -19,7 +20,7 @@ from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.orm import Session
 
 from service.catalog.records import JobStatus, ScanOutcome, TileRecord
-from service.catalog.steps import JobKind
+from service.catalog.steps import STEPS, JobKind
 from service.catalog.tables import Tally
 
 _NOTED = "tallies"  #: where a session keeps what its transaction has counted so far
@@ -33,7 +34,13 @@ class Measure:
     help: str
     labels: tuple[str, ...]
     summary: bool = False
+    #: Values of the labels that are told as 0 before anything was counted: Prometheus sees no first increase otherwise.
+    expected: tuple[tuple[str, ...], ...] = ()
 
+
+#: Ends of a job that somebody is called for; see docker/monitoring/alerts.yaml.
+FAULTS = ("internal", "worker_died", "timed_out", "disk_full")
+_OF_STEPS = tuple((kind, step.name) for kind, steps in STEPS.items() for step in steps)
 
 STEP_SECONDS = Measure(
     name="spicd_step_seconds",
@@ -51,21 +58,25 @@ ATTEMPTS = Measure(
     name="spicd_step_attempts_lost",
     help="Steps that ended without a result by their own fault",
     labels=("kind", "step"),
+    expected=_OF_STEPS,
 )
 INTERRUPTIONS = Measure(
     name="spicd_step_interruptions",
     help="Steps that were interrupted from outside: killed, stopped, or a part that they need was away",
     labels=("kind", "step"),
+    expected=_OF_STEPS,
 )
 JOBS_ENDED = Measure(
     name="spicd_jobs_ended",
     help="Jobs that ended: successful, or the code of their problem",
     labels=("kind", "outcome"),
+    expected=tuple(itertools.product(STEPS, ("successful", *FAULTS))),
 )
 SCANS = Measure(
     name="spicd_scans_registered",
     help="Scans of maps and surveys by what became of them: accepted, or the reason of docs/reasons.md",
     labels=("of", "outcome"),
+    expected=(("map", "accepted"), ("survey", "accepted")),
 )
 FITNESS = Measure(
     name="spicd_registration_fitness",

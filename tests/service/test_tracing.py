@@ -5,19 +5,15 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, field
-from http.server import BaseHTTPRequestHandler, HTTPServer
-from typing import Any
 
 import pytest
 from fastapi.testclient import TestClient
-from opentelemetry.proto.collector.trace.v1.trace_service_pb2 import ExportTraceServiceRequest
 
 from service import tracing
 from service.catalog.catalog import Catalog
+from tests.support.collector import Collector, attributes, collecting
 from tests.support.samples import add_map, ply
 
 #: A worker that forks for a step, which ends as rq's does: without the interpreter's own end.
@@ -37,60 +33,22 @@ os.waitpid(child, 0)
 """
 
 
-@dataclass
-class Collector:
-    """Stands in for an OpenTelemetry collector."""
-
-    url: str = ""
-    spans: list[Any] = field(default_factory=list)
-
-    def named(self, name: str) -> Any:
-        """The one span of that name, once it has come."""
-        until = time.monotonic() + 10
-        while time.monotonic() < until and all(span.name != name for span in self.spans):
-            time.sleep(0.02)
-        (found,) = [span for span in self.spans if span.name == name]
-        return found
-
-
 @pytest.fixture
 def collector() -> Iterator[Collector]:
-    collected = Collector()
-
-    class Handler(BaseHTTPRequestHandler):
-        def do_POST(self) -> None:
-            body = self.rfile.read(int(self.headers["Content-Length"]))
-            for resource in ExportTraceServiceRequest.FromString(body).resource_spans:
-                for scope in resource.scope_spans:
-                    collected.spans.extend(scope.spans)
-            self.send_response(200)
-            self.end_headers()
-
-        def log_message(self, *_: object) -> None:
-            pass
-
-    server = HTTPServer(("127.0.0.1", 0), Handler)
-    collected.url = f"http://127.0.0.1:{server.server_port}"
-    threading.Thread(target=server.serve_forever, daemon=True).start()
-    yield collected
-    server.shutdown()
-    server.server_close()
+    with collecting() as collected:
+        yield collected
 
 
 @pytest.fixture
 def traced(collector: Collector, monkeypatch: pytest.MonkeyPatch) -> Iterator[Collector]:
     """This process has its spans collected."""
-    monkeypatch.setenv("OTEL_EXPORTER_OTLP_ENDPOINT", collector.url)
-    monkeypatch.setenv("OTEL_EXPORTER_OTLP_COMPRESSION", "none")
+    for name, value in collector.environment.items():
+        monkeypatch.setenv(name, value)
     tracing._provider.cache_clear()
     yield collector
     if (provider := tracing._provider(os.getpid())) is not None:
         provider.shutdown()
     tracing._provider.cache_clear()
-
-
-def attributes(span: Any) -> dict[str, Any]:
-    return {one.key: one.value.string_value or one.value.int_value for one in span.attributes}
 
 
 def sent(traced: Collector) -> Collector:
@@ -134,12 +92,7 @@ def test_a_request_that_submits_a_job_has_a_link_to_the_jobs_trace(
 def test_a_step_in_a_forked_process_has_its_stages_and_is_in_the_jobs_trace(
     collector: Collector, fails: str
 ) -> None:
-    environment = {
-        **os.environ,
-        "OTEL_EXPORTER_OTLP_ENDPOINT": collector.url,
-        "OTEL_EXPORTER_OTLP_COMPRESSION": "none",
-        "FAIL": fails,
-    }
+    environment = {**os.environ, **collector.environment, "FAIL": fails}
     subprocess.run([sys.executable, "-c", FORKING], env=environment, check=True, timeout=60)
     step = collector.named("step register_survey")
     assert step.trace_id == tracing._of_job("job-1").trace_id.to_bytes(16)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import shutil
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -174,21 +174,27 @@ def _queue(one: OpenSteps) -> str:
 
 def _of_tallies(samples: Iterable[tallies.Sample]) -> list[Metric]:
     """Tell every measure, also those of which nothing was counted yet."""
-    families: dict[str, CounterMetricFamily | SummaryMetricFamily] = {}
-    for measure in tallies.MEASURES:
-        kind = SummaryMetricFamily if measure.summary else CounterMetricFamily
-        families[measure.name] = kind(measure.name, measure.help, labels=measure.labels)
+    counted: dict[str, dict[tuple[str, ...], tuple[int, float]]] = {
+        measure.name: dict.fromkeys(measure.expected, (0, 0.0)) for measure in tallies.MEASURES
+    }
     labels = {measure.name: measure.labels for measure in tallies.MEASURES}
     for sample in samples:
-        family = families.get(sample.name)
-        if family is None:  # of another release
-            continue
-        values = [sample.labels.get(label, "") for label in labels[sample.name]]
-        if isinstance(family, SummaryMetricFamily):
-            family.add_metric(values, count_value=sample.count, sum_value=sample.total)
-        else:
-            family.add_metric(values, sample.total)
-    return list(families.values())
+        if sample.name in counted:  # those of another release are left out
+            values = tuple(sample.labels.get(label, "") for label in labels[sample.name])
+            counted[sample.name][values] = sample.count, sample.total
+    return [_family(measure, counted[measure.name]) for measure in tallies.MEASURES]
+
+
+def _family(measure: tallies.Measure, counted: Mapping[tuple[str, ...], tuple[int, float]]) -> Metric:
+    if measure.summary:
+        summary = SummaryMetricFamily(measure.name, measure.help, labels=measure.labels)
+        for values, (count, total) in counted.items():
+            summary.add_metric(values, count_value=count, sum_value=total)
+        return summary
+    counter = CounterMetricFamily(measure.name, measure.help, labels=measure.labels)
+    for values, (_, total) in counted.items():
+        counter.add_metric(values, total)
+    return counter
 
 
 class MetricsMiddleware:

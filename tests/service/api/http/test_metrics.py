@@ -12,6 +12,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from sqlalchemy import text, update
 
 from service.api.http.metrics import Workers
+from service.api.http.problems import PROBLEMS
 from service.catalog import tables, tallies
 from service.catalog.catalog import Catalog
 from tests.support.samples import add_map, add_survey
@@ -70,6 +71,15 @@ def test_every_measure_is_told_of_before_anything_is_counted(client: TestClient)
     told = client.get("/metrics").text
     for measure in tallies.MEASURES:
         assert f"# HELP {measure.name}" in told
+
+
+def test_what_somebody_is_called_for_is_0_before_it_happens(client: TestClient) -> None:
+    """Prometheus' `increase` does not see the first of a series that was not there."""
+    found = scraped(client)
+    for code in tallies.FAULTS:
+        assert found["spicd_jobs_ended_total", "survey", code] == 0
+        assert PROBLEMS[code]
+    assert found["spicd_step_attempts_lost_total", "survey", "score"] == 0
 
 
 def test_the_disk_and_the_workers_are_told(client: TestClient) -> None:
