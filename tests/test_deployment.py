@@ -199,6 +199,23 @@ def test_the_compose_file_is_one() -> None:
     jsonschema.validate(COMPOSE, json.loads(schema.read_text()))
 
 
+@pytest.mark.parametrize("name", ["ci", "images"])
+def test_a_workflow_of_the_hosted_ci_is_one(name: str) -> None:
+    schema = resources.files("check_jsonschema") / "builtin_schemas/vendor/github-workflows.json"
+    workflow = yaml.safe_load((ROOT / f".github/workflows/{name}.yml").read_text())
+    workflow["on"] = workflow.pop(True)  # YAML 1.1 takes the word for a truth value
+    jsonschema.validate(workflow, json.loads(schema.read_text()))
+
+
+def test_the_hosted_ci_builds_every_image_and_reads_every_file() -> None:
+    jobs = yaml.safe_load((ROOT / ".github/workflows/images.yml").read_text())["jobs"]
+    targets = {name for name, stage in STAGES.items() if any(word == "USER" for word, _ in stage.lines)}
+    assert set(jobs["build"]["strategy"]["matrix"]["target"]) == targets
+    commands = " ".join(step.get("run", "") for job in jobs.values() for step in job["steps"])
+    for image in (SERVICES["proxy"]["image"], "promtool", "hadolint", "compose.yaml --profile gpu config"):
+        assert image in commands
+
+
 def test_the_parts_of_the_compose_file_are_there_and_fit_together() -> None:
     assert set(SERVICES) == {"proxy", *OURS, *STORES, "s3-bucket"}
     for part in SERVICES.values():
