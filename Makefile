@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 
-.PHONY: help demo up test test-fast check format bench openapi clean
+.PHONY: help demo up test test-fast check format bench chaos fuzz load soak openapi clean
 help: ## this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
 
@@ -31,6 +31,19 @@ format: $(INSTALLED) ## let ruff put the code in shape
 
 bench: $(INSTALLED) ## seconds in each stage on a simulated corridor, saved under bench/
 	$(BIN)/spicd-worker bench
+
+chaos: $(INSTALLED) ## 1,000 kills and 100 freezes while surveys run: an hour, 90 minutes at most
+	$(BIN)/python -m tests.breaking.chaos
+
+fuzz: $(INSTALLED) ## a million mutated scans to the readers, 100,000 requests to the API: about 20 minutes, 40 at most
+	$(BIN)/python -m tests.breaking.fuzz_readers --files 1000000 --minutes 25
+	$(BIN)/python -m tests.breaking.fuzz_api --cases 100000 --minutes 15
+
+load: $(INSTALLED) ## 20 robots at 200 kB/s, 50 surveys, 5 dashboards against a service of its own
+	$(BIN)/python -m tests.breaking.load
+
+soak: $(INSTALLED) ## two hours of light work; fails where a process grows
+	$(BIN)/python -m tests.breaking.soak
 
 openapi: $(INSTALLED) ## write openapi/openapi.json anew
 	$(BIN)/python -m service.api.openapi

@@ -20,6 +20,8 @@ ServiceError
 
 from __future__ import annotations
 
+import errno
+
 
 class ServiceError(Exception):
     """Base of every error that a client can see; `str()` says what is wrong and what to do."""
@@ -85,3 +87,12 @@ class DatabaseUnavailable(Unavailable):
 
 class BlobsUnavailable(Unavailable):
     code = "blobs_unavailable"
+
+
+def is_disk_full(error: BaseException | None) -> bool:
+    """Tell whether an error, or one that it comes from, says that no space is left."""
+    while error is not None:
+        if isinstance(error, DiskFull) or getattr(error, "errno", None) in (errno.ENOSPC, errno.EDQUOT):
+            return True
+        error = error.__cause__ or error.__context__
+    return False

@@ -1,47 +1,103 @@
-"""The way of a job to its workers: the only file of the service that knows rq.
+"""The way of a step to its worker: the only file of the service that knows rq.
 
-The queue carries names and ids and nothing else, and is never the record: what a job is and how far it got stands in
-the catalog.
+The queue carries names and ids and nothing else, and is never the record: what a job is, how far it got and which step
+is due stands in the catalog. What waits here is the little that workers take next (service/dispatch.py).
+
+A worker that takes a step moves it from the queue to the list of steps that are taken, then claims it. The claim lasts
+as long as the worker renews it, and its key in Redis ends by itself a few seconds after the last time.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
 from typing import Any
 
 from redis import Redis
 from redis.backoff import NoBackoff
 from redis.exceptions import RedisError, WatchError
 from redis.retry import Retry
-from rq import Queue
-from rq.command import send_stop_job_command
-from rq.exceptions import InvalidJobOperation, NoSuchJobError
+from rq.command import send_command
 from rq.job import Job, JobStatus
-from rq.registry import DeferredJobRegistry
 from rq.serializers import JSONSerializer
+from rq.worker_registration import REDIS_WORKER_KEYS
 
 from service.catalog.steps import STEPS, JobKind, Step
+from service.catalog.steps import Queue as QueueName
 from service.errors import QueueUnavailable
 
 PATIENCE_S = 2.0  #: a request waits no longer than this for Redis
-KEPT_S = 24 * 3600  #: how long rq remembers a step that ended; the catalog keeps the result
+KEPT_S = 24 * 3600  #: how long rq remembers a step that nobody cleaned up after
+QUEUES: tuple[QueueName, ...] = ("geometry", "inference")
+
+_WORKER = "rq:worker:"  #: what the key of a worker begins with
 
 
-def step_id(job_id: str, step: Step) -> str:
+def step_id(job_id: str, step: str) -> str:
     """Return the name of one step in the queue. rq admits letters, digits, `_` and `-`; a step's name has no `-`."""
-    return f"{job_id}-{step.name}"
+    return f"{job_id}-{step}"
+
+
+def step_of_id(name: str) -> tuple[str, str]:
+    """Return the id of the job and the name of the step."""
+    job_id, _, step = name.rpartition("-")
+    return job_id, step
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Claim:
+    """A worker's hold on a step."""
+
+    step: str  #: as `step_id` names it
+    execution: str  #: of rq, one a run
+    worker: str | None  #: name of the worker; None when the claim has ended without being given back
+
+    @property
+    def key(self) -> str:
+        """Its member in rq's registry of what runs."""
+        return f"{self.step}:{self.execution}"
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class QueueState:
+    """What one queue holds."""
+
+    waiting: tuple[str, ...] = ()  #: steps that no worker has taken, the next one first
+    taken: tuple[str, ...] = ()  #: that a worker has taken and not yet claimed
+    claims: tuple[Claim, ...] = ()
+    answering: tuple[str, ...] = ()  #: names of the workers that gave a sign of life
+    silent: tuple[str, ...] = ()  #: of those that did not, and never said that they end
+
+    @property
+    def held(self) -> frozenset[str]:
+        """Every step that waits, is taken, or has a claim that stands."""
+        claimed = (claim.step for claim in self.claims if claim.worker is not None)
+        return frozenset((*self.waiting, *self.taken, *claimed))
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Snapshot:
+    """What all queues hold."""
+
+    queues: Mapping[QueueName, QueueState] = field(default_factory=dict)
+
+    def __getitem__(self, queue: QueueName) -> QueueState:
+        return self.queues.get(queue) or QueueState()
+
+    @property
+    def held(self) -> frozenset[str]:
+        """The steps that any queue holds."""
+        return frozenset().union(*(state.held for state in self.queues.values()))
 
 
 class JobQueue:
-    """Submits, looks for and dismisses jobs; safe to share between threads, connects at the first call.
+    """Hands steps over, says what is held, and dismisses; safe to share between threads, connects at the first call.
 
-    `steps` is another table of steps in tests. Every method raises `QueueUnavailable` when Redis does not answer.
+    Every method raises `QueueUnavailable` when Redis does not answer.
     """
 
-    def __init__(
-        self, redis_url: str, *, timeout_s: int = 3600, steps: Mapping[JobKind, Sequence[Step]] = STEPS
-    ) -> None:
+    def __init__(self, redis_url: str, *, timeout_s: int = 3600) -> None:
         self._redis = Redis.from_url(
             redis_url,
             socket_timeout=PATIENCE_S,
@@ -49,49 +105,74 @@ class JobQueue:
             retry=Retry(NoBackoff(), 0),
         )
         self._timeout_s = timeout_s
-        self._steps = steps
 
     def ping(self) -> None:
         """Return when the queue can take jobs."""
         with _redis_errors():
             self._redis.ping()
 
-    def submit(self, job_id: str, kind: JobKind) -> None:
-        """Enqueue the steps of a job, all or none; a job that the queue holds is left as it is.
+    def snapshot(self) -> Snapshot:
+        """Return what the queues hold, and which workers answer."""
+        with _redis_errors():
+            return Snapshot(queues={name: self._state(name) for name in QUEUES})
 
-        One that it lost goes on with the first step that had not finished, as far as the queue remembers.
+    def arrange(self, queue: QueueName, wanted: Sequence[tuple[str, Step]]) -> None:
+        """Have these steps (id of the job, step) wait in this order, and none else.
+
+        A step that a worker has taken or claimed meanwhile is left as it is. Where the queue changes during the call,
+        nothing is done: the next call sees it.
         """
-        # a WatchError: the same job was submitted, or moved on, between the look and the write
+        key = _waiting(queue)
         with _redis_errors(), suppress(WatchError), self._redis.pipeline() as pipe:
-            # every change of a step's state is one of these keys, so who comes between is noticed
-            pipe.watch(*(Job.key_for(step_id(job_id, step)) for step in self._steps[kind]))  # type: ignore[no-untyped-call]
-            if self._holds(job_id, kind):
+            pipe.watch(key, _taken(queue), _claims(queue))  # type: ignore[no-untyped-call]
+            state = self._state(queue)
+            gone = state.held.difference(state.waiting)
+            steps = {step_id(job_id, step.name): (job_id, step) for job_id, step in wanted}
+            order = [name for name in steps if name not in gone]
+            if tuple(order) == state.waiting:
                 return
-            jobs = self._chain(job_id, self._left(job_id, kind))
             pipe.multi()
-            for job in jobs:
-                self._forget(job, pipe)
-            for waiting in jobs[1:]:
-                self._defer(waiting, pipe)
-            self._queue(jobs[0].origin).enqueue_job(jobs[0], pipeline=pipe)
+            pipe.delete(key)
+            for name in set(state.waiting).difference(order):
+                self._forget(name, pipe)
+            for name in order:
+                if name not in state.waiting:
+                    self._forget(name, pipe)
+                    self._write(*steps[name], pipe)
+                pipe.rpush(key, name)
             pipe.execute()
 
-    def holds(self, job_id: str, kind: JobKind) -> bool:
-        """Tell whether a step of the job waits for a worker, or a worker has its claim on one.
-
-        A claim outlives its worker by about a minute; then another worker finds it and asks what to do.
-        """
+    def release(self, claims: Iterable[Claim]) -> None:
+        """Take claims away that no worker has any more; what is to be known of them is recorded before."""
         with _redis_errors():
-            return self._holds(job_id, kind)
+            for claim in claims:
+                with self._unheld(claim.step, but=claim) as pipe:
+                    for queue in QUEUES:
+                        pipe.zrem(_claims(queue), claim.key)
+                    pipe.delete(f"rq:execution:{claim.key}")
+
+    def drop_taken(self, queue: QueueName, name: str) -> None:
+        """Forget that a worker has taken a step: it ended before it claimed it."""
+        with _redis_errors(), self._unheld(name, taken=True) as pipe:
+            pipe.lrem(_taken(queue), 0, name)
+
+    def forget_worker(self, name: str) -> None:
+        """Strike a worker that has ended off rq's list."""
+        with _redis_errors(), self._redis.pipeline() as pipe:
+            for key in (REDIS_WORKER_KEYS, *(f"rq:workers:{queue}" for queue in QUEUES)):
+                pipe.srem(key, _WORKER + name)
+            pipe.delete(_WORKER + name)
+            pipe.execute()
 
     def release_claims(self) -> None:
-        """Take all claims away: for a caller who knows that no worker is alive, and need not wait until they end."""
+        """Take all claims away: for a caller who knows that no worker is alive."""
         with _redis_errors():
-            for name in sorted({step.queue for steps in self._steps.values() for step in steps}):
-                queue = self._queue(name)
-                self._redis.delete(
-                    queue.started_job_registry.key, queue.intermediate_queue_key, queue.registry_cleaning_key
-                )
+            state = {name: self._state(name) for name in QUEUES}
+            self.release(claim for queue in state.values() for claim in queue.claims)
+            self._redis.delete(*(_taken(name) for name in QUEUES))
+            for queue in state.values():
+                for worker in (*queue.answering, *queue.silent):
+                    self.forget_worker(worker)
 
     def dismiss(self, job_id: str, kind: JobKind) -> None:
         """Take back what waits and stop what runs in a geometry worker.
@@ -99,83 +180,110 @@ class JobQueue:
         A running step of the inference queue shares its process with the network and is not killed: it asks the
         catalog between batches whether its job was dismissed. So does a step that starts while this call is made.
         """
-        ids = [step_id(job_id, step) for step in self._steps[kind]]
-        with _redis_errors(), suppress(InvalidJobOperation):  # a step that expired between two looks
-            known = Job.fetch_many(ids, connection=self._redis, serializer=JSONSerializer)
-            for job in reversed([job for job in known if job]):  # the last first: nothing moves up meanwhile
-                status = job.get_status(refresh=False)
-                if status in (JobStatus.QUEUED, JobStatus.DEFERRED):
-                    job.delete()
-                elif status == JobStatus.STARTED and job.origin == "geometry":
-                    with suppress(InvalidJobOperation, NoSuchJobError):  # it ended just now
-                        send_stop_job_command(self._redis, job.id, serializer=JSONSerializer)
+        with _redis_errors():
+            steps = {step_id(job_id, step.name): step.queue for step in STEPS[kind]}
+            for name, queue in steps.items():
+                if self._redis.lrem(_waiting(queue), 0, name):
+                    with self._unheld(name):
+                        pass
+            for claim in self._state("geometry").claims:
+                if claim.step in steps and claim.worker is not None:
+                    send_command(self._redis, claim.worker, "stop-job", job_id=claim.step)
 
     def close(self) -> None:
         """Give the connections back."""
         self._redis.close()
 
-    def _holds(self, job_id: str, kind: JobKind) -> bool:
+    def _state(self, queue: QueueName) -> QueueState:
         """Look in the order in which a step moves on, so that none slips by between two looks."""
-        for step in self._steps[kind]:
-            queue, name = self._queue(step.queue), step_id(job_id, step)
-            for waiting in (queue.key, queue.intermediate_queue_key):
-                if self._redis.lpos(waiting, name) is not None:
-                    return True
-            if name in queue.started_job_registry:
-                return True
-        return False
+        with self._redis.pipeline(transaction=True) as pipe:
+            pipe.lrange(_waiting(queue), 0, -1)
+            pipe.lrange(_taken(queue), 0, -1)
+            pipe.zrange(_claims(queue), 0, -1)
+            pipe.smembers(f"rq:workers:{queue}")
+            waiting, taken, claims, workers = pipe.execute()
+        claims, workers = _texts(claims), sorted(_texts(workers))
+        with self._redis.pipeline(transaction=False) as pipe:
+            for claim in claims:
+                pipe.hget(f"rq:execution:{claim}", "worker_name")
+            for worker in workers:
+                pipe.exists(worker)
+            told = pipe.execute()
+        holders, alive = told[: len(claims)], told[len(claims) :]
+        names = [worker.removeprefix(_WORKER) for worker in workers]
+        return QueueState(
+            waiting=_texts(waiting),
+            taken=_texts(taken),
+            claims=tuple(_claim(key, holder) for key, holder in zip(claims, holders, strict=True)),
+            answering=tuple(name for name, there in zip(names, alive, strict=True) if there),
+            silent=tuple(name for name, there in zip(names, alive, strict=True) if not there),
+        )
 
-    def _left(self, job_id: str, kind: JobKind) -> Sequence[Step]:
-        """Return the steps from the first that has not finished; all of them where none is known, or none is left."""
-        steps = self._steps[kind]
-        ids = [step_id(job_id, step) for step in steps]
-        known = Job.fetch_many(ids, connection=self._redis, serializer=JSONSerializer)
-        for number, job in enumerate(known):
-            if job is None or job.get_status(refresh=False) != JobStatus.FINISHED:
-                return steps[number:]
-        return steps
+    @contextmanager
+    def _unheld(self, name: str, *, but: Claim | None = None, taken: bool = False) -> Iterator[Any]:
+        """Open a transaction that also removes what rq keeps of a step, unless somebody holds the step.
 
-    def _chain(self, job_id: str, steps: Sequence[Step]) -> list[Job]:
-        """Return the steps as rq jobs, each waiting for the one before."""
-        jobs: list[Job] = []
-        for step in steps:
-            jobs.append(
-                Job.create(
-                    step.function,
-                    args=(job_id,),
-                    id=step_id(job_id, step),
-                    origin=step.queue,
-                    depends_on=jobs[-1:] or None,
-                    timeout=self._timeout_s,
-                    result_ttl=KEPT_S,
-                    failure_ttl=KEPT_S,
-                    connection=self._redis,
-                    serializer=JSONSerializer,
-                )
-            )
-        return jobs
-
-    @staticmethod
-    def _forget(job: Job, pipe: Any) -> None:
-        """Remove what an earlier submission left of a step."""
-        pipe.delete(job.key, job.dependents_key, job.dependencies_key, job.execution_registry.key)
-        for registry in (job.finished_job_registry, job.failed_job_registry):
-            pipe.zrem(registry.key, job.id)
-        DeferredJobRegistry(job.origin, connection=job.connection).remove(job.id, pipeline=pipe)
-
-    def _queue(self, name: str) -> Queue:
-        return Queue(name, connection=self._redis, serializer=JSONSerializer)
-
-    @staticmethod
-    def _defer(job: Job, pipe: Any) -> None:
-        """Park a step until the one before has finished.
-
-        What `rq.Queue.setup_dependencies` does, less its look at the dependency's state: here the dependency is
-        written in the same transaction, and a look would end that transaction.
+        The claim `but`, and with `taken` a place among the steps that are taken, do not count. When the queue changes
+        meanwhile, nothing is done: who comes next does it.
         """
-        job.set_status(JobStatus.DEFERRED, pipeline=pipe)
-        job.register_dependency(pipeline=pipe)
+        with suppress(WatchError), self._redis.pipeline() as pipe:
+            pipe.watch(*(key(queue) for queue in QUEUES for key in (_waiting, _taken, _claims)))  # type: ignore[no-untyped-call]
+            states = [self._state(queue) for queue in QUEUES]
+            claimed = {
+                claim.step for state in states for claim in state.claims if claim.key != (but and but.key)
+            }
+            waits = {step for state in states for step in state.waiting + (() if taken else state.taken)}
+            pipe.multi()
+            if name not in claimed | waits:
+                self._forget(name, pipe)
+            yield pipe
+            pipe.execute()
+
+    def _write(self, job_id: str, step: Step, pipe: Any) -> None:
+        """Write a step as an rq job that is about to wait."""
+        job = Job.create(
+            step.function,
+            args=(job_id,),
+            id=step_id(job_id, step.name),
+            origin=step.queue,
+            timeout=self._timeout_s,
+            result_ttl=KEPT_S,
+            failure_ttl=KEPT_S,
+            status=JobStatus.QUEUED,
+            connection=self._redis,
+            serializer=JSONSerializer,
+        )
         job.save(pipeline=pipe)
+        pipe.expire(job.key, 30 * KEPT_S)  # of one that nobody ever takes or forgets
+
+    @staticmethod
+    def _forget(name: str, pipe: Any) -> None:
+        """Remove what rq keeps of a step."""
+        pipe.delete(*(f"{key}:{name}" for key in ("rq:job", "rq:executions", "rq:results")))
+
+
+def _waiting(queue: str) -> str:
+    """Return the key of the list of steps that no worker has taken."""
+    return f"rq:queue:{queue}"
+
+
+def _taken(queue: str) -> str:
+    """Return the key of the list between queue and worker (`rq.intermediate_queue`)."""
+    return f"rq:queue:{queue}:intermediate"
+
+
+def _claims(queue: str) -> str:
+    """Return the key of the registry of what runs (`rq.registry.StartedJobRegistry`)."""
+    return f"rq:wip:{queue}"
+
+
+def _claim(key: str, holder: bytes | None) -> Claim:
+    step, _, execution = key.rpartition(":")
+    return Claim(step=step, execution=execution, worker=None if holder is None else holder.decode())
+
+
+def _texts(values: Iterable[bytes]) -> tuple[str, ...]:
+    return tuple(value.decode() for value in values)
 
 
 @contextmanager

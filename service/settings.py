@@ -59,7 +59,19 @@ class Settings(BaseSettings):
     inference_workers: int = Field(1, ge=0, description="worker processes of the inference queue")
     max_upload_bytes: int = Field(2 * 1024**3, gt=0, description="largest body of one request")
     max_scan_points: int = Field(50_000_000, gt=0, description="most points that one scan may declare")
+    step_memory_bytes: int | None = Field(
+        None,
+        ge=0,
+        description="most that each process of a geometry step may allocate; 0: no limit, "
+        "unset: four fifths of the machine's or the container's memory",
+    )
     job_timeout_s: int = Field(3600, gt=0, description="longest time of one step of a job")
+    max_waiting_jobs: int = Field(
+        1000, gt=0, description="jobs that may wait; a request for one more is answered with 429"
+    )
+    max_waiting_jobs_per_device: int = Field(
+        200, gt=0, description="of one device, so that none takes the room of the others"
+    )
     training_minutes: float = Field(
         10.0, gt=0, description="of a model's training where a request names none"
     )

@@ -131,4 +131,4 @@ def codes_of_ends() -> set[str]:
     """What is recorded of a step that could not speak for itself."""
     ends = (FunctionRefused(), JobTimeoutException(), KeyError())
     step = SimpleNamespace(id="job-1-register", timeout=1)
-    return {WORKER_DIED, *(rq_workers._problem(end, step)[0] for end in ends)}  # type: ignore[arg-type]
+    return {WORKER_DIED, *(rq_workers._ending_of(end, step).code for end in ends)}  # type: ignore[arg-type]

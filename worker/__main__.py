@@ -6,21 +6,33 @@ import argparse
 import contextlib
 import importlib
 import logging
+import os
+import socket
 import sys
+import time
+from collections.abc import Callable, Iterator
+from uuid import uuid4
 
 from redis import Redis
+from redis.exceptions import RedisError
 
 from service.catalog.database import Database
 from service.catalog.jobs import Jobs
 from service.catalog.records import Problem
 from service.catalog.steps import ALLOWED_FUNCTIONS
+from service.dispatch import Dispatcher
 from service.logs import set_up_logging
+from service.queue import JobQueue
 from service.settings import Settings
 from service.up.lifetime import end_with_parent
 from worker.rq_workers import GeometryWorker, InferenceWorker
+from worker.scratch import sweep
 from worker.threads import wait_passively
 
 log = logging.getLogger("worker")
+
+CONNECT_S = 5.0  #: a connection to Redis takes no longer
+AGAIN_S = 1.0  #: between two attempts to reach it
 
 # Imported before the first fork, so that no step pays for it. Importing is all that may happen here: native work in
 # the parent starts threads, and a fork among threads that hold locks deadlocks.
@@ -43,43 +55,84 @@ def main(arguments: list[str] | None = None) -> int:
     for module in WARM_MODULES[options.queue]:
         importlib.import_module(module)
     log.info("%s worker is ready", options.queue)
+    records = CatalogRecords(settings)
     kind = GeometryWorker if options.queue == "geometry" else InferenceWorker
-    kind(
-        options.queue,
-        Redis.from_url(settings.redis_url),
-        allowed=ALLOWED_FUNCTIONS,
-        records=CatalogRecords(settings.resolved_database_url()),
-        grace_s=options.grace,
-    ).work()
+    name = options.name or f"{options.queue}-{socket.gethostname()}-{os.getpid()}-{uuid4().hex[:8]}"
+
+    redis_url = settings.redis_url
+
+    def make() -> GeometryWorker | InferenceWorker:
+        return kind(
+            options.queue,
+            Redis.from_url(redis_url, socket_connect_timeout=CONNECT_S),
+            allowed=ALLOWED_FUNCTIONS,
+            records=records,
+            grace_s=options.grace,
+            name=name,
+        )
+
+    work(make)
     return 0
 
 
-class CatalogRecords:
-    """Writes to the catalog how a step ended, first writer wins: what the step itself recorded stands.
+def work(make: Callable[[], GeometryWorker | InferenceWorker]) -> None:
+    """Work until told to stop, with a new worker each time that Redis went away."""
+    while True:
+        try:
+            worker = make()
+            worker.work()
+            if worker.stopping:
+                return
+        except RedisError as error:
+            log.warning("the queue does not answer (%s); trying again", type(error).__name__)
+        time.sleep(AGAIN_S)
 
-    The database alone is opened, and closed again: the blob store starts threads, and this process forks.
+
+class CatalogRecords:
+    """Tells the catalog how a step ended that could not say so itself, and keeps the queue supplied.
+
+    The database alone is opened, and closed again: this process forks, and the blob store starts threads.
     """
 
-    def __init__(self, database_url: str) -> None:
-        self._url = database_url
+    def __init__(self, settings: Settings) -> None:
+        self._database = Database(settings.resolved_database_url())
+        self._jobs = Jobs(self._database)
+        queue = JobQueue(settings.redis_url or "", timeout_s=settings.job_timeout_s)
+        self._dispatcher = Dispatcher(self._jobs, queue)
+        self._scratch = settings.scratch_dir()
 
-    def failed(self, job_id: str, code: str, sentence: str) -> bool:
-        """Record that the job failed with this problem."""
-        with self._database() as database:
-            return Jobs(database).fail(job_id, Problem(code=code, detail=sentence))
+    def failed(self, job_id: str, step: str, code: str, sentence: str) -> None:
+        """Record that the job failed with this problem, unless it is at another step by now."""
+        with self._opened():
+            self._jobs.fail(job_id, Problem(code=code, detail=sentence), step=step)
 
-    def lost(self, job_id: str, how: str) -> bool:
-        """Count an attempt; whether to start the step again."""
-        with self._database() as database:
-            return Jobs(database).lose_attempt(job_id, how)
+    def lost(self, job_id: str, step: str, how: str) -> None:
+        """Count an attempt."""
+        with self._opened():
+            self._jobs.lose_attempt(job_id, step, how)
 
-    def stopped(self, job_id: str) -> bool:
-        """Record that the step waits for another worker; tell whether the job still wants it."""
-        with self._database() as database:
-            return Jobs(database).put_back(job_id)
+    def interrupted(self, job_id: str, step: str, how: str) -> None:
+        """Count an interruption."""
+        with self._opened():
+            self._jobs.interrupt(job_id, step, how)
 
-    def _database(self) -> contextlib.closing[Database]:
-        return contextlib.closing(Database(self._url))
+    def stopped(self, job_id: str, step: str) -> None:
+        """Have the step wait for another worker."""
+        with self._opened():
+            self._jobs.put_back(job_id, step, "stopped with its worker; goes on with the next that is free")
+
+    def tick(self) -> None:
+        """Sweep what killed steps left, find what was lost, and hand over what is due."""
+        sweep(self._scratch)
+        with self._opened():
+            self._dispatcher.run()
+
+    @contextlib.contextmanager
+    def _opened(self) -> Iterator[None]:
+        try:
+            yield
+        finally:
+            self._database.close()
 
 
 def _parse(arguments: list[str] | None) -> argparse.Namespace:
@@ -88,6 +141,7 @@ def _parse(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument(
         "--grace", type=float, default=8.0, help="seconds that a running step has after SIGTERM"
     )
+    parser.add_argument("--name", help="of this worker, given once; left out, one is made")
     parser.add_argument(
         "--parent", type=int, default=0, help="end when the process with this id, the parent, ends"
     )

@@ -8,9 +8,11 @@ PipelineError
 ├── MapFailed                map_failed             nothing to tile, no point left
 ├── TrainingFailed           training_failed        a map too small to train on, a loss that is no number
 ├── ProcessLost              process_lost           a process that shared the work ended without a word (often: no memory)
+├── OutOfMemory          out_of_memory          the step would take more memory than it may
 ├── NoSpaceLeft              disk_full              the disk is full; the step can be run again
 ├── DetectorUnavailable      detector_unavailable   no such model, or its files do not match its card
-└── Cancelled                cancelled              somebody dismissed the job
+└── Cancelled                cancelled              somebody dismissed the job, or another worker has the step
+    └── GaveWay              cancelled              the step goes on later: others go first
 """
 
 from __future__ import annotations
@@ -50,12 +52,20 @@ class ProcessLost(PipelineError):
     code = "process_lost"
 
 
+class OutOfMemory(PipelineError):
+    code = "out_of_memory"
+
+
 class DetectorUnavailable(PipelineError):
     code = "detector_unavailable"
 
 
 class Cancelled(PipelineError):
     code = "cancelled"
+
+
+class GaveWay(Cancelled):
+    """Not an error: what was done is kept, and the step is run again."""
 
 
 class NoSpaceLeft(PipelineError):

@@ -3,100 +3,167 @@
 `GeometryWorker` forks a process for each step, so that a crash in C++ or a lack of memory ends one step and not the
 worker. `InferenceWorker` keeps the network in its own memory and never forks (CUDA does not survive one).
 
-Both tell the catalog when a step ended without having said why; what the step itself recorded stands. A step whose
-process or worker died is started again where the catalog says so, and one that was stopped with its worker waits for
-the next. A step that took too long or raised is not: with the same scans it would do so again.
+rq hands out steps, keeps the list of workers, and carries the word that a step is to be stopped. What became of a step
+is recorded in the catalog, by the step itself (worker/jobs/step.py) or, where that cannot speak any more, by its
+worker. Only then the claim on it is given back, so that who finds a step without a claim knows that nobody has told.
 """
 
 from __future__ import annotations
 
 import logging
 import os
+import random
 import signal
 import threading
 import time
-from collections.abc import Callable
-from contextlib import suppress
-from typing import Any, Protocol
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, Protocol
 
 from redis import Redis
 from redis.exceptions import RedisError
-from rq import Queue, SimpleWorker, Worker
-from rq.exceptions import AbandonedJobError
-from rq.job import JobStatus
+from rq import Queue, SimpleWorker, Worker, worker_registration
+from rq.exceptions import StopRequested
+from rq.executions import Execution
 from rq.serializers import JSONSerializer
-from rq.timeouts import JobTimeoutException
-from rq.worker.base import BaseWorker
+from rq.timeouts import JobTimeoutException, UnixSignalDeathPenalty
+from rq.utils import now
+from rq.worker.base import BaseWorker, WorkerStatus
 
 from service.logs import about
+from service.settings import Settings
 from service.up.lifetime import end_with_parent
 from worker.errors import PipelineError
+from worker.memory import limit_memory
 from worker.rq_jobs import FunctionRefused, StepJob, step_job
+from worker.watch import Watch
 
 log = logging.getLogger("worker")
 
-# With rq's defaults a job of a dead worker is found after 7 minutes. Here the worker's claim on a step ends 65 s
-# after its last sign of life (interval + 60, in rq), and an idle worker looks every 5 s.
-WORKER_TTL_S = 20
-HEARTBEAT_S = 5
+HEARTBEAT_S = 4  #: between two signs of life
+ANSWERS_S = 20  #: a worker without a sign of life for so long is told as silent
+CLAIM_S = 15  #: a claim that was not renewed for so long has ended
+LATE_S = 3.0  #: a step that outlasts its time limit by this does not hear its own alarm, and is killed
+_LOOK_S = 1.0  #: between two looks at the processes of a step
+_OUTSIDE = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGQUIT)
+
+How = Literal["lost", "interrupted", "failed", "stopped", "dismissed"]
 
 
 class Records(Protocol):
-    """What a worker tells the catalog, and asks it."""
+    """What a worker tells the catalog. Each may raise whatever it likes: a worker outlives that."""
 
-    def failed(self, job_id: str, code: str, sentence: str) -> object:
+    def failed(self, job_id: str, step: str, code: str, sentence: str) -> object:
         """Record that a step ended for good, with this problem."""
 
-    def lost(self, job_id: str, how: str) -> bool:
-        """Record that an attempt ended without a word; tell whether to start the step again."""
+    def lost(self, job_id: str, step: str, how: str) -> object:
+        """Record that an attempt ended without a word, by its own fault."""
 
-    def stopped(self, job_id: str) -> bool:
-        """Record that a step was stopped with its worker; tell whether it shall go on with another."""
+    def interrupted(self, job_id: str, step: str, how: str) -> object:
+        """Record that a step ended through no fault of its own."""
+
+    def stopped(self, job_id: str, step: str) -> object:
+        """Record that a step was stopped with its worker."""
+
+    def tick(self) -> object:
+        """Hand over what is due, and find what was lost."""
 
 
 class WorkerStopped(BaseException):
     """The worker was told to end and its time is up. Not an `Exception`, so that no step swallows it."""
 
 
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Ending:
+    """How a step's process ended that could not tell itself."""
+
+    how: How
+    sentence: str = ""  #: or the first half of one
+    code: str = ""  #: of the problem, where it failed
+
+
 class _StepWorker(BaseWorker):  # type: ignore[misc]  # rq is untyped here
-    """What both kinds have in common: the allow-list, the end of a step, and the end of the worker."""
+    """What both kinds have in common: the allow-list, the claim, signs of life, and the end of a step."""
+
+    _stopped_job_id: str | None
+    max_connection_wait_time = 2.0  #: between two attempts to reach Redis; rq would wait for up to a minute
 
     def __init__(
-        self, queue: str, connection: Redis, *, allowed: frozenset[str], records: Records, grace_s: float
+        self,
+        queue: str,
+        connection: Redis,
+        *,
+        allowed: frozenset[str],
+        records: Records,
+        grace_s: float,
+        name: str | None = None,
     ) -> None:
         super().__init__(
             [queue],
+            name=name,
             connection=connection,
             job_class=step_job(allowed),
             serializer=JSONSerializer,
-            worker_ttl=WORKER_TTL_S,
+            worker_ttl=15 + HEARTBEAT_S,  # rq waits for a step for 15 s less
             job_monitoring_interval=HEARTBEAT_S,
             maintenance_interval=HEARTBEAT_S,
-            exception_handlers=[self._record],
         )
         self._records = records
         self._grace_s = grace_s
 
+    @property
+    def stopping(self) -> bool:
+        """Whether the worker was told to end."""
+        return bool(self._stop_requested)
+
+    def register_birth(self) -> None:
+        """Register, also where an earlier life of this name left its mark: names are given once."""
+        self.connection.delete(self.key)
+        super().register_birth()
+
+    def heartbeat(self, timeout: int | None = None, pipeline: Any = None) -> None:  # noqa: ARG002  (rq's signature)
+        """Give a sign of life; all of it, for Redis may have lost what it knew."""
+        self.last_heartbeat = now()
+        pipe = self.connection.pipeline() if pipeline is None else pipeline
+        pipe.hset(self.key, mapping=self.serialize())
+        pipe.expire(self.key, ANSWERS_S)
+        worker_registration.register(self, pipe)
+        if pipeline is None:
+            pipe.execute()
+
+    def maintain_heartbeats(self, job: StepJob) -> None:
+        """Give a sign of life, and renew the claim on the step."""
+        with self.connection.pipeline() as pipe:
+            self.heartbeat(pipeline=pipe)
+            self.execution.heartbeat(job.started_job_registry, CLAIM_S, pipe)
+            pipe.execute()
+
+    def run_maintenance_tasks(self) -> None:
+        """Compare catalog and queue, in place of rq's own look at its registries."""
+        self._tell(self._records.tick)
+        self.last_cleaned_at = now()
+
     def execute_job(self, job: StepJob, queue: Queue) -> None:
+        """Claim a step, have it run, and give the claim back once the catalog knows how it ended."""
         begun = time.monotonic()
+        self._claim(job, queue)
         with about(job_id=job.catalog_id):  # a process that is forked for the step inherits it
             log.info("%s: %s started", self.queues[0].name, job.id)
-            super().execute_job(job, queue)
-            log.info("%s: %s ended after %.1f s", self.queues[0].name, job.id, time.monotonic() - begun)
+            try:
+                self._work_on(job)
+            finally:
+                log.info("%s: %s ended after %.1f s", self.queues[0].name, job.id, time.monotonic() - begun)
+                with suppress(RedisError):  # the claim ends by itself
+                    self._give_back(job)
+                self._tell(self._records.tick)
+                with suppress(RedisError):
+                    self.set_state(WorkerStatus.IDLE)
 
-    def handle_exception(self, job: StepJob, *exc_info: Any) -> None:
-        """Log a user's error in one line and ours with its traceback, then record it."""
-        expected = isinstance(exc_info[1], PipelineError | FunctionRefused | WorkerStopped)
-        log.error("%s failed: %s", job.id, exc_info[1], exc_info=None if expected else exc_info)
-        self._record(job, *exc_info)
-
-    def handle_job_failure(self, job: StepJob, queue: Queue, *args: Any, **kwargs: Any) -> None:
-        """Forget the steps behind one that failed for good: rq does not run them, and would keep them for ever."""
-        if self.execution is None and job.get_status(refresh=False) == JobStatus.QUEUED:
-            self._lost(job, _gone(job))  # rq found it between queue and worker: that one died before it began
-        if not job.should_retry:
-            job.drop_dependents()
-        super().handle_job_failure(job, queue, *args, **kwargs)
+    def _shutdown(self) -> None:
+        self._stop_requested = True  # rq notes it of a busy worker only
+        super()._shutdown()
 
     def handle_warm_shutdown_request(self) -> None:
         """Answer the first SIGTERM: the running step has `grace_s` seconds to end by itself."""
@@ -105,52 +172,84 @@ class _StepWorker(BaseWorker):  # type: ignore[misc]  # rq is untyped here
         timer.daemon = True
         timer.start()
 
+    def _work_on(self, job: StepJob) -> None:
+        raise NotImplementedError
+
     def _end_grace(self) -> None:
         raise NotImplementedError
 
-    def _record(self, job: StepJob, kind: type[BaseException], error: BaseException, *_: Any) -> None:
-        """Handle a step that raised, or whose worker went away; rq calls this."""
-        if kind is AbandonedJobError:
-            self._lost(job, _gone(job))
-            if not job.should_retry:
-                job.drop_dependents()
-        elif kind is WorkerStopped:
-            self._put_back(job)
-        else:
-            self._tell(job, self._records.failed, *_problem(error, job))
+    def _claim(self, job: StepJob, queue: Queue) -> None:
+        with self.connection.pipeline() as pipe:
+            self.execution = Execution.create(job, CLAIM_S, pipeline=pipe, worker_name=self.name)
+            pipe.lrem(queue.intermediate_queue_key, 0, job.id)
+            self.set_current_job_id(job.id, pipeline=pipe)
+            self.set_state(WorkerStatus.BUSY, pipeline=pipe)
+            pipe.execute()
 
-    def _lost(self, job: StepJob, how: str) -> None:
-        """Record an attempt that ended without a word, and start the step again where it shall be."""
-        log.warning("%s: %s", job.id, how)
-        if self._tell(job, self._records.lost, how):
-            job.start_again()
+    def _give_back(self, job: StepJob) -> None:
+        with self.connection.pipeline() as pipe:
+            self.execution.delete(job=job, pipeline=pipe)
+            pipe.delete(job.key)
+            self.set_current_job_id(None, pipeline=pipe)
+            pipe.execute()
+        self.execution = None
 
-    def _put_back(self, job: StepJob) -> None:
-        """Put back a step that ends with this worker, through no fault of its own."""
-        if self._tell(job, self._records.stopped):
-            job.start_again()
-
-    def _tell(self, job: StepJob, record: Callable[..., object], *words: str) -> bool:
-        """Return the catalog's answer; one that does not answer must not take the worker down.
-
-        What it did not hear, it learns when the service next starts and finds the job running without a step.
-        """
-        if job.catalog_id is None:
-            return False
+    def _run(self, job: StepJob) -> None:
+        """Call the step under its time limit; record what it could not record itself."""
         try:
-            return bool(record(job.catalog_id, *words))
-        except Exception:
-            log.exception("%s: the catalog did not take how it ended", job.id)
-            return False
+            with UnixSignalDeathPenalty(job.timeout, JobTimeoutException):
+                job.run()
+        except BaseException as error:
+            expected = isinstance(
+                error, PipelineError | FunctionRefused | WorkerStopped | JobTimeoutException
+            )
+            log.error("%s failed: %s", job.id, error, exc_info=None if expected else error)
+            self._record(job, _ending_of(error, job))
+
+    def _record(self, job: StepJob, ending: Ending) -> None:
+        """Tell the catalog how a step ended."""
+        if job.catalog_id is None or ending.how == "dismissed":
+            return
+        of = (job.catalog_id, job.step)
+        match ending.how:
+            case "failed":
+                self._tell(self._records.failed, *of, ending.code, ending.sentence)
+            case "lost":
+                self._tell(self._records.lost, *of, ending.sentence)
+            case "interrupted":
+                self._tell(self._records.interrupted, *of, ending.sentence)
+            case "stopped":
+                self._tell(self._records.stopped, *of)
+
+    def _tell(self, record: Any, *words: str) -> None:
+        """Call the catalog; one that does not answer must not take the worker down.
+
+        What it did not hear, a dispatcher finds: a step that has begun, and on which nobody has a claim.
+        """
+        try:
+            record(*words)
+        except StopRequested:
+            raise
+        except Exception as error:
+            log.warning("%s: the catalog was not told (%s): %s", self.queues[0].name, " ".join(words), error)
 
 
 class GeometryWorker(_StepWorker, Worker):  # type: ignore[misc]
     """One forked process for each step."""
 
-    def main_work_horse(self, job: StepJob, queue: Queue) -> None:
+    def main_work_horse(self, job: StepJob, queue: Queue) -> None:  # noqa: ARG002  (rq's signature)
         """Run the step in the forked process, which ends with the worker, whatever ends that."""
-        end_with_parent(self.pid)
-        super().main_work_horse(job, queue)
+        try:
+            end_with_parent(self.pid)
+            limit_memory(Settings().step_memory_bytes)
+            random.seed()
+            self.setup_work_horse_signals()
+            self._is_horse = True
+            self._run(job)
+        except BaseException:
+            log.exception("%s: cannot be run", job.id)
+            os._exit(1)
+        os._exit(0)
 
     def kill_horse(self, sig: signal.Signals = signal.SIGKILL) -> None:
         """Kill the step's process group, and never another: rq asks for the group of pid 0 once the step is over."""
@@ -163,20 +262,58 @@ class GeometryWorker(_StepWorker, Worker):  # type: ignore[misc]
             else:  # it has not made its own group yet
                 os.kill(pid, sig)
 
-    def handle_work_horse_killed(
-        self,
-        job: StepJob,
-        pid: int | None,  # noqa: ARG002  (rq's signature)
-        status: int | None,
-        usage: Any,  # noqa: ARG002
-    ) -> None:
-        """Handle a process that ended without a word: a crash, no memory, or this worker's end."""
+    def _work_on(self, job: StepJob) -> None:
+        killed_before = _out_of_memory_kills()
+        self.fork_work_horse(job, None)
+        ending, status = self._wait(job)
+        self._end_group()
+        if ending is None and status == 0:
+            return  # it has told the catalog itself
         if self._stop_requested:
-            self._put_back(job)
-        elif status is None:
-            self._tell(job, self._records.failed, *_problem(JobTimeoutException(), job))
-        else:
-            self._lost(job, f"the process of step {job.id} ended {_ending(status)}")
+            ending = Ending(how="stopped")
+        elif self._stopped_job_id == job.id:
+            self._stopped_job_id, ending = None, Ending(how="dismissed")
+        if ending is None:
+            ending = _ending_of_status(status, job, out_of_memory=_out_of_memory_kills() > killed_before)
+        if ending.sentence:
+            log.warning("%s: %s", job.id, ending.sentence)
+        self._record(job, ending)
+
+    def _wait(self, job: StepJob) -> tuple[Ending | None, int]:
+        """Wait for the step's process, and kill it when its time is up or when it hangs; return its wait status."""
+        begun, watch, ending = time.monotonic(), Watch(self.horse_pid), None
+        look = beat = begun
+        while True:
+            pid, status, _ = os.wait4(self.horse_pid, os.WNOHANG)
+            if pid:
+                return ending, status
+            instant = time.monotonic()
+            if ending is None and instant >= look:
+                look = instant + _LOOK_S
+                ending = self._due_end(job, instant - begun, watch)
+                if ending is not None:
+                    self.kill_horse()
+            if instant >= beat:
+                beat = instant + HEARTBEAT_S
+                with suppress(RedisError):  # the step goes on without; it is the catalog that counts
+                    self.maintain_heartbeats(job)
+            time.sleep(min(0.1, 0.01 + (instant - begun) / 20))
+
+    def _due_end(self, job: StepJob, ran_s: float, watch: Watch) -> Ending | None:
+        """Return why a step has to be ended; None while it may go on."""
+        if job.timeout and ran_s > job.timeout + LATE_S:
+            return _ending_of(JobTimeoutException(), job)
+        trouble = watch.trouble()
+        if trouble is None:
+            return None
+        what, from_outside = trouble
+        return Ending(how="interrupted" if from_outside else "lost", sentence=f"step {job.id} {what}")
+
+    def _end_group(self) -> None:
+        """Kill what the step's process started and left behind."""
+        with suppress(ProcessLookupError, PermissionError):
+            os.killpg(self.horse_pid, signal.SIGKILL)
+        self._horse_pid = 0
 
     def _end_grace(self) -> None:
         self.kill_horse()
@@ -185,64 +322,74 @@ class GeometryWorker(_StepWorker, Worker):  # type: ignore[misc]
 class InferenceWorker(_StepWorker, SimpleWorker):  # type: ignore[misc]
     """One process that stays warm; a thread keeps its claim alive while it works."""
 
-    _working: threading.Event | None = None  #: set when the running step is over
-
-    def get_heartbeat_ttl(self, job: StepJob) -> int:
-        """Return the forking worker's claim, not `SimpleWorker`'s, which lasts as long as the step may take."""
-        return int(BaseWorker.get_heartbeat_ttl(self, job))
-
-    def perform_job(self, job: StepJob, queue: Queue) -> bool:
-        self._working = threading.Event()
-        threading.Thread(target=self._beat, args=(job, self._working), daemon=True).start()
-        try:
-            return bool(super().perform_job(job, queue))
-        finally:
-            self._working.set()
-
-    def handle_execution_ended(self, job: StepJob, queue: Queue, heartbeat_ttl: int) -> None:
-        """End the signs of life: the work is done, rq is about to remove its claim, and none may come after that."""
-        if self._working is not None:
-            self._working.set()
-        super().handle_execution_ended(job, queue, heartbeat_ttl)
-
     def request_force_stop(self, *_: Any) -> None:
         """Leave the step from wherever it is: time is up."""
         raise WorkerStopped
 
-    def _beat(self, job: StepJob, over: threading.Event) -> None:
-        while not over.wait(HEARTBEAT_S):
-            with suppress(RedisError, AttributeError):  # Redis is away; the claim was removed just now
-                self.maintain_heartbeats(job)
+    def _work_on(self, job: StepJob) -> None:
+        with self._alive(job):
+            self._run(job)
+
+    @contextmanager
+    def _alive(self, job: StepJob) -> Iterator[None]:
+        """Give signs of life from a thread for the length of the block."""
+        over = threading.Event()
+
+        def beat() -> None:
+            while not over.wait(HEARTBEAT_S):
+                with suppress(RedisError):
+                    self.maintain_heartbeats(job)
+
+        thread = threading.Thread(target=beat, daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            over.set()
+            thread.join(ANSWERS_S)  # no sign of life may come after the claim was given back
 
     def _end_grace(self) -> None:
         """Signal the main thread, which runs the step; the handler is `request_force_stop` by now."""
         os.kill(os.getpid(), signal.SIGTERM)
 
 
-def _problem(error: BaseException, job: StepJob) -> tuple[str, str]:
-    """Return code and sentence for an error that left a step."""
+def _ending_of(error: BaseException, job: StepJob) -> Ending:
+    """Return how a step ended that an error left."""
     match error:
+        case WorkerStopped():
+            return Ending(how="stopped")
         case PipelineError():
-            return error.code, str(error)
+            return Ending(how="failed", code=error.code, sentence=str(error))
         case FunctionRefused():
-            return "function_refused", str(error)
+            return Ending(how="failed", code="function_refused", sentence=str(error))
         case JobTimeoutException():
-            return "timed_out", f"step {job.id} took longer than {job.timeout} s; send fewer or smaller scans"
+            took = f"step {job.id} took longer than {job.timeout} s; send fewer or smaller scans"
+            return Ending(how="failed", code="timed_out", sentence=took)
         case _:
-            return (
-                "internal",
-                f"step {job.id} stopped on an unexpected {type(error).__name__}; see the worker's log",
-            )
+            what = f"step {job.id} stopped on an unexpected {type(error).__name__}; see the worker's log"
+            return Ending(how="failed", code="internal", sentence=what)
 
 
-def _gone(job: StepJob) -> str:
-    return f"the worker of step {job.id} went away"
+def _ending_of_status(status: int, job: StepJob, *, out_of_memory: bool) -> Ending:
+    """Return how a process ended without a word, from its wait status.
 
-
-def _ending(status: int) -> str:
-    """Say how a process ended, from its wait status."""
+    A signal that a fault in the process itself raises costs an attempt; one that is sent from outside does not, unless
+    the kernel says that it killed a process for want of memory.
+    """
+    of = f"the process of step {job.id} ended"
     if not os.WIFSIGNALED(status):
-        return f"with exit status {os.waitstatus_to_exitcode(status)}"
-    number = os.WTERMSIG(status)
-    why = " (often: out of memory)" if number == signal.SIGKILL else ""
-    return f"by signal {signal.Signals(number).name}{why}"
+        return Ending(how="lost", sentence=f"{of} with exit status {os.waitstatus_to_exitcode(status)}")
+    number = signal.Signals(os.WTERMSIG(status))
+    if number == signal.SIGKILL and out_of_memory:
+        return Ending(how="lost", sentence=f"{of} by signal {number.name}: out of memory")
+    how: How = "interrupted" if number in _OUTSIDE else "lost"
+    return Ending(how=how, sentence=f"{of} by signal {number.name}")
+
+
+def _out_of_memory_kills() -> int:
+    """Return how many processes the kernel has killed for want of memory, of this control group or the machine."""
+    for path in (Path("/sys/fs/cgroup/memory.events"), Path("/proc/vmstat")):
+        with suppress(OSError, ValueError):
+            counts = dict(line.split() for line in path.read_text().splitlines())
+            return int(counts.get("oom_kill", 0))
+    return 0

@@ -27,9 +27,10 @@ from service.api.http.docs_pages import add_pages
 from service.api.http.metrics import Metrics, MetricsMiddleware
 from service.api.http.requests import RequestLog
 from service.api.http.security_headers import SecurityHeadersMiddleware
-from service.api.http.submission import resubmit
+from service.api.http.submission import Ticker
 from service.api.http.uploads import sweep
 from service.catalog.catalog import open_catalog
+from service.dispatch import Dispatcher
 from service.queue import JobQueue
 from service.settings import Settings
 
@@ -123,14 +124,21 @@ def _lifespan(settings: Settings, queue: Queue | None) -> Any:
         used = queue or JobQueue(settings.redis_url or "", timeout_s=settings.job_timeout_s)
         catalog = await run_in_threadpool(open_catalog, settings)
         await run_in_threadpool(sweep, settings.data_dir / INCOMING)
+        dispatcher = Dispatcher(catalog.jobs, used)
         app.state.services = Services(
-            settings=settings, catalog=catalog, queue=used, cards=Cards(settings.model_store, catalog.models)
+            settings=settings,
+            catalog=catalog,
+            queue=used,
+            dispatcher=dispatcher,
+            cards=Cards(settings.model_store, catalog.models),
         )
-        await run_in_threadpool(resubmit, app.state.services)
+        ticker = Ticker(dispatcher)
+        await run_in_threadpool(ticker.__enter__)
         try:
             async with housekeeping(app.state.services):
                 yield
         finally:
+            await run_in_threadpool(ticker.__exit__)
             catalog.close()
 
     return lifespan

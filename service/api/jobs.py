@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Annotated, Literal
 
 from fastapi import APIRouter, Path, Query, Request
 from pydantic import Field
 
 from service.api.http.access import maps_of_key
-from service.api.http.dependencies import Provided
+from service.api.http.dependencies import Provided, Services
 from service.api.http.documents import Document, Link, link
 from service.api.http.fields import Id
 from service.api.http.paging import PageRequest, list_links
@@ -17,6 +18,8 @@ from service.api.http.submission import dismiss
 from service.api.models import model_path
 from service.catalog.records import JobRecord, JobStatus
 from service.catalog.steps import JobKind
+from service.catalog.tables import now
+from service.dispatch import queue_positions
 
 RESULTS = "http://www.opengis.net/def/rel/ogc/1.0/results"  #: OGC 18-062r2, Section 7.11
 
@@ -38,6 +41,12 @@ class JobDocument(JobRecord, Document):
     kind: JobKind = Field(serialization_alias="processID")  # the standard's name
     type: Literal["process"] = "process"
     problem: JobProblem  # type: ignore[assignment]  # as RFC 9457 has it
+    queue_position: int | None = Field(
+        None, description="of the step that waits, 1 is next; null while it runs", examples=[1]
+    )
+    waiting_s: float | None = Field(
+        None, description="for how long the step has waited; null while it runs", examples=[0.4]
+    )
     links: list[Link]
 
 
@@ -59,13 +68,17 @@ def list_jobs(request: Request, services: Provided, asked: Annotated[JobsRequest
         limit=asked.limit,
     )
     links = list_links(request, page, lambda job: (job.created, job.job_id))
-    return JobList(jobs=[job_document(job, request) for job in page.items], links=links)
+    waits = _waits(services, page.items)
+    return JobList(
+        jobs=[job_document(job, request, waits.get(job.job_id)) for job in page.items], links=links
+    )
 
 
 @router.get("/jobs/{job_id}", summary="Follow a job", responses=NAMED)
 def get_job(request: Request, services: Provided, job_id: JobId) -> JobDocument:
     """Its state, stage and progress; a failed job carries its problem."""
-    return job_document(services.catalog.jobs.get(job_id), request)
+    job = services.catalog.jobs.get(job_id)
+    return job_document(job, request, _waits(services, [job]).get(job_id))
 
 
 @router.delete(
@@ -82,12 +95,26 @@ def dismiss_job(request: Request, services: Provided, job_id: JobId) -> JobDocum
     return job_document(dismiss(services, job_id), request)
 
 
-def job_document(record: JobRecord, request: Request) -> JobDocument:
-    """Return a job with its links: itself, and its result once there is one."""
+Wait = tuple[int, float]  #: position in its queue, seconds waited
+
+
+def _waits(services: Services, jobs: Sequence[JobRecord]) -> dict[str, Wait]:
+    """Return where the steps stand that wait; nothing is asked where all of `jobs` have ended."""
+    if not any(job.status in ("accepted", "running") for job in jobs):
+        return {}
+    instant, open_jobs = now(), services.catalog.jobs.open_jobs()
+    positions = queue_positions(open_jobs, instant)
+    since = {job.job_id: max(0.0, (instant - job.due).total_seconds()) for job in open_jobs}
+    return {job_id: (position, round(since[job_id], 3)) for job_id, position in positions.items()}
+
+
+def job_document(record: JobRecord, request: Request, wait: Wait | None = None) -> JobDocument:
+    """Return a job with its links: itself, and its result once there is one; `wait` of one whose step waits."""
     links = [link(request, f"/jobs/{record.job_id}", "self")]
     if record.status == "successful":
         links.append(link(request, _result(record), RESULTS))
-    return JobDocument(links=links, **dict(record))
+    position, waited_s = wait or (None, None)
+    return JobDocument(links=links, queue_position=position, waiting_s=waited_s, **dict(record))
 
 
 def _result(record: JobRecord) -> str:

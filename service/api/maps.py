@@ -18,7 +18,7 @@ from service.api.http.fields import Id, Model, Text, from_text
 from service.api.http.files import blob_response
 from service.api.http.paging import PageRequest, list_links
 from service.api.http.problems import BODY, LISTED, MADE, NAMED, JobProblem, documented
-from service.api.http.submission import ScansRequest, kept_scans, monitor, stop_if_open, submit
+from service.api.http.submission import ScansRequest, admit, kept_scans, monitor, stop_if_open, submit
 from service.catalog import blob_keys
 from service.catalog.records import Anchor, Built, JobRecord, MapRecord, MapStatus
 
@@ -150,11 +150,14 @@ class MapList(Document):
     "/maps",
     status_code=202,
     summary="Build a map",
-    responses=documented(*BODY, "not_found", "conflict", "scan_unreadable", "queue_unavailable"),
+    responses=documented(
+        *BODY, "not_found", "conflict", "scan_unreadable", "queue_unavailable", "queue_full"
+    ),
     openapi_extra=bodies.documented(json=MapRequest, form=MapRequest, file="scans"),
 )
 async def create_map(request: HttpRequest, response: Response, services: Provided) -> AcceptedMap:
     """From scans uploaded before (`scan_ids`) or sent here (`scans`); their poses, where given, set the frame of the map."""
+    await run_in_threadpool(admit, services)
     async with bodies.received(request, services.settings) as body:
         wanted = checked(MapRequest, body.fields)
         require_map(request, wanted.id)

@@ -16,7 +16,7 @@ from service.api.http.dependencies import Provided, Services
 from service.api.http.documents import Document, Link, Request, checked, link
 from service.api.http.fields import Id, Model
 from service.api.http.problems import BODY, documented
-from service.api.http.submission import monitor, submit
+from service.api.http.submission import admit, monitor, submit
 from service.catalog.models import name_for
 from service.catalog.records import JobRecord, ModelRecord, ModelStatus
 from service.errors import BadRequest, Conflict
@@ -76,7 +76,7 @@ class AcceptedModel(Document):
     "/maps/{map_id}/models",
     status_code=202,
     summary="Train a model on a map",
-    responses=documented(*BODY, "not_found", "not_ready", "conflict", "queue_unavailable"),
+    responses=documented(*BODY, "not_found", "not_ready", "conflict", "queue_unavailable", "queue_full"),
     openapi_extra=bodies.documented(json=TrainingRequest),
 )
 async def train_model(
@@ -135,6 +135,7 @@ def _create(
     name = wanted.name or name_for(map_id)
     if any(card.get("name") == name for card in services.cards.released()):
         raise Conflict(f"the name {name!r} is that of a model in the model store; choose another")
+    admit(services, map_id)
     record, job = catalog.models.create(
         map_id,
         name=name,

@@ -21,7 +21,7 @@ from service.api.http.fields import DeviceId, Id, Instant, Model
 from service.api.http.files import blob_response
 from service.api.http.paging import PageRequest, list_links
 from service.api.http.problems import BODY, MADE, NAMED, JobProblem, documented
-from service.api.http.submission import ScansRequest, kept_scans, monitor, stop_if_open, submit
+from service.api.http.submission import ScansRequest, admit, kept_scans, monitor, stop_if_open, submit
 from service.catalog import blob_keys
 from service.catalog.records import JobRecord, MapRecord, SurveyRecord, SurveyStatus
 
@@ -69,7 +69,9 @@ class SurveyList(Document):
     "/maps/{map_id}/surveys",
     status_code=202,
     summary="Compare a visit with a map",
-    responses=documented(*BODY, "not_found", "not_ready", "scan_unreadable", "queue_unavailable"),
+    responses=documented(
+        *BODY, "not_found", "not_ready", "scan_unreadable", "queue_unavailable", "queue_full"
+    ),
     openapi_extra=bodies.documented(json=SurveyRequest, form=SurveyRequest, file="scans"),
 )
 async def create_survey(
@@ -77,6 +79,7 @@ async def create_survey(
 ) -> AcceptedSurvey:
     """Of scans uploaded before (`scan_ids`) or sent here (`scans`), with the version of the map that is in use now."""
     reference = await run_in_threadpool(services.catalog.maps.ready, map_id)  # before a long upload
+    await run_in_threadpool(admit, services)
     async with bodies.received(request, services.settings) as body:
         wanted = checked(SurveyRequest, body.fields)
         record, job = await run_in_threadpool(
@@ -186,6 +189,7 @@ def _create(
     body: Body,
     maps: Collection[str] | None,
 ) -> tuple[SurveyRecord, JobRecord]:
+    admit(services, wanted.device_id or reference.map_id)
     catalog = services.catalog
     model = services.cards.check(wanted.model or reference.model, maps)
     with kept_scans(catalog, body, wanted) as scan_ids:

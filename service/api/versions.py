@@ -16,7 +16,7 @@ from service.api.http.documents import Document, Link, checked, link
 from service.api.http.fields import Id
 from service.api.http.paging import PageRequest, list_links
 from service.api.http.problems import BODY, MADE, NAMED, JobProblem, documented
-from service.api.http.submission import ScansRequest, kept_scans, monitor, submit
+from service.api.http.submission import ScansRequest, admit, kept_scans, monitor, submit
 from service.api.maps import BuiltDocument, MapId, cloud_response, file_links, manifest_response
 from service.catalog.records import JobRecord, MapStatus, VersionRecord
 
@@ -59,7 +59,9 @@ class VersionList(Document):
     "/maps/{map_id}/versions",
     status_code=202,
     summary="Build a new version of a map",
-    responses=documented(*BODY, "not_found", "not_ready", "conflict", "scan_unreadable", "queue_unavailable"),
+    responses=documented(
+        *BODY, "not_found", "not_ready", "conflict", "scan_unreadable", "queue_unavailable", "queue_full"
+    ),
     openapi_extra=bodies.documented(json=VersionRequest, form=VersionRequest, file="scans"),
 )
 async def create_version(
@@ -71,6 +73,7 @@ async def create_version(
     and the ids of tiles stay. The version in use stays in use until the new one is ready; one version builds at a time.
     """
     await run_in_threadpool(services.catalog.maps.ready, map_id)  # before a long upload
+    await run_in_threadpool(admit, services)
     async with bodies.received(request, services.settings) as body:
         wanted = checked(VersionRequest, body.fields)
         record, job = await run_in_threadpool(_create, services, map_id, wanted, body)

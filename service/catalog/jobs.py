@@ -2,28 +2,35 @@
 
 accepted -> running -> successful | failed | dismissed, and accepted -> failed | dismissed
 
-A step that ends without a result is started again, and not for ever: a crash may be the file's fault, and then every
-attempt ends so; or the machine's, and then the next one does not.
+A job is at one step at a time, and the catalog knows at which: the step waits (`due`), or a worker has begun it
+(`begun`). The queue is told what to do next (service/dispatch.py) and is never asked how far a job is.
+
+A step that ends without a result is started again, and not for ever. A crash may be the file's fault, and then every
+attempt ends so: three are made. What comes from outside (a killed process, a lost machine, a database that is away)
+costs no attempt, and is borne twenty times, with a growing wait.
 """
 
 from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass
-from datetime import datetime
+from datetime import datetime, timedelta
 from typing import Any, cast
 
-from sqlalchemy import CursorResult, func, select, update
+from sqlalchemy import ColumnElement, CursorResult, func, select, update
 from sqlalchemy.orm import Session
 
 from service.catalog import history, tables, tallies
 from service.catalog.database import Database
 from service.catalog.records import JobRecord, JobStatus, Page, Position, Problem
-from service.catalog.steps import JobKind
+from service.catalog.steps import STEPS, JobKind, Step, first_step, step_after, step_of
+from service.catalog.steps import Queue as QueueName
 from service.catalog.tables import new_id, now
 from service.errors import Conflict, NotFound
 
-MAX_ATTEMPTS = 3  #: of a whole job, whichever of its steps they are lost in
+MAX_ATTEMPTS = 3  #: of one step
+MAX_INTERRUPTIONS = 20  #: of one step
+_LONGEST_DELAY_S = 30.0  #: before a step that was interrupted again and again
 WORKER_DIED = "worker_died"  #: code of the problem of a job that is given up
 
 _OPEN = tables.Job.status.in_(("accepted", "running"))
@@ -38,6 +45,34 @@ class OpenSteps:
     waits: bool
     count: int
     since: datetime  #: when the oldest came due, or began
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class OpenJob:
+    """A job that has not ended, as it is dispatched."""
+
+    job_id: str
+    kind: JobKind
+    step: str  #: name of the step that is due or runs
+    status: JobStatus
+    owner: str  #: who shares the workers with others: a device, else the map
+    created: datetime
+    due: datetime  #: when the step may begin
+    begun: datetime | None  #: when a worker began the step; None while it waits
+
+    @property
+    def queue_step(self) -> Step:
+        """The step itself."""
+        return step_of(self.kind, self.step)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Run:
+    """One run of a step: what a worker holds from `begin` to `advance`."""
+
+    job_id: str
+    step: str
+    begun: datetime  #: tells it from another run of the same step
 
 
 class Jobs:
@@ -97,28 +132,85 @@ class Jobs:
             for kind, step, waits, count, since in rows
         )
 
-    def start(self, job_id: str) -> bool:
-        """Mark the job as running; False when it has ended or gone, and the step has nothing to do."""
-        return self._advance(job_id, **_started())
+    def open_jobs(self) -> tuple[OpenJob, ...]:
+        """Return all that has not ended, in the order they were asked for."""
+        job = tables.Job
+        columns = (job.job_id, job.kind, job.step, job.status, job.owner, job.map_id)
+        query = (
+            select(*columns, job.created, job.due, job.begun).where(_OPEN).order_by(job.created, job.job_id)
+        )
+        with self._database.read() as session:
+            return tuple(
+                OpenJob(
+                    job_id=row.job_id,
+                    kind=row.kind,
+                    step=step_of(row.kind, row.step).name,
+                    status=row.status,
+                    owner=row.owner or row.map_id,
+                    created=row.created,
+                    due=row.due or row.created,
+                    begun=row.begun,
+                )
+                for row in session.execute(query)
+            )
 
-    def report(self, job_id: str, *, message: str, progress: float) -> bool:
+    def waiting(self, owner: str | None = None) -> int:
+        """Count the jobs that no worker has begun, of one owner or of all."""
+        query = select(func.count()).where(tables.Job.status == "accepted")
+        if owner is not None:
+            query = query.where(tables.Job.owner == owner)
+        with self._database.read() as session:
+            return session.scalar(query) or 0
+
+    def surveys_wait(self, queue: QueueName) -> bool:
+        """Tell whether a survey waits for a worker of a queue."""
+        names = {step.name for step in STEPS["survey"] if step.queue == queue}
+        job = tables.Job
+        query = select(job.job_id).where(
+            _OPEN, job.kind == "survey", job.begun.is_(None), job.step.in_(names), job.due <= now()
+        )
+        with self._database.read() as session:
+            return session.scalar(query.limit(1)) is not None
+
+    def begin(self, job_id: str, step: str) -> Run | None:
+        """Mark a step as running; None when it is not due: the job has ended, gone on, or another worker has it."""
+        begun = now()
+        due = (tables.Job.step == step, tables.Job.begun.is_(None))
+        if not self._advance(job_id, *due, **_started(), begun=begun):
+            return None
+        return Run(job_id=job_id, step=step, begun=begun)
+
+    def report(self, run: Run, *, message: str, progress: float) -> bool:
         """Say the stage and the share (0..1) of the whole job; False when the work should stop.
 
         The share never falls: a step that runs again reports from where the job already was.
         """
         percent = round(100 * min(max(progress, 0.0), 1.0))
         largest = func.greatest if self._database.engine.dialect.name == "postgresql" else func.max
-        return self._advance(
-            job_id, message=message, progress=largest(tables.Job.progress, percent), updated=now()
-        )
+        values = {"message": message, "progress": largest(tables.Job.progress, percent), "updated": now()}
+        return self._advance(run.job_id, *_of_run(run), **values)
+
+    def advance(self, run: Run) -> bool:
+        """Go on to the step behind one that ended well; False when the job had ended, or another run has the step."""
+        with self._database.write() as session:
+            ran = _ran(session, run.job_id)
+            following = None if ran is None else step_after(ran.kind, run.step)
+            if following is None:
+                return False
+            fresh = {"attempts": 0, "interruptions": 0, "updated": now()}
+            values = {"step": following.name, **fresh, **_due()}
+            return _changed(session, run.job_id, values, *_of_run(run), ran=ran, outcome="successful")
 
     def succeed(self, job_id: str) -> bool:
         """Mark the job as done and its map's version, survey or model as ready; False when it had ended or gone."""
         return self._end(job_id, "successful", message="done", progress=100)
 
-    def fail(self, job_id: str, problem: Problem) -> bool:
-        """Mark the job and its map's version, survey or model as failed; False when it had ended or gone."""
-        return self._end(job_id, "failed", message=problem.detail, problem=problem.model_dump())
+    def fail(self, job_id: str, problem: Problem, *, step: str | None = None) -> bool:
+        """Mark the job and its map's version, survey or model as failed; False when it had ended or gone.
+
+        `step` names the step that failed; where the job is at another one by now, nothing is changed.
+        """
+        return self._end(job_id, "failed", step=step, message=problem.detail, problem=problem.model_dump())
 
     def dismiss(self, job_id: str) -> JobRecord:
         """Stop the job for good; once more changes nothing. Raises NotFound, and Conflict when it ended by itself."""
@@ -129,40 +221,62 @@ class Jobs:
             raise Conflict(f"job {job_id!r} is already {job.status}; delete its map or survey instead")
         return job
 
-    def lose_attempt(self, job_id: str, reason: str) -> bool:
-        """Count an attempt that ended without a result; `reason` is the first half of a sentence.
+    def lose_attempt(self, job_id: str, step: str, reason: str) -> bool:
+        """Count an attempt that ended without a result, by its own fault; `reason` is the first half of a sentence.
 
-        True when the step shall be started again. False when this was the last attempt, and the job failed with
-        `WORKER_DIED`; and when the job had ended or gone before.
+        True when the step waits again. False when this was the last attempt, and the job failed with `WORKER_DIED`; and
+        when the job had ended, gone, or gone on.
         """
-        lost = tables.Job.attempts + 1
+        count = tables.Job.attempts
         with self._database.write() as session:
-            statement = update(tables.Job).where(tables.Job.job_id == job_id, _OPEN)
-            attempts = session.scalar(statement.values(attempts=lost).returning(tables.Job.attempts))
-            if attempts is None:
+            ran = _ran(session, job_id)
+            attempts = _counted(session, job_id, step, count)
+            if attempts is None or ran is None:
                 return False
+            tallies.tally_attempt(session, kind=ran.kind, step=step)
             if attempts < MAX_ATTEMPTS:
                 message = f"started again ({attempts + 1} of {MAX_ATTEMPTS}): {reason}"
-                return _changed(session, job_id, _started(message))
-        detail = f"{reason}; given up after {attempts} attempts, look at the worker's log and memory"
-        self.fail(job_id, Problem(code=WORKER_DIED, detail=detail))
+                return _changed(session, job_id, {**_started(message), **_due()}, ran=ran, outcome="lost")
+        self._give_up(job_id, step, f"{reason}; given up after {attempts} attempts")
         return False
 
-    def put_back(self, job_id: str) -> bool:
-        """Note that a step was stopped with its worker, which counts for no attempt.
+    def interrupt(self, job_id: str, step: str, reason: str, *, begun: datetime | None = None) -> bool:
+        """Put back a step that ended through no fault of its own, as `lose_attempt` does, at no attempt's cost.
 
-        False when the job had ended or gone, and the step is not wanted any more.
+        With `begun` only that very run: for who looked at the job before it looked at the queue.
         """
-        return self._advance(
-            job_id, **_started("stopped with its worker; goes on with the next that is free")
-        )
-
-    def _advance(self, job_id: str, **values: Any) -> bool:
+        same = () if begun is None else (tables.Job.begun == begun,)
         with self._database.write() as session:
-            return _changed(session, job_id, values)
+            ran = _ran(session, job_id)
+            times = _counted(session, job_id, step, tables.Job.interruptions, *same)
+            if times is None or ran is None:
+                return False
+            tallies.tally_interruption(session, kind=ran.kind, step=step)
+            if times < MAX_INTERRUPTIONS:
+                delay = min(2.0 ** (times - 3), _LONGEST_DELAY_S) if times > 3 else 0.0
+                message = f"interrupted, goes on with the next worker that is free: {reason}"
+                values = {**_started(message), **_due(delay)}
+                return _changed(session, job_id, values, ran=ran, outcome="interrupted")
+        self._give_up(job_id, step, f"{reason}; given up after {times} interruptions")
+        return False
 
-    def _end(self, job_id: str, status: JobStatus, **values: Any) -> bool:
+    def put_back(self, job_id: str, step: str, message: str) -> bool:
+        """Have a step wait again that gave way; False when the job had ended, gone, or gone on."""
+        with self._database.write() as session:
+            ran, values = _ran(session, job_id), {**_started(message), **_due()}
+            return _changed(session, job_id, values, tables.Job.step == step, ran=ran, outcome="put_back")
+
+    def _give_up(self, job_id: str, step: str, detail: str) -> None:
+        problem = Problem(code=WORKER_DIED, detail=f"{detail}, look at the worker's log and memory")
+        self.fail(job_id, problem, step=step)
+
+    def _advance(self, job_id: str, *where: ColumnElement[bool], **values: Any) -> bool:
+        with self._database.write() as session:
+            return _changed(session, job_id, values, *where)
+
+    def _end(self, job_id: str, status: JobStatus, *, step: str | None = None, **values: Any) -> bool:
         instant = now()
+        where = () if step is None else (tables.Job.step == step,)
         with self._database.write() as session:
             job = session.get(tables.Job, job_id)
             if job is None:
@@ -170,11 +284,13 @@ class Jobs:
             session.get(
                 tables.Map, job.map_id, with_for_update=True
             )  # map, then survey, then job: in one order
-            if not _changed(
-                session, job_id, {**values, "status": status, "finished": instant, "updated": instant}
-            ):
+            ended = {"status": status, "finished": instant, "updated": instant, "begun": None, "due": None}
+            problem = values.get("problem")
+            outcome = status if problem is None else problem["code"]
+            ran = _ran(session, job_id)
+            if not _changed(session, job_id, {**values, **ended}, *where, ran=ran, outcome=outcome):
                 return False
-            tallies.tally_job(session, kind=job.kind, status=status, problem=values.get("problem"))
+            tallies.tally_job(session, kind=job.kind, outcome=outcome)
             subject = _subject(session, job)
             if subject is not None:
                 subject.status = "ready" if status == "successful" else "failed"
@@ -185,9 +301,17 @@ class Jobs:
 
 
 def new_job(
-    kind: JobKind, map_id: str, survey_id: str | None = None, *, model: str | None = None
+    kind: JobKind,
+    map_id: str,
+    survey_id: str | None = None,
+    *,
+    model: str | None = None,
+    owner: str | None = None,
 ) -> tables.Job:
-    """Return a job that waits; the caller records it in the transaction of its map, survey or model."""
+    """Return a job that waits; the caller records it in the transaction of its map, survey or model.
+
+    `owner` is who shares the workers with others, a device; left out, it is the map.
+    """
     instant = now()
     return tables.Job(
         job_id=new_id("job"),
@@ -198,6 +322,9 @@ def new_job(
         status="accepted",
         message="waiting",
         progress=0,
+        step=first_step(kind).name,
+        due=instant,
+        owner=owner,
         created=instant,
         updated=instant,
     )
@@ -208,6 +335,23 @@ def _started(message: str | None = None) -> dict[str, object]:
     instant = now()
     columns = {"status": "running", "started": func.coalesce(tables.Job.started, instant), "updated": instant}
     return columns if message is None else {**columns, "message": message}
+
+
+def _due(delay_s: float = 0.0) -> dict[str, object]:
+    """Return the columns of a step that waits, from now on or from later on."""
+    return {"due": now() + timedelta(seconds=delay_s), "begun": None}
+
+
+def _of_run(run: Run) -> tuple[ColumnElement[bool], ...]:
+    """Return what holds as long as no other run has the step."""
+    return tables.Job.step == run.step, tables.Job.begun == run.begun
+
+
+def _counted(session: Session, job_id: str, step: str, count: Any, *where: ColumnElement[bool]) -> int | None:
+    """Add one to a count of the step that a job is at, and return it; None where the job is not at it any more."""
+    at_it = (tables.Job.job_id == job_id, tables.Job.step == step, _OPEN, *where)
+    statement = update(tables.Job).where(*at_it).values({count.key: count + 1}).returning(count)
+    return cast("int | None", session.scalar(statement))
 
 
 def _subject(session: Session, job: tables.Job) -> tables.MapVersion | tables.Survey | tables.Model | None:
@@ -226,6 +370,39 @@ def _row(session: Session, job_id: str) -> tables.Job:
     return row
 
 
-def _changed(session: Session, job_id: str, values: dict[str, Any]) -> bool:
-    statement = update(tables.Job).where(tables.Job.job_id == job_id, _OPEN).values(values)
-    return cast("CursorResult[Any]", session.execute(statement)).rowcount == 1
+@dataclass(frozen=True, kw_only=True, slots=True)
+class _Ran:
+    """The step that a job is at, and its times."""
+
+    kind: JobKind
+    step: str
+    due: datetime | None
+    begun: datetime | None
+
+
+def _ran(session: Session, job_id: str) -> _Ran | None:
+    """Return what the job is at, before that is changed."""
+    job = tables.Job
+    row = session.execute(select(job.kind, job.step, job.due, job.begun).where(job.job_id == job_id)).first()
+    if row is None:
+        return None
+    return _Ran(kind=cast("JobKind", row.kind), step=row.step, due=row.due, begun=row.begun)
+
+
+def _changed(
+    session: Session,
+    job_id: str,
+    values: dict[str, Any],
+    *where: ColumnElement[bool],
+    ran: _Ran | None = None,
+    outcome: str = "",
+) -> bool:
+    """Change an open job where that holds, and tell whether it did; a step that `ran` and ends so is tallied."""
+    statement = update(tables.Job).where(tables.Job.job_id == job_id, _OPEN, *where).values(values)
+    if cast("CursorResult[Any]", session.execute(statement)).rowcount != 1:
+        return False
+    if ran is not None and ran.begun is not None:
+        waited, took = ran.begun - (ran.due or ran.begun), now() - ran.begun
+        times = {"waited_s": waited.total_seconds(), "ran_s": took.total_seconds()}
+        tallies.tally_step(session, kind=ran.kind, step=ran.step, outcome=outcome, **times)
+    return True

@@ -400,6 +400,13 @@ class JobRecord(Record):
     survey_id: str | None
     model: str | None = Field(description="that a training makes", examples=[None])  #: `name/version`
     problem: Problem | None
+    step: str = Field(
+        description="that is due or runs; the last one of a job that has ended", examples=["register"]
+    )
+    attempts: int = Field(description="of this step that crashed; the third ends the job", examples=[0])
+    interruptions: int = Field(
+        description="of this step from outside, such as a worker that was stopped", examples=[0]
+    )
 
 
 class KeyRecord(Record):

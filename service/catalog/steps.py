@@ -39,9 +39,22 @@ STEPS: dict[JobKind, tuple[Step, ...]] = {
     ),
 }
 
-#: The name of `encode_map` in steps that an earlier build left in the queue; they are still run.
-_FORMER_FUNCTIONS = ("worker.jobs.describe_map",)
 
-ALLOWED_FUNCTIONS = frozenset(step.function for steps in STEPS.values() for step in steps).union(
-    _FORMER_FUNCTIONS
-)
+def first_step(kind: JobKind) -> Step:
+    """Return the step that a new job begins with."""
+    return STEPS[kind][0]
+
+
+def step_of(kind: JobKind, name: str) -> Step:
+    """Return a job's step by its name; the first where an earlier build knew it by another one."""
+    return next((step for step in STEPS[kind] if step.name == name), first_step(kind))
+
+
+def step_after(kind: JobKind, name: str) -> Step | None:
+    """Return the step that follows; None after the last."""
+    steps = STEPS[kind]
+    following = steps[steps.index(step_of(kind, name)) + 1 :]
+    return following[0] if following else None
+
+
+ALLOWED_FUNCTIONS = frozenset(step.function for steps in STEPS.values() for step in steps)

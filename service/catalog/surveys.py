@@ -52,7 +52,7 @@ class Surveys:
         """Record a survey and its job together. Raises NotFound, NotReady (the map), BadRequest (the scans)."""
         scan_ids = checked_scan_ids(scan_ids)
         survey_id = new_id("survey")
-        job = new_job("survey", map_id, survey_id)
+        job = new_job("survey", map_id, survey_id, owner=device_id)
         with self._database.write() as session:
             map_row(session, map_id, lock=True)  # nobody deletes the version meanwhile
             version = version_in_use(session, map_id)

@@ -19,7 +19,7 @@ from sqlalchemy import event, select
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.orm import Session
 
-from service.catalog.records import JobStatus, ScanOutcome, TileRecord
+from service.catalog.records import ScanOutcome, TileRecord
 from service.catalog.steps import STEPS, JobKind
 from service.catalog.tables import Tally
 
@@ -155,7 +155,7 @@ def read(session: Session) -> tuple[Sample, ...]:
 def tally_step(
     session: Session, *, kind: JobKind, step: str, outcome: str, waited_s: float, ran_s: float
 ) -> None:
-    """Count a step that ended: `outcome` is `successful`, `interrupted`, `lost` or the code of a problem."""
+    """Count a step that ended: `outcome` is `successful`, `interrupted`, `lost`, `put_back` or the code of a problem."""
     labels = {"kind": kind, "step": step, "outcome": outcome}
     add(session, STEP_WAIT_SECONDS.name, labels, max(waited_s, 0.0))
     add(session, STEP_SECONDS.name, labels, max(ran_s, 0.0))
@@ -171,9 +171,9 @@ def tally_interruption(session: Session, *, kind: str, step: str) -> None:
     add(session, INTERRUPTIONS.name, {"kind": kind, "step": step})
 
 
-def tally_job(session: Session, *, kind: str, status: JobStatus, problem: Mapping[str, Any] | None) -> None:
-    """Count a job that ended, under the code of its problem where it has one."""
-    add(session, JOBS_ENDED.name, {"kind": kind, "outcome": str(problem["code"]) if problem else status})
+def tally_job(session: Session, *, kind: str, outcome: str) -> None:
+    """Count a job that ended: its status, or the code of its problem where it has one."""
+    add(session, JOBS_ENDED.name, {"kind": kind, "outcome": outcome})
 
 
 def tally_outcomes(session: Session, of: str, outcomes: Iterable[ScanOutcome], known: Iterable[str]) -> None:

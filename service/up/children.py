@@ -1,21 +1,45 @@
-"""The worker processes of `spicd up`: started, started again when they die, and ended together."""
+"""The worker processes of `spicd up`: started, started again when they end, ended when they hang, and ended together."""
 
 from __future__ import annotations
 
 import logging
 import os
+import signal
+import socket
 import subprocess
 import sys
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal, Self
+from itertools import count
+from typing import Literal, Protocol, Self
+
+from service.up.lifetime import is_stopped
 
 log = logging.getLogger("spicd")
 
 GRACE_S = 3.0  #: what a running step has after SIGTERM
 _LONGEST_WAIT_S = 30.0  #: between two starts of a worker that keeps dying
 _HEALTHY_S = 60.0  #: a worker that lived this long starts again at once
+_FROZEN_S = 3.0  #: a worker that was stopped (SIGSTOP) for so long is ended
+_SILENT_S = 30.0  #: so is one of which the queue has heard nothing for so long, though it had before
+_LISTEN_S = 2.0  #: between two questions to the queue
+_OUTSIDE = (
+    -signal.SIGKILL,
+    -signal.SIGTERM,
+    -signal.SIGINT,
+    -signal.SIGHUP,
+)  #: what a fault in it does not raise
+
+
+class Watcher(Protocol):
+    """Whom a pool tells and asks about its workers; both may raise, and a pool outlives that."""
+
+    def ended(self, name: str, how: str, *, by_itself: bool) -> None:
+        """Take note that a worker has ended; what it had begun goes to another."""
+
+    def answering(self) -> frozenset[str]:
+        """Return the names of the workers that gave a sign of life."""
 
 
 @dataclass(slots=True)
@@ -27,6 +51,9 @@ class WorkerProcess:
     started: float = 0.0  #: monotonic seconds
     deaths: int = 0  #: in a row, each after less than `_HEALTHY_S`
     due: float = 0.0  #: monotonic seconds; not started again before
+    name: str = ""  #: of the worker in the queue, another at each start
+    heard: float | None = None  #: monotonic seconds of its last sign of life; None before the first
+    ran: float = 0.0  #: monotonic seconds; when it was last seen not stopped
 
     @property
     def pid(self) -> int:
@@ -44,11 +71,15 @@ class WorkerPool:
         inference: int,
         environment: Mapping[str, str],
         program: Sequence[str] = (sys.executable, "-m", "worker"),
+        watcher: Watcher | None = None,
     ) -> None:
         self.workers = [WorkerProcess("geometry") for _ in range(geometry)]
         self.workers += [WorkerProcess("inference") for _ in range(inference)]
         self._environment = dict(environment)
         self._program = program
+        self._watcher = watcher
+        self._numbers = count()
+        self._listen = 0.0
 
     def __enter__(self) -> Self:
         for worker in self.workers:
@@ -65,6 +96,7 @@ class WorkerPool:
                 self._reap(worker, status)
             if worker.process is None and time.monotonic() >= worker.due:
                 self._start(worker)
+        self._end_who_hangs()
 
     def stop(self) -> None:
         """Send SIGTERM to all, and SIGKILL to who is left after the grace; a killed worker takes its step along."""
@@ -85,8 +117,38 @@ class WorkerPool:
             if worker.process is not None:
                 worker.process.kill()
 
+    def _end_who_hangs(self) -> None:
+        """Kill workers that are stopped, or that the queue hears nothing of: their steps go to others."""
+        instant = time.monotonic()
+        self._listen_to_all(instant)
+        for worker in self.workers:
+            if worker.process is None:
+                continue
+            if not is_stopped(worker.process.pid):
+                worker.ran = instant
+            silent = worker.heard is not None and instant - worker.heard > _SILENT_S
+            if silent or instant - worker.ran > _FROZEN_S:
+                log.warning("the %s worker %d does not answer and is ended", worker.queue, worker.pid)
+                worker.heard = None
+                worker.process.kill()
+
+    def _listen_to_all(self, instant: float) -> None:
+        if self._watcher is None or instant < self._listen:
+            return
+        self._listen = instant + _LISTEN_S
+        try:
+            answering = self._watcher.answering()
+        except Exception:  # the queue is away: nobody can be heard
+            for worker in self.workers:
+                worker.heard = None
+            return
+        for worker in self.workers:
+            if worker.name in answering:
+                worker.heard = instant
+
     def _start(self, worker: WorkerProcess) -> None:
-        options = ["--parent", str(os.getpid()), "--grace", str(GRACE_S)]
+        worker.name = f"{worker.queue}-{socket.gethostname()}-{os.getpid()}-{next(self._numbers)}"
+        options = ["--parent", str(os.getpid()), "--grace", str(GRACE_S), "--name", worker.name]
         worker.process = subprocess.Popen(
             [*self._program, worker.queue, *options],
             env=self._environment,
@@ -94,11 +156,13 @@ class WorkerPool:
             stdout=sys.stderr.fileno(),  # stdout is the launcher's answer, and libraries print
             start_new_session=True,  # Ctrl-C is for the launcher, which ends its workers in order
         )
-        worker.started = time.monotonic()
+        worker.started = worker.ran = time.monotonic()
+        worker.heard = None
 
     def _reap(self, worker: WorkerProcess, status: int) -> None:
         lived = time.monotonic() - worker.started
-        worker.deaths = 0 if lived > _HEALTHY_S else worker.deaths + 1
+        by_itself = status not in _OUTSIDE
+        worker.deaths = worker.deaths + 1 if by_itself and lived <= _HEALTHY_S else 0
         wait = min(2.0**worker.deaths - 1, _LONGEST_WAIT_S)
         log.warning(
             "the %s worker %d ended with %s after %.0f s; starting another in %.0f s",
@@ -110,3 +174,15 @@ class WorkerPool:
         )
         worker.process = None
         worker.due = time.monotonic() + wait
+        if self._watcher is not None:
+            try:
+                self._watcher.ended(worker.name, _ending(worker.queue, status), by_itself=by_itself)
+            except (
+                Exception
+            ) as error:  # catalog or queue are away; what it had begun is found without a claim
+                log.warning("that the %s worker ended was not recorded: %s", worker.queue, error)
+
+
+def _ending(queue: str, status: int) -> str:
+    how = f"by signal {signal.Signals(-status).name}" if status < 0 else f"with exit status {status}"
+    return f"the {queue} worker that had it ended {how}"

@@ -11,8 +11,11 @@ LaunchFailed             the service cannot start; the message is one sentence f
 from __future__ import annotations
 
 import fcntl
+import hashlib
+import logging
 import os
 import shutil
+import stat
 import subprocess
 import tempfile
 import time
@@ -25,11 +28,14 @@ from redis.backoff import NoBackoff
 from redis.exceptions import RedisError
 from redis.retry import Retry
 
-from service.up.lifetime import command_ending_with_parent
+from service.up.lifetime import command_ending_with_parent, is_stopped
+
+log = logging.getLogger("spicd")
 
 _LONGEST_SOCKET_PATH = 100  # sun_path holds 108 bytes on Linux and 104 on macOS, unix(7)
 _START_S = 30.0  # reading a large append-only file takes a while
 _STOP_S = 10.0
+_FROZEN_S = 3.0  #: a server that was stopped for so long is ended
 _PROGRAMS = ("redis-server", "valkey-server")
 
 
@@ -64,6 +70,7 @@ class EmbeddedRedis:
         self._socket_folder = self._folder
         self._process: subprocess.Popen[bytes] | None = None
         self._lock: int | None = None
+        self._ran = time.monotonic()  #: when the server was last seen not stopped
 
     @property
     def url(self) -> str:
@@ -89,7 +96,7 @@ class EmbeddedRedis:
         program = find_server()
         lock = self._take_folder()
         if len(os.fsencode(self._socket)) > _LONGEST_SOCKET_PATH:
-            self._socket_folder = Path(tempfile.mkdtemp(prefix="spicd-"))  # only this user may enter
+            self._socket_folder = _short_folder(self._folder)
         self._process = subprocess.Popen(
             command_ending_with_parent([str(program), *self._options()]),
             cwd=self._folder,
@@ -100,6 +107,18 @@ class EmbeddedRedis:
             start_new_session=True,  # Ctrl-C is for the launcher, which ends the server last
         )
         self._wait_until_ready()
+
+    def check(self) -> None:
+        """Start a server that ended again, and end one that is stopped (SIGSTOP); call a few times a second."""
+        if not self.alive:
+            log.warning("the embedded Redis ended; starting it again")
+            self.start()
+        if not is_stopped(self.pid):
+            self._ran = time.monotonic()
+        elif self._process is not None and time.monotonic() - self._ran > _FROZEN_S:
+            log.warning("the embedded Redis does not answer and is ended")
+            self._process.kill()
+            self._process.wait()
 
     def stop(self) -> None:
         """End the server; it writes what it holds first."""
@@ -180,3 +199,19 @@ class EmbeddedRedis:
             client.close()
         self.stop()
         raise LaunchFailed(f"the embedded Redis did not start; {self._folder / 'redis.log'} says why")
+
+
+def _short_folder(folder: Path) -> Path:
+    """Return a folder for a socket whose path would be too long, the same at each start; only this user may enter.
+
+    Raises LaunchFailed where somebody else made it.
+    """
+    name = hashlib.sha256(os.fsencode(folder)).hexdigest()[:16]
+    short = Path(tempfile.gettempdir()) / f"spicd-{os.getuid()}-{name}"
+    short.mkdir(mode=0o700, exist_ok=True)
+    status = short.lstat()
+    if status.st_uid != os.getuid() or status.st_mode & 0o077 or not stat.S_ISDIR(status.st_mode):
+        raise LaunchFailed(
+            f"the folder {short} belongs to somebody else; remove it, or name a shorter data folder"
+        )
+    return short

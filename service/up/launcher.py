@@ -19,14 +19,16 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import uvicorn
 from fastapi import FastAPI
 
 from service.catalog.database import Database
+from service.catalog.jobs import Jobs
 from service.catalog.keys import open_keys
-from service.queue import JobQueue
+from service.dispatch import Dispatcher
+from service.queue import QUEUES, JobQueue
 from service.settings import Settings
 from service.up.children import WorkerPool
 from service.up.embedded_redis import EmbeddedRedis, LaunchFailed
@@ -83,6 +85,7 @@ def up(
             geometry=settings.geometry_workers,
             inference=settings.inference_workers,
             environment=environment_of(settings),
+            watcher=stack.enter_context(Supervision(settings)),
         )
         stack.enter_context(pool)
         stop.then = pool.kill
@@ -90,12 +93,36 @@ def up(
         on_ready(_running(settings, redis, pool))
         while not stop.asked:
             pool.check()
-            if redis is not None and not redis.alive:
-                log.warning("the embedded Redis ended; starting it again")
-                redis.start()
+            if redis is not None:
+                redis.check()
             if not api.is_alive():
                 raise LaunchFailed("the API ended by itself; the log says why")
             time.sleep(_LOOK_S)
+
+
+class Supervision:
+    """What the pool of workers tells catalog and queue of its workers; a context manager."""
+
+    def __init__(self, settings: Settings) -> None:
+        self._database = Database(settings.resolved_database_url())
+        self._queue = JobQueue(settings.redis_url or "", timeout_s=settings.job_timeout_s)
+        self._dispatcher = Dispatcher(Jobs(self._database), self._queue)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._queue.close()
+        self._database.close()
+
+    def ended(self, name: str, how: str, *, by_itself: bool) -> None:
+        """Have what a worker had begun go to another, now."""
+        self._dispatcher.worker_ended(name, how, by_itself=by_itself)
+
+    def answering(self) -> frozenset[str]:
+        """Return the names of the workers that gave a sign of life."""
+        snapshot = self._queue.snapshot()
+        return frozenset(name for queue in QUEUES for name in snapshot[queue].answering)
 
 
 def sweep_scratch(folder: Path) -> None:

@@ -13,6 +13,7 @@ import sys
 import threading
 import time
 from collections.abc import Sequence
+from pathlib import Path
 
 _PR_SET_PDEATHSIG = 1
 _POLL_S = 1.0
@@ -45,6 +46,14 @@ def end_with_parent(parent: int) -> None:
         threading.Thread(target=_watch, args=(parent,), daemon=True).start()
     if os.getppid() != parent:  # it ended before the kernel knew
         os._exit(1)
+
+
+def is_stopped(pid: int) -> bool:
+    """Tell whether a process is stopped by a signal and does not go on; False where the system does not say (proc(5))."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] in "Tt"
+    except (OSError, IndexError):
+        return False
 
 
 def _watch(parent: int) -> None:

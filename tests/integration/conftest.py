@@ -18,12 +18,8 @@ from tests.support.house import House, Material, environment, made_material
 
 @pytest.fixture
 def bench(tmp_path: Path) -> Iterator[Bench]:
-    with EmbeddedRedis(tmp_path / "redis") as server:
-        bench = Bench(tmp_path, server.url)
+    with EmbeddedRedis(tmp_path / "redis") as server, Bench(tmp_path, server.url) as bench:
         yield bench
-        for worker in bench.workers:
-            worker.kill()
-            worker.wait()
 
 
 @pytest.fixture(scope="session")

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import json
-import tempfile
+from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 from service.catalog import blob_keys
-from service.catalog.jobs import Jobs
+from service.catalog.jobs import Jobs, Run
 from service.catalog.records import JobRecord, Placement, ScanRecord
 from service.catalog.steps import STEPS, JobKind
 from service.settings import Settings
@@ -25,6 +24,7 @@ from worker.errors import DetectorUnavailable, MapFailed, ScanError
 from worker.jobs.surveys import scoring
 from worker.pipeline.flow import NoScanAccepted
 from worker.pipeline.registration.diagnosis import REASONS
+from worker.scratch import scratch_folder
 
 
 @pytest.fixture
@@ -207,9 +207,9 @@ def test_a_job_dismissed_while_a_step_works_stops_there(
         run(visited, earlier)
     real, files = Jobs.report, house.files()
 
-    def dismissed_meanwhile(self: Jobs, job_id: str, *, message: str, progress: float) -> bool:
-        self.dismiss(job_id)
-        return real(self, job_id, message=message, progress=progress)
+    def dismissed_meanwhile(self: Jobs, of: Run, *, message: str, progress: float) -> bool:
+        self.dismiss(of.job_id)
+        return real(self, of, message=message, progress=progress)
 
     monkeypatch.setattr(Jobs, "report", dismissed_meanwhile)
     run(visited, name)
@@ -347,18 +347,17 @@ def test_what_a_step_is_in_the_middle_of_lies_in_the_scratch_folder(
 ) -> None:
     folders: list[Path] = []
 
-    def noting(**given: Any) -> tempfile.TemporaryDirectory[str]:
-        folders.append(Path(given["dir"]))
-        return tempfile.TemporaryDirectory(**given)
+    def noting(parent: Path, name: str) -> AbstractContextManager[Path]:
+        folders.append(parent)
+        return scratch_folder(parent, name)
 
-    monkeypatch.setattr("worker.jobs.step.TemporaryDirectory", noting)
+    monkeypatch.setattr("worker.jobs.step.scratch_folder", noting)
     run(house.map_of(house.add("one.pcd", house.material.before[1]), map_id="hall"))
     assert set(folders) == {Settings().scratch_dir()}
     assert list(Settings().scratch_dir().iterdir()) == []
 
 
-def test_the_last_step_of_a_map_that_an_earlier_build_queued_is_the_one_of_today() -> None:
-    assert jobs.describe_map is jobs.encode_map
+def test_the_steps_that_the_queue_names_are_those_of_the_worker() -> None:
     assert {step.function.removeprefix("worker.jobs.") for steps in STEPS.values() for step in steps} <= set(
         jobs.__all__
     )

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import functools
 import socket
-import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import cast
 
 import pytest
 from redis import Redis
 
-from service.catalog.steps import ALLOWED_FUNCTIONS, STEPS, JobKind, Step
+from service.catalog.steps import STEPS
 from service.errors import QueueUnavailable
-from service.queue import JobQueue
+from service.queue import Claim, JobQueue
 from service.up.embedded_redis import EmbeddedRedis
 
 
@@ -38,118 +38,125 @@ def queue(server: EmbeddedRedis, redis: Redis) -> Iterator[JobQueue]:
     queue.close()
 
 
-def test_submit_queues_the_first_step_and_parks_the_others(queue: JobQueue, redis: Redis) -> None:
-    queue.submit("s1", "survey")
-    assert redis.lrange("rq:queue:geometry", 0, -1) == ["s1-register"]
-    assert redis.exists("rq:queue:inference") == 0
-    assert redis.smembers("rq:job:s1-register:dependents") == {"s1-score"}
-    assert redis.smembers("rq:job:s1-score:dependents") == {"s1-export"}
-    assert redis.zrange("rq:deferred:inference", 0, -1) == ["s1-score"]
+REGISTER = STEPS["map"][0]
+
+
+def begin(redis: Redis, name: str, *, worker: str = "w1", queue: str = "geometry") -> None:
+    """What a worker leaves in Redis that has claimed a step."""
+    redis.lrem(f"rq:queue:{queue}", 1, name)
+    redis.zadd(f"rq:wip:{queue}", {f"{name}:1": 1})
+    redis.hset(f"rq:execution:{name}:1", "worker_name", worker)
+
+
+def waiting(redis: Redis) -> list[str]:
+    return cast("list[str]", redis.lrange("rq:queue:geometry", 0, -1))
 
 
 def test_a_step_carries_a_name_and_an_id_and_bounded_times(queue: JobQueue, redis: Redis) -> None:
-    queue.submit("m1", "map")
+    queue.arrange("geometry", [("m1", REGISTER)])
     raw = Redis(connection_pool=redis.connection_pool)
-    job = raw.hmget("rq:job:m1-register", "timeout", "result_ttl", "failure_ttl", "origin", "description")
-    assert job == ["120", "86400", "86400", "geometry", "worker.jobs.register_map('m1')"]
+    job = raw.hmget("rq:job:m1-register", "timeout", "origin", "status", "description")
+    assert job == ["120", "geometry", "queued", "worker.jobs.register_map('m1')"]
+    assert redis.ttl("rq:job:m1-register") > 0
 
 
-def test_submitting_twice_queues_once(queue: JobQueue, redis: Redis) -> None:
-    queue.submit("m1", "map")
-    queue.submit("m1", "map")
-    assert redis.lrange("rq:queue:geometry", 0, -1) == ["m1-register"]
-    assert redis.zcard("rq:deferred:inference") == 1
+def test_what_waits_is_what_is_wanted_in_that_order(queue: JobQueue, redis: Redis) -> None:
+    queue.arrange("geometry", [("m1", REGISTER), ("m2", REGISTER)])
+    assert waiting(redis) == ["m1-register", "m2-register"]
+    queue.arrange("geometry", [("m3", REGISTER), ("m1", REGISTER)])
+    assert waiting(redis) == ["m3-register", "m1-register"]
+    assert sorted(redis.keys("rq:job:*")) == ["rq:job:m1-register", "rq:job:m3-register"]
+    assert redis.exists("rq:queue:inference") == 0
 
 
-def begin(redis: Redis, name: str, queue: str = "geometry") -> None:
-    """What a worker leaves in Redis that has taken a step."""
-    redis.lrem(f"rq:queue:{queue}", 1, name)
-    redis.zadd(f"rq:wip:{queue}", {f"{name}:1": time.time() + 60})
-    redis.hset(f"rq:job:{name}", "status", "started")
+def test_what_somebody_else_wrote_is_removed(queue: JobQueue, redis: Redis) -> None:
+    redis.rpush("rq:queue:geometry", "forged")
+    redis.hset("rq:job:forged", "data", "os.system")
+    queue.arrange("geometry", [])
+    assert waiting(redis) == []
+    assert not redis.exists("rq:job:forged")
 
 
-def test_a_job_is_held_while_a_step_waits_or_a_worker_has_it(queue: JobQueue, redis: Redis) -> None:
-    assert not queue.holds("m1", "map")
-    queue.submit("m1", "map")
-    assert queue.holds("m1", "map")
-    redis.lmove("rq:queue:geometry", "rq:queue:geometry:intermediate")  # a worker is about to begin
-    assert queue.holds("m1", "map")
+def test_the_state_follows_a_step_from_the_queue_to_its_end(queue: JobQueue, redis: Redis) -> None:
+    assert queue.snapshot().held == frozenset()
+    queue.arrange("geometry", [("m1", REGISTER)])
+    assert queue.snapshot()["geometry"].waiting == ("m1-register",)
+    redis.lmove("rq:queue:geometry", "rq:queue:geometry:intermediate")  # a worker is about to claim it
+    assert queue.snapshot()["geometry"].taken == ("m1-register",)
     redis.delete("rq:queue:geometry:intermediate")
     begin(redis, "m1-register")
-    assert queue.holds("m1", "map")
-    redis.delete("rq:wip:geometry")
-    assert not queue.holds("m1", "map")
-    assert not queue.holds("m", "map")
+    assert queue.snapshot()["geometry"].claims == (Claim(step="m1-register", execution="1", worker="w1"),)
+    assert queue.snapshot().held == {"m1-register"}
+    redis.delete("rq:execution:m1-register:1")  # the claim has ended by itself
+    (claim,) = queue.snapshot()["geometry"].claims
+    assert (claim.worker, queue.snapshot().held) == (None, frozenset())
 
 
-def test_a_step_that_a_worker_has_is_not_queued_again(queue: JobQueue, redis: Redis) -> None:
-    queue.submit("m1", "map")
+@pytest.mark.parametrize("by", ["taken", "claimed"])
+def test_a_step_that_a_worker_has_is_not_queued_again(queue: JobQueue, redis: Redis, by: str) -> None:
+    queue.arrange("geometry", [("m1", REGISTER)])
+    if by == "taken":
+        redis.lmove("rq:queue:geometry", "rq:queue:geometry:intermediate")
+    else:
+        begin(redis, "m1-register")
+    queue.arrange("geometry", [("m1", REGISTER), ("m2", REGISTER)])
+    assert waiting(redis) == ["m2-register"]
+    assert redis.exists("rq:job:m1-register")
+
+
+def test_a_claim_that_is_released_leaves_nothing(queue: JobQueue, redis: Redis) -> None:
+    queue.arrange("geometry", [("m1", REGISTER)])
     begin(redis, "m1-register")
-    queue.submit("m1", "map")
-    assert redis.exists("rq:queue:geometry") == 0
-    assert redis.hget("rq:job:m1-register", "status") == "started"
+    queue.release(queue.snapshot()["geometry"].claims)
+    assert redis.keys("rq:*") == []
 
 
-def test_a_step_whose_claims_are_released_is_queued_again_with_those_behind_it(
+def test_an_old_claim_that_is_released_takes_nothing_from_the_step_that_waits_again(
     queue: JobQueue, redis: Redis
 ) -> None:
-    queue.submit("s1", "survey")
-    begin(redis, "s1-register")
-    redis.set("rq:clean_registries:geometry", 1)  # of a worker that was killed while it cleaned up
-    queue.release_claims()
-    assert redis.exists("rq:clean_registries:geometry") == 0
-    queue.submit("s1", "survey")
-    assert redis.lrange("rq:queue:geometry", 0, -1) == ["s1-register"]
-    assert redis.hget("rq:job:s1-register", "status") == "queued"
-    assert redis.smembers("rq:job:s1-score:dependents") == {"s1-export"}
-    assert redis.zrange("rq:deferred:inference", 0, -1) == ["s1-score"]
+    queue.arrange("geometry", [("m1", REGISTER)])
+    begin(redis, "m1-register")
+    old = queue.snapshot()["geometry"].claims
+    redis.delete("rq:execution:m1-register:1")
+    queue.arrange("geometry", [("m1", REGISTER)])
+    queue.release(old)
+    assert waiting(redis) == ["m1-register"]
+    assert redis.exists("rq:job:m1-register")
+    assert queue.snapshot()["geometry"].claims == ()
 
 
-def test_a_step_that_a_worker_took_and_never_began_is_queued_again_once_the_claims_are_released(
-    queue: JobQueue, redis: Redis
-) -> None:
-    queue.submit("m1", "map")
+def test_a_step_that_was_taken_and_dropped_can_be_queued_again(queue: JobQueue, redis: Redis) -> None:
+    queue.arrange("geometry", [("m1", REGISTER)])
     redis.lmove("rq:queue:geometry", "rq:queue:geometry:intermediate")
-    queue.submit("m1", "map")
-    assert redis.exists("rq:queue:geometry") == 0
+    queue.drop_taken("geometry", "m1-register")
+    assert redis.keys("rq:*") == []
+    queue.arrange("geometry", [("m1", REGISTER)])
+    assert waiting(redis) == ["m1-register"]
+
+
+def test_workers_answer_while_their_key_lives(queue: JobQueue, redis: Redis) -> None:
+    redis.sadd("rq:workers:geometry", "rq:worker:w1", "rq:worker:w2")
+    redis.hset("rq:worker:w1", "state", "busy")
+    state = queue.snapshot()["geometry"]
+    assert (state.answering, state.silent) == (("w1",), ("w2",))
+    queue.forget_worker("w2")
+    assert queue.snapshot()["geometry"].silent == ()
+
+
+def test_where_no_worker_is_alive_all_claims_are_taken_away(queue: JobQueue, redis: Redis) -> None:
+    queue.arrange("geometry", [("m1", REGISTER)])
+    begin(redis, "m1-register")
+    redis.rpush("rq:queue:geometry:intermediate", "m2-register")
+    redis.sadd("rq:workers:geometry", "rq:worker:w1")
     queue.release_claims()
-    queue.submit("m1", "map")
-    assert redis.lrange("rq:queue:geometry", 0, -1) == ["m1-register"]
-
-
-def test_a_job_goes_on_with_the_step_that_had_not_finished(queue: JobQueue, redis: Redis) -> None:
-    queue.submit("s1", "survey")
-    begin(redis, "s1-register")
-    redis.hset("rq:job:s1-register", "status", "finished")
-    redis.zrem("rq:deferred:inference", "s1-score")
-    begin(redis, "s1-score", "inference")
-    queue.release_claims()
-    queue.submit("s1", "survey")
-    assert redis.exists("rq:queue:geometry") == 0
-    assert redis.lrange("rq:queue:inference", 0, -1) == ["s1-score"]
-    assert redis.zrange("rq:deferred:geometry", 0, -1) == ["s1-export"]
-
-
-def test_a_step_that_failed_unheard_leaves_no_trace_when_it_is_queued_again(
-    queue: JobQueue, redis: Redis
-) -> None:
-    queue.submit("m1", "map")
-    redis.delete("rq:queue:geometry")
-    redis.hset("rq:job:m1-register", mapping={"status": "failed", "exc_info": "x", "retries_left": 5})
-    redis.zadd("rq:failed:geometry", {"m1-register": time.time() + 60})
-    queue.submit("m1", "map")
-    assert redis.zcard("rq:failed:geometry") == 0
-    assert redis.hget("rq:job:m1-register", "retries_left") is None
-    assert redis.lrange("rq:queue:geometry", 0, -1) == ["m1-register"]
+    assert redis.keys("rq:*") == []
 
 
 def test_dismiss_leaves_nothing_of_a_waiting_job_and_all_of_another(queue: JobQueue, redis: Redis) -> None:
-    queue.submit("s1", "survey")
-    queue.submit("s2", "survey")
+    queue.arrange("geometry", [("s1", STEPS["survey"][0]), ("s2", STEPS["survey"][0])])
     queue.dismiss("s1", "survey")
-    assert redis.lrange("rq:queue:geometry", 0, -1) == ["s2-register"]
-    assert not [key for key in redis.keys("rq:job:*") if "s1" in key]
-    assert redis.zrange("rq:deferred:geometry", 0, -1) == ["s2-export"]
+    assert waiting(redis) == ["s2-register"]
+    assert redis.keys("rq:job:*") == ["rq:job:s2-register"]
 
 
 def test_dismissing_an_unknown_job_does_nothing(queue: JobQueue, redis: Redis) -> None:
@@ -161,9 +168,15 @@ def test_a_refused_connection_is_reported_and_the_password_is_not(tmp_path: Path
     with socket.socket() as closed:
         closed.bind(("127.0.0.1", 0))
         queue = JobQueue(f"redis://:secret@127.0.0.1:{closed.getsockname()[1]}")
-        about = (queue.submit, queue.holds, queue.dismiss)
-        calls = [functools.partial(call, "m1", "map") for call in about]
-        for call in (queue.ping, queue.release_claims, *calls):
+        calls: list[Callable[[], object]] = [
+            queue.ping,
+            queue.snapshot,
+            queue.release_claims,
+            functools.partial(queue.arrange, "geometry", [("m1", REGISTER)]),
+            functools.partial(queue.drop_taken, "geometry", "m1-register"),
+            functools.partial(queue.dismiss, "m1", "map"),
+        ]
+        for call in calls:
             with pytest.raises(QueueUnavailable, match="nothing was recorded") as found:
                 call()
             assert "secret" not in str(found.value)
@@ -173,36 +186,3 @@ def test_a_refused_connection_is_reported_and_the_password_is_not(tmp_path: Path
 def test_a_server_that_accepts_and_says_nothing_does_not_hold_the_request() -> None:
     with socket.create_server(("127.0.0.1", 0)) as silent, pytest.raises(QueueUnavailable):
         JobQueue(f"redis://127.0.0.1:{silent.getsockname()[1]}").ping()
-
-
-#: The steps of a map as earlier builds queued them.
-FORMER: dict[JobKind, tuple[Step, ...]] = {
-    "map": (
-        STEPS["map"][0],
-        Step(name="describe", function="worker.jobs.describe_map", queue="inference"),
-    )
-}
-
-
-def test_a_map_that_an_earlier_build_queued_goes_on_with_the_step_that_it_queued(
-    server: EmbeddedRedis, queue: JobQueue
-) -> None:
-    former = JobQueue(server.url, steps=FORMER)
-    former.submit("m1", "map")
-    former.close()
-    assert queue.holds("m1", "map")  # so it is not submitted again when the service starts
-    assert {step.function for step in FORMER["map"]} <= ALLOWED_FUNCTIONS
-
-
-def test_a_map_whose_last_step_an_earlier_build_queued_gets_the_step_of_today_beside_it(
-    server: EmbeddedRedis, queue: JobQueue, redis: Redis
-) -> None:
-    former = JobQueue(server.url, steps=FORMER)
-    former.submit("m1", "map")
-    former.close()
-    redis.delete("rq:queue:geometry")
-    redis.hset("rq:job:m1-register", "status", "finished")
-    redis.rpush("rq:queue:inference", "m1-describe")
-    queue.submit("m1", "map")
-    assert redis.lrange("rq:queue:geometry", 0, -1) == []
-    assert redis.lrange("rq:queue:inference", 0, -1) == ["m1-describe", "m1-encode"]

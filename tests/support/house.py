@@ -14,9 +14,12 @@ import numpy as np
 import pytest
 import torch
 from safetensors.torch import save
+from sqlalchemy import update
 
+from service.catalog import tables
 from service.catalog.catalog import Catalog, open_catalog
-from service.catalog.jobs import Jobs
+from service.catalog.database import Database
+from service.catalog.jobs import Jobs, Run
 from service.catalog.records import JobRecord, ScanRecord, SurveyRecord
 from service.catalog.steps import STEPS
 from service.settings import Settings
@@ -112,7 +115,17 @@ def run(job: JobRecord, *names: str) -> None:
     for step in STEPS[job.kind]:
         if not names or step.name in names:
             module, function = step.function.rsplit(".", 1)
+            _have_due(job.job_id, step.name)
             getattr(importlib.import_module(module), function)(job.job_id)
+
+
+def _have_due(job_id: str, step: str) -> None:
+    """Have a step of an open job wait, as after a run of it that was lost."""
+    database = Database(Settings().resolved_database_url())
+    with database.write() as session:
+        open_job = (tables.Job.job_id == job_id, tables.Job.status.in_(("accepted", "running")))
+        session.execute(update(tables.Job).where(*open_job).values(step=step, begun=None))
+    database.close()
 
 
 def _models(folder: Path) -> None:
@@ -148,9 +161,9 @@ def environment(patch: pytest.MonkeyPatch, data: Path, model_store: Path) -> Set
 def _overheard(told: list[tuple[str, float]]) -> Any:
     real = Jobs.report
 
-    def report(self: Jobs, job_id: str, *, message: str, progress: float) -> bool:
+    def report(self: Jobs, run: Run, *, message: str, progress: float) -> bool:
         told.append((message, progress))
-        return real(self, job_id, message=message, progress=progress)
+        return real(self, run, message=message, progress=progress)
 
     return report
 

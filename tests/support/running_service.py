@@ -23,14 +23,14 @@ ORDER = ("accepted", "running", "successful", "failed", "dismissed")
 class Service:
     """`spicd up`, and its API as a client sees it."""
 
-    def __init__(self, folder: Path, model_store: Path, **more: str) -> None:
-        """Start it and wait; `more` are further variables of its environment."""
+    def __init__(self, folder: Path, model_store: Path, **settings: str) -> None:
+        """Start it and wait; `settings` are further variables of its environment."""
         ready, self.log = folder / "ready.json", folder / "log"
         command = [sys.executable, "-m", "service", "up", "--port", "0", "--end-with-parent"]
         command += ["--data-dir", str(folder / "data"), "--ready-file", str(ready)]
         environment = {key: value for key, value in os.environ.items() if not key.startswith("SPICD_")}
-        environment |= {"SPICD_MODEL_STORE": str(model_store), **more}
-        with self.log.open("wb") as log:
+        environment |= {"SPICD_MODEL_STORE": str(model_store), **settings}
+        with self.log.open("ab") as log:
             self.process = subprocess.Popen(command, cwd=ROOT, env=environment, stdout=log, stderr=log)
         until = time.monotonic() + STARTS_WITHIN_S
         while not ready.exists():

@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
@@ -34,7 +34,9 @@ from service.catalog.records import (
     TileRecord,
     TileState,
 )
+from service.catalog.steps import Step
 from service.errors import QueueUnavailable
+from service.queue import Claim, QueueState, Snapshot
 from service.settings import Settings
 
 MODEL = "spicd-net/1"
@@ -47,18 +49,29 @@ BOUNDS = Bounds(min=(0, 0, 0), max=(3, 3, 1))
 class RememberingQueue:
     """Stands in for the job queue."""
 
-    submitted: list[tuple[str, str]] = field(default_factory=list)
+    submitted: list[tuple[str, str]] = field(default_factory=list)  #: job and step, as they came to wait
     dismissed: list[tuple[str, str]] = field(default_factory=list)
-    held: set[str] = field(default_factory=set)  #: jobs that were submitted before
+    state: QueueState = field(default_factory=lambda: QueueState(answering=tuple("abcdefgh")))
     down: bool = False
 
-    def submit(self, job_id: str, kind: str) -> None:
+    def snapshot(self) -> Snapshot:
         self.ping()
-        self.submitted.append((job_id, kind))
+        return Snapshot(queues={"geometry": self.state, "inference": self.state})
 
-    def holds(self, job_id: str, kind: str) -> bool:
+    def arrange(self, queue: str, wanted: Sequence[tuple[str, Step]]) -> None:
         self.ping()
-        return job_id in self.held
+        for job_id, step in wanted:
+            if (job_id, step.name) not in self.submitted:
+                self.submitted.append((job_id, step.name))
+
+    def release(self, claims: Iterable[Claim]) -> None:
+        self.ping()
+
+    def drop_taken(self, queue: str, name: str) -> None:
+        self.ping()
+
+    def forget_worker(self, name: str) -> None:
+        self.ping()
 
     def dismiss(self, job_id: str, kind: str) -> None:
         self.ping()

@@ -1,31 +1,37 @@
 """A worker with steps of its own, for tests.
 
-    python -m tests.support.standin geometry|inference REDIS_URL FOLDER [GRACE]
+    python -m tests.support.standin geometry|inference REDIS_URL FOLDER [GRACE [NAME]]
 
-What the steps did and how they ended stands in FOLDER/record, one line an event. Where STANDIN_CATALOG names a
-database, the steps begin and end their job there, and the worker tells it what it tells the catalog.
+What the steps did and how they ended stands in FOLDER/record, one line an event; FOLDER/steps.json says of which steps
+each kind of job consists. The catalog is that of FOLDER/data.
 """
 
 from __future__ import annotations
 
+import functools
+import json
 import logging
 import os
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 from redis import Redis
 
-from service.catalog.database import Database
-from service.catalog.jobs import Jobs
+from service.catalog import steps
 from service.logs import set_up_logging
+from service.settings import Settings
 from service.up.lifetime import end_with_parent
-from worker.__main__ import CatalogRecords
+from worker.__main__ import CatalogRecords, work
 from worker.errors import RegistrationFailed
+from worker.jobs.step import Context, step
 from worker.rq_workers import GeometryWorker, InferenceWorker
 
-FUNCTIONS = ("first", "second", "third", "refuse", "crash", "sleep", "busy", "hold", "finish")
-MAX_LOST = 3
+FUNCTIONS = (
+    "first", "second", "third", "refuse", "crash", "crash_once", "sleep", "busy", "hold", "finish", "stray", "full",
+    "early",
+)  # fmt: skip
 
 
 def record(*words: str) -> None:
@@ -34,56 +40,130 @@ def record(*words: str) -> None:
         file.write(" ".join(words) + "\n")
 
 
-def first(job_id: str) -> None:
-    record("first", job_id)
+def written_steps(path: Path) -> dict[steps.JobKind, tuple[steps.Step, ...]]:
+    """Return the steps of each kind of job, as the bench wrote them."""
+    table = json.loads(path.read_text()) if path.exists() else {}
+    return {
+        kind: tuple(
+            steps.Step(name=name, function=f"tests.support.standin.{name}", queue=queue)
+            for name, queue in chain
+        )
+        for kind, chain in table.items()
+    }
 
 
-def second(job_id: str) -> None:
-    record("second", job_id)
+def refresh() -> None:
+    """Read anew of which steps jobs consist."""
+    steps.STEPS.update(written_steps(Path(os.environ["STANDIN_RECORD"]).with_name("steps.json")))
 
 
-def third(job_id: str) -> None:
-    record("third", job_id)
+def stage(run: Callable[[Context], None]) -> Callable[[str], None]:
+    """Make a step of a function, as the steps of the service are made."""
+    run.__name__ = run.__name__.lstrip("_")
+    shell = step(run)
+
+    @functools.wraps(run)
+    def call(job_id: str) -> None:
+        refresh()
+        shell(job_id)
+
+    return call
 
 
-def refuse(job_id: str) -> None:
+@stage
+def first(context: Context) -> None:
+    record("first", context.job.job_id)
+
+
+@stage
+def second(context: Context) -> None:
+    record("second", context.job.job_id)
+
+
+@stage
+def third(context: Context) -> None:
+    record("third", context.job.job_id)
+
+
+@stage
+def refuse(context: Context) -> None:
     raise RegistrationFailed("scan 1: fitness 0.10 is below 0.30")
 
 
-def crash(job_id: str) -> None:
+@stage
+def full(context: Context) -> None:
+    raise OSError(28, "No space left on device")
+
+
+@stage
+def crash(context: Context) -> None:
     """End as a fault in C++ ends a process."""
-    record("crash", job_id)
+    record("crash", context.job.job_id)
     os.abort()
 
 
-def sleep(job_id: str) -> None:
+@stage
+def crash_once(context: Context) -> None:
+    """End so, but for the second time."""
+    record("crash_once", context.job.job_id)
+    mark = Path(os.environ["STANDIN_RECORD"]).with_name(f"crashed-{context.job.job_id}")
+    if not mark.exists():
+        mark.touch()
+        os.abort()
+
+
+@stage
+def _early(context: Context) -> None:
+    record("early", context.job.job_id)
+
+
+def early(job_id: str) -> None:
+    """End after the worker claimed the step and before it began, once."""
+    mark = Path(os.environ["STANDIN_RECORD"]).with_name("early")
+    if not mark.exists():
+        mark.touch()
+        os.kill(os.getpid(), 9)
+    _early(job_id)
+
+
+@stage
+def sleep(context: Context) -> None:
     """Hold still in one call, as native code does."""
-    record("sleep", job_id, str(os.getpid()))
+    record("sleep", context.job.job_id, str(os.getpid()))
     time.sleep(60)
-    record("woke", job_id)
+    record("woke", context.job.job_id)
 
 
-def busy(job_id: str) -> None:
+@stage
+def busy(context: Context) -> None:
     """Work in small pieces, as batches of the network do."""
-    record("busy", job_id, str(os.getpid()))
+    record("busy", context.job.job_id, str(os.getpid()))
     for _ in range(600):
         time.sleep(0.1)
 
 
-def hold(job_id: str) -> None:
-    """Work until the test says `go`."""
-    if catalog := os.environ.get("STANDIN_CATALOG"):
-        Jobs(Database(catalog)).start(job_id)
-    record("hold", job_id, str(os.getpid()))
+@stage
+def hold(context: Context) -> None:
+    """Work until the test says `go`, and leave files that nobody else removes."""
+    (context.scratch / "half").write_text("half of a file")
+    record("hold", context.job.job_id, str(os.getpid()))
     while not Path(os.environ["STANDIN_RECORD"]).with_name("go").exists():
         time.sleep(0.02)
-    record("held", job_id)
+    record("held", context.job.job_id)
 
 
-def finish(job_id: str) -> None:
-    """The last step of a job in the catalog."""
-    record("finish", job_id)
-    Jobs(Database(os.environ["STANDIN_CATALOG"])).succeed(job_id)
+@stage
+def finish(context: Context) -> None:
+    """The last step of a job."""
+    record("finish", context.job.job_id)
+    context.catalog.jobs.succeed(context.job.job_id)
+
+
+@stage
+def stray(context: Context) -> None:
+    """Start a process that outlives the step."""
+    pid = os.spawnlp(os.P_NOWAIT, "sleep", "sleep", "60")
+    record("stray", context.job.job_id, str(pid))
 
 
 def leak(*_: object) -> None:
@@ -91,36 +171,52 @@ def leak(*_: object) -> None:
     record("leak")
 
 
-class Book:
-    """Stands in for the catalog: every job is there and open, and is given up at the third loss."""
+class Book(CatalogRecords):
+    """Tells the catalog, and the record."""
 
-    def failed(self, job_id: str, code: str, sentence: str) -> None:
+    def failed(self, job_id: str, step: str, code: str, sentence: str) -> None:
         record("died", job_id, code, sentence)
+        super().failed(job_id, step, code, sentence)
 
-    def lost(self, job_id: str, how: str) -> bool:
+    def lost(self, job_id: str, step: str, how: str) -> None:
         record("lost", job_id, how)
-        lines = Path(os.environ["STANDIN_RECORD"]).read_text().splitlines()
-        return sum(line.startswith(f"lost {job_id} ") for line in lines) < MAX_LOST
+        super().lost(job_id, step, how)
 
-    def stopped(self, job_id: str) -> bool:
+    def interrupted(self, job_id: str, step: str, how: str) -> None:
+        record("interrupted", job_id, how)
+        super().interrupted(job_id, step, how)
+
+    def stopped(self, job_id: str, step: str) -> None:
         record("stopped", job_id)
-        return True
+        super().stopped(job_id, step)
+
+    def tick(self) -> None:
+        refresh()
+        super().tick()
 
 
 def main() -> None:
-    queue, redis_url, folder, grace = [*sys.argv[1:], "5"][:4]
+    queue, redis_url, folder, grace, *name = [*sys.argv[1:], *(["5"] if len(sys.argv) == 4 else [])]
     os.environ["STANDIN_RECORD"] = str(Path(folder) / "record")
+    os.environ["SPICD_REDIS_URL"] = redis_url
     end_with_parent(os.getppid())
     set_up_logging("info")
     logging.getLogger("worker").info("up")
+    refresh()
     kind = GeometryWorker if queue == "geometry" else InferenceWorker
-    kind(
-        queue,
-        Redis.from_url(redis_url),
-        allowed=frozenset(f"tests.support.standin.{name}" for name in FUNCTIONS),
-        records=CatalogRecords(catalog) if (catalog := os.environ.get("STANDIN_CATALOG")) else Book(),
-        grace_s=float(grace),
-    ).work()
+    records = Book(Settings())
+
+    def make() -> GeometryWorker | InferenceWorker:
+        return kind(
+            queue,
+            Redis.from_url(redis_url),
+            allowed=frozenset(f"tests.support.standin.{function}" for function in FUNCTIONS),
+            records=records,
+            grace_s=float(grace),
+            name=name[0] if name else None,
+        )
+
+    work(make)
     record("ended", queue)
 
 

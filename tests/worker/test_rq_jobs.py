@@ -1,48 +1,51 @@
-"""A step as the workers accept it, against an embedded server; no worker runs."""
+"""A step as the workers accept it: an allowed function, its job's id, and nothing else."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from pathlib import Path
+import json
+import zlib
+from typing import Any
+from unittest.mock import Mock
 
 import pytest
-from redis import Redis
-from rq.exceptions import NoSuchJobError
 from rq.serializers import JSONSerializer
 
-from service.queue import JobQueue
-from service.up.embedded_redis import EmbeddedRedis
-from worker.rq_jobs import StepJob
+from worker.rq_jobs import FunctionRefused, StepJob, step_job
 
 
-@pytest.fixture
-def redis(tmp_path: Path) -> Iterator[Redis]:
-    with EmbeddedRedis(tmp_path / "redis") as server:
-        queue = JobQueue(server.url)
-        queue.submit("s1", "survey")
-        queue.close()
-        client = Redis.from_url(server.url)
-        yield client
-        client.close()
+def job(function: str, *args: Any, instance: Any = None, **kwargs: Any) -> StepJob:
+    """What the queue holds, whoever wrote it."""
+    found = step_job(frozenset({"json.loads"}))(
+        "job-1-register", connection=Mock(), serializer=JSONSerializer
+    )
+    found.data = json.dumps([function, instance, args, kwargs]).encode()
+    return found
 
 
-def fetch(redis: Redis, name: str) -> StepJob:
-    return StepJob.fetch(name, connection=redis, serializer=JSONSerializer)
+def test_an_allowed_function_is_called_with_the_id_of_its_job() -> None:
+    step = job("json.loads", "[1]")
+    step.run()
+    assert (step.catalog_id, step.step) == ("[1]", "register")
 
 
-def test_a_step_that_died_before_it_began_leaves_its_place_between_queue_and_worker(redis: Redis) -> None:
-    redis.lmove("rq:queue:geometry", "rq:queue:geometry:intermediate")
-    step = fetch(redis, "s1-register")
-    assert not step.should_retry
-    step.start_again()
-    assert step.should_retry
-    assert redis.exists("rq:queue:geometry:intermediate") == 0
+@pytest.mark.parametrize(
+    "forged",
+    [
+        job("os.system", "true"),
+        job("json.loads"),
+        job("json.loads", "[1]", "[2]"),
+        job("json.loads", 1),
+        job("json.loads", "[1]", cls="x"),
+        job("json.loads", "[1]", instance="x"),
+    ],
+    ids=["function", "nothing", "two", "number", "keyword", "instance"],
+)
+def test_anything_else_is_refused(forged: StepJob) -> None:
+    with pytest.raises(FunctionRefused):
+        forged.run()
 
 
-def test_dropping_the_steps_behind_one_leaves_nothing_of_them(redis: Redis) -> None:
-    fetch(redis, "s1-register").drop_dependents()
-    for name in ("s1-score", "s1-export"):
-        with pytest.raises(NoSuchJobError):
-            fetch(redis, name)
-    assert redis.zcard("rq:deferred:geometry") == redis.zcard("rq:deferred:inference") == 0
-    assert fetch(redis, "s1-register").get_status() == "queued"
+def test_what_cannot_be_read_names_no_job() -> None:
+    forged = job("json.loads")
+    forged.data = zlib.compress(b"no json")
+    assert forged.catalog_id is None

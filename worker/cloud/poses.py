@@ -11,10 +11,17 @@ from scipy.spatial.transform import Rotation
 
 from worker.cloud.types import Floats, Matrix4
 
+_AT_ONCE = 1_000_000  # points that are moved together
+
 
 def transformed(points: NDArray[Any], target_from_source: Matrix4) -> Floats:
     """Return points (N, 3) of the source frame in the target frame; float64."""
-    moved: Floats = points @ target_from_source[:3, :3].T + target_from_source[:3, 3]
+    if len(points) <= _AT_ONCE:
+        small: Floats = points @ target_from_source[:3, :3].T + target_from_source[:3, 3]
+        return small
+    moved = np.empty((len(points), 3))
+    for start in range(0, len(points), _AT_ONCE):  # the sum takes three times the memory of its result
+        moved[start : start + _AT_ONCE] = transformed(points[start : start + _AT_ONCE], target_from_source)
     return moved
 
 

@@ -36,6 +36,7 @@ FARTHEST_RESIDUAL = 0.6  #: metres; a residual is no larger
 _FEWEST_AROUND = 3  # of eight directions with a return, for the one in their middle to be filled in
 _SMOOTH = 0.15  # of the nearest of them, that the farthest may lie behind it
 _MILLIMETRE = 0.001  # ranges are kept in these, as uint16: up to 65 m
+_AT_ONCE = 1_000_000  # points of a scan whose rays are held together
 _FARTHEST = np.uint16(np.iinfo(np.uint16).max)  # in these
 
 Counts = NDArray[np.int16]
@@ -94,13 +95,14 @@ class Sights:
 
     @classmethod
     def _of_one(cls, points: NDArray[Any], origin: Floats) -> Self:
-        rays = (points - origin).astype(np.float32)
-        cells = _cells_of(rays)
-        ranges = np.minimum(np.sqrt(np.einsum("ij,ij->i", rays, rays)) / _MILLIMETRE, float(_FARTHEST))
         nearest = np.full(6 * CELLS**2, np.inf, np.float32)
         farthest = np.zeros(6 * CELLS**2, np.float32)
-        np.minimum.at(nearest, cells, ranges)
-        np.maximum.at(farthest, cells, ranges)
+        for start in range(0, len(points), _AT_ONCE):
+            rays = (points[start : start + _AT_ONCE] - origin).astype(np.float32)
+            cells = _cells_of(rays)
+            ranges = np.minimum(np.sqrt(np.einsum("ij,ij->i", rays, rays)) / _MILLIMETRE, float(_FARTHEST))
+            np.minimum.at(nearest, cells, ranges)
+            np.maximum.at(farthest, cells, ranges)
         nearest[farthest == 0] = 0
         return cls(
             origins=np.asarray(origin, np.float64)[None],

@@ -7,6 +7,8 @@ a wall was seen, nor about what is free.
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -27,6 +29,7 @@ _DEEPEST = 2.0  # metres; from far away one direction holds a whole room, and a 
 #: times the points' RMS distance from their middle that half of them may be away: 0.7 to 1.5 for standing scanners,
 #: 2.6 for Kinect frames; what sees a cloud from farther away sees it all in one direction
 _FARTHEST = 6.0
+_AT_ONCE = 1_000_000  # points whose rays are held together; a scan may have 50 million
 #: times the range, plus metres, that a point must stand nearer than what was seen behind it
 MARGIN = (0.05, 0.3)
 
@@ -62,26 +65,42 @@ def share_in_front(points: NDArray[Any], origin: NDArray[Any]) -> float:
     ranges, cell, nearest = _returns(points, origin)
     if not len(ranges) or _far_outside(points, ranges):
         return 0.0
-    before = nearest[cell]
-    return float(np.mean(ranges < before + np.minimum(_DEPTH[0] * before, _DEEPEST) + _DEPTH[1]))
+    depth = nearest + np.minimum(_DEPTH[0] * nearest, _DEEPEST) + _DEPTH[1]  # of each cell
+    in_front = sum(
+        int(np.count_nonzero(ranges[at : at + _AT_ONCE] < depth[cell[at : at + _AT_ONCE]]))
+        for at in range(0, len(ranges), _AT_ONCE)
+    )
+    return in_front / len(ranges)
 
 
 def _far_outside(points: NDArray[Any], ranges: Floats) -> bool:
     """Tell whether points (N, 3), at ranges (K,) from an origin, are much farther from it than from each other."""
-    spread = float(np.sqrt(np.var(points, axis=0, dtype=np.float64).sum()))
+    middle = points.mean(axis=0, dtype=np.float64)
+    squares = (float(((piece - middle) ** 2).sum()) for piece in _pieces(points))
+    spread = math.sqrt(sum(squares) / len(points))
     return bool(np.median(ranges) > _FARTHEST * spread)
 
 
-def _returns(points: NDArray[Any], origin: NDArray[Any]) -> tuple[Floats, NDArray[np.int64], Floats]:
+def _returns(points: NDArray[Any], origin: NDArray[Any]) -> tuple[Floats, NDArray[np.int16], Floats]:
     """Return ranges (K,) and cells (K,) of the points that are not the origin, and the least range of each cell."""
-    rays = (points - origin).astype(np.float64)
-    ranges = np.linalg.norm(rays, axis=1)
-    away = ranges > 1e-3
-    rays, ranges = rays[away] / ranges[away, None], ranges[away]
-    cell = cube_cells(rays)
     nearest = np.full(6 * CELLS**2, np.inf)
-    np.minimum.at(nearest, cell, ranges)
-    return ranges, cell, nearest
+    ranges, cells = np.empty(len(points)), np.empty(len(points), np.int16)
+    done = 0
+    for piece in _pieces(points):
+        rays = (piece - origin).astype(np.float64)
+        lengths = np.linalg.norm(rays, axis=1)
+        away = lengths > 1e-3
+        rays, lengths = rays[away] / lengths[away, None], lengths[away]
+        cell = cube_cells(rays)
+        np.minimum.at(nearest, cell, lengths)
+        ranges[done : done + len(cell)], cells[done : done + len(cell)] = lengths, cell
+        done += len(cell)
+    return ranges[:done], cells[:done], nearest
+
+
+def _pieces(points: NDArray[Any]) -> Iterator[NDArray[Any]]:
+    """Yield points (N, 3) a piece at a time, for what is made of them takes many times their memory."""
+    return (points[start : start + _AT_ONCE] for start in range(0, len(points), _AT_ONCE))
 
 
 def cube_cells(rays: NDArray[np.float64]) -> NDArray[np.int64]:

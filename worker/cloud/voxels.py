@@ -17,6 +17,8 @@ from worker.cloud.types import Colors, Points
 from worker.cloud.voxel_keys import BITS, packed
 from worker.errors import MapFailed
 
+_AT_ONCE = 2_000_000  # points that are sorted together; a scan may have 50 million
+
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Voxels:
@@ -41,9 +43,17 @@ class Voxels:
         `origin` (3,) is where they were seen from, in their frame. Raises MapFailed for a point that is farther
         from the frame's origin than the cells can count.
         """
+        columns = [] if colors is None else [colors]
+        pieces = (slice(start, start + _AT_ONCE) for start in range(0, len(points), _AT_ONCE))
+        sums = (cls._of_piece(points[at], size, origin, [column[at] for column in columns]) for at in pieces)
+        return fused(sums) or cls._of_piece(points, size, origin, columns)
+
+    @classmethod
+    def _of_piece(
+        cls, points: NDArray[Any], size: float, origin: NDArray[Any] | None, columns: list[NDArray[Any]]
+    ) -> Voxels:
         keys = cls.keys_of(points, size=size)
-        columns = [points, _directions(points, origin)] + ([] if colors is None else [colors])
-        values = np.hstack(columns).astype(np.float64)
+        values = np.hstack([points, _directions(points, origin), *columns]).astype(np.float64)
         return _summed(size, keys, np.ones(len(keys), np.int64), values)
 
     @staticmethod

@@ -8,10 +8,7 @@ from worker.jobs.maps import encode_map, register_map
 from worker.jobs.surveys import export_survey, register_survey, score_survey
 from worker.jobs.training import finish_model, pack_tiles, train_model
 
-describe_map = encode_map  # steps that an earlier build left in the queue name it so
-
 __all__ = [
-    "describe_map",
     "encode_map",
     "export_survey",
     "finish_model",

@@ -8,16 +8,19 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TypeVar
 
 from service import tracing
 from service.catalog.catalog import Catalog, open_catalog
+from service.catalog.jobs import Run
 from service.catalog.records import JobRecord, Problem
-from service.catalog.steps import JobKind
+from service.catalog.steps import STEPS, JobKind, step_of
+from service.errors import NotFound, Unavailable, is_disk_full
 from service.settings import Settings
-from worker.errors import Cancelled, PipelineError
-from worker.reporting import Reporter
+from worker.errors import Cancelled, GaveWay, NoSpaceLeft, PipelineError
+from worker.memory import as_out_of_memory
+from worker.reporting import Reporter, Turn
+from worker.scratch import scratch_folder
 
 log = logging.getLogger("worker.jobs")
 
@@ -68,7 +71,10 @@ class Context:
 
 
 def step(run: Callable[[Context], None]) -> Callable[[str], None]:
-    """Open the catalog, skip what has ended, and record what goes wrong before rq hears of it."""
+    """Have a step begin, go on to the next when it ends well, and record what went wrong before its worker hears of it.
+
+    A step that is not due does nothing: its job has ended or gone on, or another worker has it.
+    """
 
     @functools.wraps(run)
     def call(job_id: str) -> None:
@@ -76,28 +82,69 @@ def step(run: Callable[[Context], None]) -> Callable[[str], None]:
         with tracing.step(job_id, run.__name__), ExitStack() as stack:
             catalog = open_catalog(settings, migrate=False)
             stack.callback(catalog.close)
-            if not catalog.jobs.start(job_id):
-                log.info("job %s has ended; nothing to do", job_id)
+            begun = _begun(catalog, job_id, run.__name__)
+            if begun is None:
+                log.info("%s of job %s is not due; nothing to do", run.__name__, job_id)
                 return
             job = catalog.jobs.get(job_id)
-            folder = settings.scratch_dir()  # on the blobs' own disk, and swept when the service starts
-            folder.mkdir(parents=True, exist_ok=True)
-            scratch = Path(stack.enter_context(TemporaryDirectory(prefix="spicd-step-", dir=folder)))
-            report = Reporter(STAGES[job.kind], functools.partial(_report, catalog, job_id))
+            folder = settings.scratch_dir()  # on the blobs' own disk
             try:
-                run(Context(settings=settings, catalog=catalog, job=job, report=report, scratch=scratch))
-            except Cancelled:
-                log.info("job %s was dismissed", job_id)
-            except PipelineError as error:
-                catalog.jobs.fail(job_id, Problem.of(error))
-                raise
+                scratch = stack.enter_context(scratch_folder(folder, f"{job_id}-{begun.step}"))
+                report = _reporter(catalog, job, begun)
+                with as_out_of_memory(f"a step of job {job_id}"):
+                    run(Context(settings=settings, catalog=catalog, job=job, report=report, scratch=scratch))
+                catalog.jobs.advance(begun)
+            except Exception as error:
+                _ended(catalog, begun, error)
 
     return call
 
 
-def _report(catalog: Catalog, job_id: str, stage: str, share: float) -> bool:
+def _begun(catalog: Catalog, job_id: str, function: str) -> Run | None:
+    """Begin the step that a function is of a job; None where it is not due."""
+    try:
+        kind = catalog.jobs.get(job_id).kind
+    except NotFound:
+        return None
+    names = (step.name for step in STEPS[kind] if step.function.rpartition(".")[2] == function)
+    return catalog.jobs.begin(job_id, next(names, ""))
+
+
+def _reporter(catalog: Catalog, job: JobRecord, run: Run) -> Reporter:
+    """Return what reports the stages of a step; a build gives way to surveys that wait."""
+    write = functools.partial(_report, catalog, run)
+    if job.kind != "map":
+        return Reporter(STAGES[job.kind], write)
+    turn = Turn(lambda: catalog.jobs.surveys_wait(step_of(job.kind, run.step).queue))
+    return Reporter(STAGES[job.kind], write, give_way={"registering": turn})
+
+
+def _report(catalog: Catalog, run: Run, stage: str, share: float) -> bool:
     tracing.stage(stage)
-    return catalog.jobs.report(job_id, message=stage, progress=share)
+    return catalog.jobs.report(run, message=stage, progress=share)
+
+
+def _ended(catalog: Catalog, run: Run, error: Exception) -> None:
+    """Record an error that ended a step; raises it where the worker shall hear of it too."""
+    of = (run.job_id, run.step)
+    match error:
+        case GaveWay():
+            log.info("job %s gives way to a survey", run.job_id)
+            catalog.jobs.put_back(*of, "gave way to a survey; goes on after it")
+        case Cancelled():
+            log.info("job %s was dismissed, or another worker has it", run.job_id)
+        case Unavailable():
+            log.warning("step %s of job %s is interrupted: %s", run.step, run.job_id, error)
+            catalog.jobs.interrupt(*of, str(error), begun=run.begun)
+        case PipelineError():
+            catalog.jobs.fail(run.job_id, Problem.of(error), step=run.step)
+            raise error
+        case _ if is_disk_full(error):
+            full = NoSpaceLeft("the disk is full; make room, then submit it again")
+            catalog.jobs.fail(run.job_id, Problem.of(full), step=run.step)
+            raise full from error
+        case _:
+            raise error
 
 
 def load(context: Context, key: str, read: Callable[[Path], T]) -> T:

@@ -10,17 +10,12 @@ from fastapi import Depends, Request
 from service.api.http.cards import Cards
 from service.catalog.catalog import Catalog
 from service.catalog.steps import JobKind
+from service.dispatch import Dispatcher, Hands
 from service.settings import Settings
 
 
-class Queue(Protocol):
+class Queue(Hands, Protocol):
     """What the API asks of the job queue (`service.queue.JobQueue`)."""
-
-    def submit(self, job_id: str, kind: JobKind) -> None:
-        """Hand a job to the workers, unless they have it. Raises QueueUnavailable."""
-
-    def holds(self, job_id: str, kind: JobKind) -> bool:
-        """Tell whether the job waits for a worker or has one. Raises QueueUnavailable."""
 
     def dismiss(self, job_id: str, kind: JobKind) -> None:
         """Stop a job that waits or runs. Raises QueueUnavailable."""
@@ -36,6 +31,7 @@ class Services:
     settings: Settings
     catalog: Catalog
     queue: Queue
+    dispatcher: Dispatcher
     cards: Cards
 
 

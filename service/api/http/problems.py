@@ -52,6 +52,7 @@ PROBLEMS: dict[str, tuple[int | None, str]] = {
     "detector_unavailable": (None, "The model cannot be used"),
     "pipeline_error": (None, "The job failed"),
     "worker_died": (None, "A worker died"),
+    "out_of_memory": (None, "The step needed too much memory"),
     "process_lost": (None, "A process of the job ended"),
     "timed_out": (None, "A step took too long"),
     "function_refused": (None, "The queue held a call that no worker makes"),

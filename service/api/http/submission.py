@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import threading
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
-from typing import Annotated
+from typing import Annotated, Self
 
 from fastapi import Request as HttpRequest
 from fastapi import Response
@@ -19,7 +20,8 @@ from service.api.http.documents import Link, Request, link
 from service.api.http.fields import MAX_LISTED, DeviceId, Id, Instant, names_from_text
 from service.catalog.catalog import Catalog
 from service.catalog.records import JobRecord, ScanRecord
-from service.errors import QueueUnavailable, ServiceError
+from service.dispatch import Dispatcher
+from service.errors import QueueFull, QueueUnavailable, ServiceError, Unavailable
 from service.logs import about
 
 log = logging.getLogger(__name__)
@@ -64,33 +66,59 @@ def monitor(request: HttpRequest, response: Response, job: JobRecord) -> Link:
     return here
 
 
+def admit(services: Services, owner: str | None = None) -> None:
+    """Make sure that one more job may wait, of an owner or of all. Raises QueueFull."""
+    jobs, settings = services.catalog.jobs, services.settings
+    if (waiting := jobs.waiting()) >= settings.max_waiting_jobs:
+        raise QueueFull(f"{waiting} jobs wait, as many as may; send it again later")
+    if owner is not None and (waiting := jobs.waiting(owner)) >= settings.max_waiting_jobs_per_device:
+        raise QueueFull(
+            f"{waiting} jobs of {owner!r} wait, as many as may of one device; send it again later"
+        )
+
+
 def submit(services: Services, job: JobRecord, *, forget: Callable[[], None]) -> None:
-    """Hand a recorded job to the queue. Raises QueueUnavailable after `forget` has taken the record back."""
+    """Have a recorded job wait for its turn. Raises QueueUnavailable after `forget` has taken the record back."""
     try:
-        services.queue.submit(job.job_id, job.kind)
+        services.queue.ping()
+        services.dispatcher.hand_over()
     except BaseException:
         forget()
         raise
     tracing.link_job(job.job_id)
     with about(job_id=job.job_id):  # the one line that has the ids of request and job
-        log.info("the %s job was submitted", job.kind)
+        log.info("the %s job waits", job.kind)
 
 
-def resubmit(services: Services) -> None:
-    """Hand over again what the catalog knows as unfinished and the queue does not hold; call when the service starts.
+class Ticker:
+    """Has the dispatcher compare catalog and queue every second, in a thread of its own; a context manager."""
 
-    A job that waits was perhaps never submitted: a process died between the two, or Redis lost it. One that runs has
-    lost its worker, and with it an attempt: what takes the whole machine down with it must not do so for ever.
-    """
-    jobs = services.catalog.jobs
-    try:
-        for job in jobs.unfinished():
-            if services.queue.holds(job.job_id, job.kind):
-                continue
-            if job.status == "accepted" or jobs.lose_attempt(job.job_id, "the service ended while it ran"):
-                services.queue.submit(job.job_id, job.kind)
-    except QueueUnavailable as error:
-        log.warning("unfinished jobs could not be submitted again: %s", error)
+    def __init__(self, dispatcher: Dispatcher, *, every_s: float = 1.0) -> None:
+        self._dispatcher, self._every_s = dispatcher, every_s
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="dispatch", daemon=True)
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._over.set()
+        self._thread.join(5)
+
+    def _run(self) -> None:
+        silenced = False
+        while not self._over.is_set():
+            try:
+                self._dispatcher.run()
+                silenced = False
+            except Unavailable as error:
+                if not silenced:
+                    log.warning("jobs cannot be handed over: %s", error)
+                silenced = True
+            except Exception:
+                log.exception("jobs cannot be handed over")
+            self._over.wait(self._every_s)
 
 
 def dismiss(services: Services, job_id: str) -> JobRecord:

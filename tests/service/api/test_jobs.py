@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+from contextlib import closing
+from pathlib import Path
+
 import pytest
 from fastapi.testclient import TestClient
+from httpx import Response
 
-from service.catalog.catalog import Catalog
+from service.catalog.catalog import Catalog, open_catalog
 from service.catalog.records import Problem
+from service.queue import Claim, QueueState
 from service.settings import Settings
-from tests.support.samples import RememberingQueue, add_map, add_survey, catalog_of, running
+from tests.support.processes import until
+from tests.support.samples import RememberingQueue, add_map, add_scan, add_survey, catalog_of, running
 
 
 def test_a_job_that_waits_is_an_ogc_status_document(client: TestClient, catalog: Catalog) -> None:
@@ -28,14 +34,20 @@ def test_a_job_that_waits_is_an_ogc_status_document(client: TestClient, catalog:
         "survey_id": None,
         "model": None,
         "problem": None,
+        "step": "register",
+        "attempts": 0,
+        "interruptions": 0,
+        "queue_position": 1,
+        "waiting_s": job["waiting_s"],
         "links": [{"href": f"/jobs/{job_id}", "rel": "self", "type": "application/json"}],
     }
 
 
 def test_a_job_that_runs_shows_its_stage_and_share(client: TestClient, catalog: Catalog) -> None:
     job_id = add_map(catalog, ready=False)
-    catalog.jobs.start(job_id)
-    catalog.jobs.report(job_id, message="registration", progress=0.4)
+    run = catalog.jobs.begin(job_id, "register")
+    assert run is not None
+    catalog.jobs.report(run, message="registration", progress=0.4)
     job = client.get(f"/jobs/{job_id}").json()
     assert (job["status"], job["message"], job["progress"]) == ("running", "registration", 40)
     assert job["started"].endswith("Z")
@@ -104,32 +116,54 @@ def test_jobs_are_listed_by_state_and_map(client: TestClient, catalog: Catalog) 
         assert [job["jobID"] for job in client.get("/jobs", params=asked).json()["jobs"]] == ids
 
 
-def test_a_start_submits_again_what_is_unfinished_and_not_in_the_queue(settings: Settings) -> None:
+def test_a_start_hands_over_what_is_unfinished_and_nobody_holds(settings: Settings) -> None:
     with running(settings, RememberingQueue()) as client:
         catalog = catalog_of(client)
         first, begun, held, last = (add_map(catalog, name, ready=False) for name in ("a", "b", "c", "d"))
+    with closing(open_catalog(settings)) as catalog:  # the service is down
         for job_id in (begun, held):
-            catalog.jobs.start(job_id)
+            assert catalog.jobs.begin(job_id, "register")
         add_map(catalog, "done")
-    queue = RememberingQueue(held={held})
+    claim = Claim(step=f"{held}-register", execution="1", worker="w1")
+    queue = RememberingQueue(state=QueueState(answering=tuple("abcd"), claims=(claim,)))
     with running(settings, queue) as client:
-        assert queue.submitted == [(first, "map"), (begun, "map"), (last, "map")]
+        until(lambda: len(queue.submitted) == 3)
+        assert set(queue.submitted) == {(job_id, "register") for job_id in (first, begun, last)}
         messages = {job["jobID"]: job["message"] for job in client.get("/jobs").json()["jobs"]}
-        assert messages[begun] == "started again (2 of 3): the service ended while it ran"
-        assert messages[first] == "waiting"
+        assert messages[begun].startswith("interrupted, goes on with the next worker that is free")
+        assert messages[first] == messages[held] == "waiting"
 
 
-def test_a_job_that_runs_at_the_third_end_of_the_service_is_given_up(settings: Settings) -> None:
-    with running(settings, RememberingQueue()) as client:
-        job_id = add_map(catalog_of(client), ready=False)
-        catalog_of(client).jobs.start(job_id)
-    queue = RememberingQueue()
-    for _ in range(3):
-        with running(settings, queue) as client:
-            job = client.get(f"/jobs/{job_id}").json()
-    assert queue.submitted == [(job_id, "map")] * 2
-    assert (job["status"], job["problem"]["type"]) == ("failed", "urn:spicd:problem:worker_died")
-    assert "3 attempts" in job["problem"]["detail"]
+def test_a_job_that_waits_tells_its_place_and_for_how_long(client: TestClient, catalog: Catalog) -> None:
+    add_map(catalog)
+    build = add_map(catalog, "hall", ready=False)
+    surveys = [add_survey(catalog, ready=False)[1] for _ in range(2)]
+    jobs = {job["jobID"]: job for job in client.get("/jobs").json()["jobs"]}
+    assert [jobs[job_id]["queue_position"] for job_id in (*surveys, build)] == [1, 2, 3]
+    assert jobs[build]["waiting_s"] >= jobs[surveys[1]]["waiting_s"] >= 0
+    assert catalog.jobs.begin(surveys[0], "register")
+    begun = client.get(f"/jobs/{surveys[0]}").json()
+    assert (begun["queue_position"], begun["waiting_s"], begun["step"]) == (None, None, "register")
+    assert client.get(f"/jobs/{surveys[1]}").json()["queue_position"] == 1
+
+
+def test_no_more_jobs_wait_than_may(settings: Settings, tmp_path: Path) -> None:
+    few = settings.model_copy(update={"max_waiting_jobs": 3, "max_waiting_jobs_per_device": 2})
+    with running(few, RememberingQueue()) as client:
+        catalog = catalog_of(client)
+        add_map(catalog)
+        scan = add_scan(catalog, "visit")
+
+        def submit(device: str) -> Response:
+            body = {"scan_ids": [scan.scan_id], "device_id": device}
+            return client.post("/maps/lobby/surveys", json=body)
+
+        assert [submit("robot-1").status_code for _ in range(3)] == [202, 202, 429]
+        assert "robot-1" in submit("robot-1").json()["detail"]
+        assert [submit("robot-2").status_code for _ in range(2)] == [202, 429]
+        refused = submit("robot-2")
+        assert refused.json()["type"] == "urn:spicd:problem:queue_full"
+        assert len(client.get("/maps/lobby/surveys").json()["surveys"]) == 3
 
 
 def test_a_start_without_a_queue_serves_all_the_same(settings: Settings) -> None:

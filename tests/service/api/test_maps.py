@@ -40,7 +40,7 @@ def test_a_map_of_known_scans_is_accepted_and_its_job_submitted(
     assert answer.status_code == 202
     job_id = answer.json()["job_id"]
     assert answer.headers["location"] == f"/jobs/{job_id}"
-    assert queue.submitted == [(job_id, "map")]
+    assert queue.submitted == [(job_id, "register")]
     found = client.get("/maps/lobby").json()
     assert (found["status"], found["name"], found["model"]) == ("building", "Lobby", MODEL)
     assert (found["version"], found["registration"], found["anchor"]) == (1, None, None)

@@ -45,7 +45,7 @@ def test_a_training_is_recorded_and_handed_to_the_queue(
     assert answer.status_code == 202
     accepted = answer.json()
     assert answer.headers["location"] == f"/jobs/{accepted['job_id']}"
-    assert queue.submitted == [(accepted["job_id"], "model")]
+    assert queue.submitted == [(accepted["job_id"], "pack")]
     assert (accepted["model"], accepted["map_version"], accepted["status"]) == ("lobby-net/1", 1, "training")
     job = client.get(f"/jobs/{accepted['job_id']}").json()
     assert (job["processID"], job["map_id"], job["model"]) == ("model", "lobby", "lobby-net/1")

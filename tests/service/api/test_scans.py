@@ -228,11 +228,11 @@ def test_an_upload_that_was_acknowledged_outlives_a_request_that_brought_the_sam
 ) -> None:
     sent: list[str] = []
 
-    def refuse(job_id: str, kind: str) -> None:
+    def refuse() -> None:
         sent.append(client.post("/scans", content=ply(), headers=RAW).json()["scan_id"])
         raise QueueUnavailable("the job queue does not answer")
 
-    monkeypatch.setattr(queue, "submit", refuse)
+    monkeypatch.setattr(queue, "ping", refuse)
     assert client.post("/maps", files={"scans": ("hall.ply", ply())}).status_code == 503
     assert catalog.blobs.get_bytes(catalog.scans.get(sent[0]).key) == ply()
 

@@ -24,7 +24,7 @@ def test_a_survey_of_files_is_accepted_and_its_job_submitted(
     assert answer.status_code == 202
     accepted = answer.json()
     assert answer.headers["location"] == f"/jobs/{accepted['job_id']}"
-    assert queue.submitted == [(accepted["job_id"], "survey")]
+    assert queue.submitted == [(accepted["job_id"], "register")]
     found = client.get(f"/surveys/{accepted['survey_id']}").json()
     assert (found["status"], found["threshold"], found["map_id"]) == ("running", 0.7, "lobby")
     assert found["map_version"] == 1

@@ -65,7 +65,7 @@ def test_a_version_of_further_scans_is_accepted_and_its_job_submitted(
     accepted = answer.json()
     assert (accepted["map_id"], accepted["version"], accepted["status"]) == ("lobby", 2, "building")
     assert answer.headers["location"] == f"/jobs/{accepted['job_id']}"
-    assert queue.submitted == [(accepted["job_id"], "map")]
+    assert queue.submitted == [(accepted["job_id"], "register")]
     hrefs = {link["rel"]: link["href"] for link in accepted["links"]}
     found = client.get(hrefs["self"]).json()
     assert (found["version"], found["base_version"], found["survey_id"]) == (2, 1, None)
@@ -93,7 +93,7 @@ def test_a_version_of_an_accepted_survey_takes_its_scans_over_with_their_poses(
     scans = accept_scans(catalog, survey_id)
     answer = post(client, survey_id=survey_id)
     assert answer.status_code == 202
-    assert queue.submitted == [(answer.json()["job_id"], "map")]
+    assert queue.submitted == [(answer.json()["job_id"], "register")]
     found = client.get("/maps/lobby/versions/2").json()
     assert (found["base_version"], found["survey_id"]) == (1, survey_id)
     assert found["scans"][1:] == [scan.model_dump(mode="json") for scan in scans]
@@ -104,7 +104,7 @@ def test_a_map_stays_in_use_while_a_version_builds_and_shows_it_when_it_is_ready
 ) -> None:
     first = add_map(catalog)
     second = add_version(catalog, ready=False)
-    catalog.jobs.start(second)
+    catalog.jobs.begin(second, "register")
     assert shown(client) == (1, "ready", {"tiles": 4})
     for job_id, content in ((first, b"ply one"), (second, b"ply two")):
         catalog.blobs.put_bytes(blob_keys.map_cloud(job_id), content)

@@ -136,7 +136,7 @@ def test_the_embedding_of_the_last_build_is_found_under_its_key() -> None:
 
 
 def test_work_goes_on_in_a_database_of_the_last_build(opened: Catalog) -> None:
-    assert opened.jobs.start("job-3")
+    assert opened.jobs.begin("job-3", "register")
     outcomes = [scan.model_copy(update={"accepted": True}) for scan in opened.versions.get("lobby", 2).scans]
     opened.versions.save_result("job-3", outcomes=outcomes, bounds=BOUNDS, counts={"tiles": 5})
     assert opened.jobs.succeed("job-3")

@@ -86,3 +86,14 @@ def test_a_storey_was_not_seen_from_high_above_it() -> None:
 
 def test_a_wall_before_a_camera_was_seen_by_it() -> None:
     assert share_in_front(wall(4.0, y=(-1.0, 1.0)), np.zeros(3)) > ENOUGH
+
+
+def test_what_was_seen_is_the_same_whatever_is_gone_through_at_once(monkeypatch) -> None:
+    rng = np.random.default_rng(2)
+    rays = rng.normal(size=(2000, 3))
+    points = rays / np.abs(rays).max(axis=1)[:, None] * np.where(rng.random(2000) < 0.3, 2, 5)[:, None]
+    whole, image = share_in_front(points, np.zeros(3)), RangeImage.of(points, np.zeros(3))
+    monkeypatch.setattr("worker.cloud.visibility._AT_ONCE", 13)
+    assert share_in_front(points, np.zeros(3)) == whole
+    assert 0 < whole < 1
+    np.testing.assert_array_equal(RangeImage.of(points, np.zeros(3)).ranges, image.ranges)

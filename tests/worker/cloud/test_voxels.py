@@ -56,3 +56,14 @@ def test_a_cell_seen_from_both_sides_has_no_direction() -> None:
 def test_a_point_beyond_what_the_cells_can_count_is_refused(far: float) -> None:
     with pytest.raises(MapFailed, match="60 km from the map's origin"):
         Voxels.of(np.array([[0.0, far, 0.0]]), size=0.05)
+
+
+def test_a_cloud_gives_the_same_voxels_whatever_is_sorted_at_once(monkeypatch) -> None:
+    rng = np.random.default_rng(2)
+    points, colors = rng.uniform(-1, 1, (1000, 3)), rng.integers(0, 256, (1000, 3), np.uint8)
+    whole = Voxels.of(points, size=0.25, origin=np.zeros(3), colors=colors)
+    monkeypatch.setattr("worker.cloud.voxels._AT_ONCE", 7)
+    pieces = Voxels.of(points, size=0.25, origin=np.zeros(3), colors=colors)
+    np.testing.assert_array_equal(pieces.keys, whole.keys)
+    np.testing.assert_array_equal(pieces.counts, whole.counts)
+    np.testing.assert_allclose(pieces.sums, whole.sums)

@@ -7,9 +7,9 @@ PCD and PLY both describe a point as a row of named, typed fields. Both readers 
 from __future__ import annotations
 
 import mmap
-from collections.abc import Iterator, Sequence
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -24,6 +24,7 @@ HEADER_LIMIT = 64 * 1024  #: bytes; a longer header is refused unread
 STRIDE_LIMIT = 64 * 1024  #: bytes of one point; SHOT, the widest descriptor in PCL, takes 1.4 kB
 LINE_LIMIT = 1024 * 1024  #: bytes of one line
 _NUMBERS_AT_ONCE = 1_000_000  #: decoded together, which bounds the memory of the columns nobody wants
+_TEXT_AT_ONCE = 16 * LINE_LIMIT  #: bytes of lines decoded together, however long each is
 
 _POSITION = ("x", "y", "z")
 _TRIPLES = (
@@ -72,23 +73,25 @@ def chosen_fields(fields: Sequence[Field]) -> dict[str, int]:
         raise ScanError(
             f"a point takes {stride(fields)} bytes, the limit is {STRIDE_LIMIT}; drop wide fields"
         )
-    names = [field.name for field in fields]
+    times = Counter(field.name for field in fields)
+    index = {field.name: i for i, field in enumerate(fields)}
     for name in _POSITION:
-        if names.count(name) != 1:
-            raise ScanError(
-                f"{names.count(name)} fields are named {name!r}, one is needed; write x, y and z once"
-            )
-        field = fields[names.index(name)]
+        if times[name] != 1:
+            raise ScanError(f"{times[name]} fields are named {name!r}, one is needed; write x, y and z once")
+        field = fields[index[name]]
         if field.count != 1 or field.dtype.kind != "f":
             # Integers are some writer's private scale: reading them as metres would be a guess.
             kind = f"{field.count} x {field.dtype.name}"
             raise ScanError(f"field {name!r} is {kind}; write positions as one float or double in metres")
-    return {name: names.index(name) for name in (*_POSITION, *_color_names(fields))}
+    single = {field.name: field for field in fields if field.count == 1 and times[field.name] == 1}
+    return {name: index[name] for name in (*_POSITION, *_color_names(single))}
 
 
-def _color_names(fields: Sequence[Field]) -> tuple[str, ...]:
-    """Choose the fields that colour a point, or none; a colour of another type is ignored like any other field."""
-    single = {f.name: f for f in fields if f.count == 1 and [g.name for g in fields].count(f.name) == 1}
+def _color_names(single: Mapping[str, Field]) -> tuple[str, ...]:
+    """Choose the fields that colour a point, or none; a colour of another type is ignored like any other field.
+
+    `single` are the fields of one number whose name stands once, by that name.
+    """
     for triple in _TRIPLES:
         if all(name in single for name in triple):
             kinds = {single[name].dtype.newbyteorder("=").str[1:] for name in triple}
@@ -130,10 +133,13 @@ def from_rows(fields: Sequence[Field], buffer: mmap.mmap, *, offset: int, n: int
 
 
 def from_blocks(fields: Sequence[Field], block: NDArray[np.uint8], *, n: int) -> Columns:
-    """Return the columns of `n` records stored field by field, as PCD's binary_compressed keeps them."""
+    """Return the columns of `n` records stored field by field, as PCD's binary_compressed keeps them.
+
+    They are copies, so that the block need not be kept for the fields that nobody wants.
+    """
     starts = np.cumsum([0, *(field.size * n for field in fields)])
     return {
-        name: np.frombuffer(block, fields[i].dtype, count=n, offset=int(starts[i]))
+        name: np.frombuffer(block, fields[i].dtype, count=n, offset=int(starts[i])).copy()
         for name, i in chosen_fields(fields).items()
     }
 
@@ -149,13 +155,28 @@ def header_line(head: bytes, start: int, *, last: str) -> tuple[list[str], int]:
     return head[start:end].decode("latin-1").split(), end + 1
 
 
-def text_lines(buffer: mmap.mmap) -> Iterator[bytes]:
-    """Yield the lines of `buffer` from where it stands, without the blank ones."""
-    for line in iter(buffer.readline, b""):
-        if len(line) > LINE_LIMIT:
-            raise ScanError(f"a line of {len(line)} bytes, the limit is {LINE_LIMIT}; write one point a line")
-        if not line.isspace():
-            yield line
+def text_lines(buffer: mmap.mmap, start: int) -> Iterator[bytes]:
+    """Yield the lines of `buffer` from `start` on, without the blank ones; a block at a time is held.
+
+    Raises ScanError for a line over the limit.
+    """
+    cut = b""  # the beginning of a line whose end is in the next block
+    for at in range(start, len(buffer), LINE_LIMIT):
+        *lines, last = buffer[at : at + LINE_LIMIT].split(b"\n")
+        if lines:
+            lines[0], cut = cut + lines[0], last
+            _check_line(lines[0])
+            yield from (line for line in lines if line and not line.isspace())
+        else:
+            cut += last
+        _check_line(cut)
+    if cut and not cut.isspace():
+        yield cut
+
+
+def _check_line(line: bytes) -> None:
+    if len(line) > LINE_LIMIT:
+        raise ScanError(f"a line of over {LINE_LIMIT} bytes; write one point a line")
 
 
 def from_text(fields: Sequence[Field], lines: Iterator[bytes], *, n: int, size: int) -> Columns:
@@ -171,24 +192,33 @@ def from_text(fields: Sequence[Field], lines: Iterator[bytes], *, n: int, size: 
     firsts = np.cumsum([0, *(field.count for field in fields)])
     chosen = chosen_fields(fields)
     columns = {name: np.empty(n, fields[i].dtype) for name, i in chosen.items()}
-    step = max(1, _NUMBERS_AT_ONCE // width)
-    for start in range(0, n, step):
-        rows = min(step, n - start)
-        chunk = list(islice(lines, rows))
+    start = 0
+    while start < n:
+        chunk = _chunk(lines, rows=min(n - start, max(1, _NUMBERS_AT_ONCE // width)))
+        if not chunk:
+            raise ScanError(f"truncated: header declares {n} points, file holds {start}; upload it again")
         numbers = _decode(chunk, width, start=start, n=n)
         for name, i in chosen.items():
             columns[name][start : start + len(chunk)] = _cast(numbers[:, firsts[i]], fields[i])
-        if len(chunk) < rows:
-            raise ScanError(
-                f"truncated: header declares {n} points, file holds {start + len(chunk)}; upload it again"
-            )
+        start += len(chunk)
     return columns
+
+
+def _chunk(lines: Iterator[bytes], *, rows: int) -> list[bytes]:
+    """Take up to so many lines, and fewer where they are long."""
+    chunk: list[bytes] = []
+    held = 0
+    while len(chunk) < rows and held < _TEXT_AT_ONCE:
+        line = next(lines, None)
+        if line is None:
+            break
+        chunk.append(line)
+        held += len(line)
+    return chunk
 
 
 def _decode(chunk: list[bytes], width: int, *, start: int, n: int) -> NDArray[np.float64]:
     """Decode lines of `width` numbers, (lines, width); raise ScanError that names the point at fault."""
-    if not chunk:
-        return np.empty((0, width))
     try:
         numbers = np.loadtxt(chunk, dtype=np.float64, comments=None, ndmin=2, encoding="latin-1")
     except ValueError:

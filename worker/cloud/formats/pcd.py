@@ -31,7 +31,7 @@ from worker.cloud.formats.fields import (
     text_lines,
 )
 from worker.cloud.types import Colors, Matrix4, Points
-from worker.errors import ScanError
+from worker.errors import ScanError, ScanTooLarge
 from worker.files import write_bytes
 
 _KEYWORDS = (
@@ -41,6 +41,12 @@ _VERSIONS = (".5", ".6", ".7", "0.5", "0.6", "0.7")
 _TYPES = {f"{kind}{size}" for kind in "IU" for size in (1, 2, 4, 8)} | {"F4", "F8"}
 _NO_POSE = ["0", "0", "0", "1", "0", "0", "0"]
 _LZF_GAIN = 88  #: the longest back reference of LZF makes 264 bytes out of 3
+_LZF_HONEST_GAIN = (
+    32  #: of a block that is not harmless; scans have gains of 1 to 3, and 10 if most returns are missing
+)
+_HARMLESS = 64 * 1024**2  #: bytes that may be unpacked whatever the gain and the limit of points
+_PLAIN_PER_POINT = 24  #: bytes a point of the limit: positions, colours, and twice as much that is not used
+_PLAIN_LIMIT = 2**31 - 1  #: bytes that `lzf_decode` can unpack
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -64,8 +70,25 @@ def read_pcd(buffer: mmap.mmap, *, max_points: int) -> RawCloud:
     header = parse_pcd_header(buffer[:HEADER_LIMIT])
     chosen_fields(header.fields)
     check_point_count(header.n, max_points=max_points)
-    decode = {"ascii": _ascii, "binary": _binary, "binary_compressed": _compressed}[header.encoding]
-    return RawCloud(columns=decode(header, buffer), sensor_pose=header.sensor_pose)
+    if header.encoding == "binary_compressed":
+        columns = _compressed(header, buffer, most=max(_PLAIN_PER_POINT * max_points, _HARMLESS))
+    else:
+        columns = {"ascii": _ascii, "binary": _binary}[header.encoding](header, buffer)
+    return RawCloud(columns=columns, sensor_pose=header.sensor_pose)
+
+
+def _check_plain_size(size: int, packed: int, *, most: int) -> None:
+    """Refuse a block that would unpack to more than it is worth: LZF can only be unpacked whole."""
+    most = min(most, _PLAIN_LIMIT)
+    if size > most:
+        raise ScanTooLarge(
+            f"the compressed points unpack to {size} bytes, the limit is {most}; "
+            "write them without compression, or leave out fields"
+        )
+    if size > max(packed * _LZF_HONEST_GAIN, _HARMLESS):
+        raise ScanError(
+            f"{packed} compressed bytes unpack to {size}, as no scan's do; write them without compression"
+        )
 
 
 def parse_pcd_header(head: bytes) -> PcdHeader:
@@ -166,8 +189,7 @@ def _viewpoint(words: list[str]) -> Matrix4:
 
 
 def _ascii(header: PcdHeader, buffer: mmap.mmap) -> Columns:
-    buffer.seek(header.size)
-    lines = text_lines(buffer)
+    lines = text_lines(buffer, header.size)
     columns = from_text(header.fields, lines, n=header.n, size=len(buffer) - header.size)
     if next(lines, None) is not None:
         raise ScanError(f"header declares {header.n} points, but more lines follow; correct POINTS")
@@ -180,7 +202,7 @@ def _binary(header: PcdHeader, buffer: mmap.mmap) -> Columns:
     return from_rows(header.fields, buffer, offset=header.size, n=header.n)
 
 
-def _compressed(header: PcdHeader, buffer: mmap.mmap) -> Columns:
+def _compressed(header: PcdHeader, buffer: mmap.mmap, *, most: int) -> Columns:
     start, needed = header.size + 8, header.n * stride(header.fields)
     if len(buffer) < start:
         raise ScanError(
@@ -196,11 +218,13 @@ def _compressed(header: PcdHeader, buffer: mmap.mmap) -> Columns:
         raise ScanError(
             f"{packed} compressed bytes are said to hold {unpacked}, but {header.n} points take {needed} bytes"
         )
+    _check_plain_size(unpacked, packed, most=most)
     _refuse_leftovers(buffer, start + packed)
-    return from_blocks(header.fields, _decompress(buffer[start : start + packed], unpacked), n=header.n)
+    block = memoryview(buffer)[start : start + packed]
+    return from_blocks(header.fields, _decompress(block, unpacked), n=header.n)
 
 
-def _decompress(packed: bytes, size: int) -> NDArray[np.uint8]:
+def _decompress(packed: memoryview, size: int) -> NDArray[np.uint8]:
     """Unpack an LZF block into exactly `size` bytes."""
     import imagecodecs  # noqa: PLC0415 - most scans are not compressed
 
@@ -208,7 +232,7 @@ def _decompress(packed: bytes, size: int) -> NDArray[np.uint8]:
     if size == 0:
         return unpacked
     try:
-        filled = len(imagecodecs.lzf_decode(packed, out=unpacked.data))
+        filled = len(imagecodecs.lzf_decode(packed, out=unpacked.data))  # type: ignore[arg-type]  # any buffer
     except imagecodecs.LzfError as error:
         raise ScanError(f"compressed data is damaged ({error}); upload it again") from None
     if filled != size:  # the decoder stops early without complaint

@@ -43,7 +43,7 @@ _LONG_NAMES = {
 }  # fmt: skip
 _TYPES = _SHORT_NAMES | _LONG_NAMES
 _ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
-_LIST_ROWS_LIMIT = 5_000_000  #: rows with lists that are walked one by one in Python, about 0.5 us each
+_LISTS_LIMIT = 5_000_000  #: lists of an element that are walked one by one in Python, about 0.5 us each
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -161,17 +161,18 @@ def _property(words: list[str], order: str) -> Property:
 
 
 def _ascii(header: PlyHeader, buffer: mmap.mmap) -> Columns:
-    buffer.seek(header.size)
-    lines = text_lines(buffer)
+    lines = text_lines(buffer, header.size)
+    size = len(buffer) - header.size
     for element in header.elements[: header.vertex]:  # one line a row, whatever is in it
+        if element.n * 2 - 1 > size:  # a row takes a character and its end
+            raise ScanError(f"truncated: element {element.name!r} declares {element.n} rows in {size} bytes")
         held = sum(1 for _ in zip(range(element.n), lines, strict=False))
         if held < element.n:
             raise ScanError(
                 f"truncated: element {element.name!r} declares {element.n} rows, file holds {held}"
             )
     vertex = header.elements[header.vertex]
-    left = len(buffer) - buffer.tell()
-    columns = from_text([p.field for p in vertex.properties], lines, n=vertex.n, size=left)
+    columns = from_text([p.field for p in vertex.properties], lines, n=vertex.n, size=size)
     if header.vertex == len(header.elements) - 1 and next(lines, None) is not None:
         raise ScanError(f"header declares {vertex.n} points, but more lines follow; correct the count")
     return columns
@@ -203,10 +204,11 @@ def _after(element: Element, buffer: mmap.mmap, start: int) -> int:
         )
     if not element.has_lists:
         return start + element.n * element.smallest_row
-    if element.n > _LIST_ROWS_LIMIT:
+    lists = element.n * sum(p.length is not None for p in element.properties)
+    if lists > _LISTS_LIMIT:
         raise ScanError(
-            f"element {element.name!r} has {element.n} rows of lists before the points, "
-            f"the limit is {_LIST_ROWS_LIMIT}; write the points first"
+            f"element {element.name!r} has {lists} lists before the points, "
+            f"the limit is {_LISTS_LIMIT}; write the points first"
         )
     steps = list(_steps(element))
     try:

@@ -7,6 +7,7 @@ is refused with the numbers that show it. A scan is never repaired, except that 
 from __future__ import annotations
 
 import mmap
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,15 +15,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from worker.cloud.formats.fields import FARTHEST, RawCloud, colors_of
+from worker.cloud.formats.fields import FARTHEST, Columns, RawCloud, colors_of
 from worker.cloud.formats.pcd import looks_like_pcd, read_pcd
 from worker.cloud.formats.ply import looks_like_ply, read_ply
-from worker.cloud.types import Colors, Matrix4, Points
+from worker.cloud.types import Bools, Colors, Matrix4, Points
 from worker.errors import ScanError, ScanTooLarge, ScanUnits
 
 LONGEST_SITE = 500.0  #: metres along one axis; an indoor scan that is longer is not in metres
 SHORTEST_ROOM = 3.0  #: metres; what another unit would make of the extent has to be a room
 _SAMPLE = 100_000  #: points that the extent is measured on
+_AT_ONCE = 1_000_000  #: points checked and copied together
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -65,26 +67,73 @@ def _decode(path: Path, max_points: int) -> RawCloud:
 
 
 def _checked_scan(raw: RawCloud, name: str) -> Scan:
-    """Drop missing returns and refuse what cannot be a scan of a building in metres."""
-    positions = np.stack([raw.columns[axis] for axis in "xyz"], axis=1)  # (N, 3), the file's type
-    positions = positions.astype(positions.dtype.newbyteorder("="), copy=False)
-    finite = np.isfinite(positions).all(axis=1)  # (N,)
-    n_dropped = len(finite) - int(np.count_nonzero(finite))
-    if n_dropped == len(finite):
-        raise ScanError(f"no points are left: {len(finite)} declared, {n_dropped} of them NaN or inf")
-    columns = {key: column for key, column in raw.columns.items() if key not in ("x", "y", "z")}
-    if n_dropped:
-        positions = positions[finite]
-        columns = {key: column[finite] for key, column in columns.items()}
-    check_units(positions)
-    _check_distance(positions)
+    """Drop missing returns and refuse what cannot be a scan of a building in metres.
+
+    The columns are gone through a piece at a time, so that nothing is held beside them but what is returned.
+    """
+    finite = np.concatenate(
+        [np.isfinite(_positions(raw.columns, piece)).all(axis=1) for piece in _pieces(raw)]
+    )
+    n = int(np.count_nonzero(finite))
+    if not n:
+        raise ScanError(f"no points are left: {len(finite)} declared, {len(finite)} of them NaN or inf")
+    check_units(_sampled(raw, finite, n))
+    points, far = np.empty((n, 3), np.float32), _FarPoints()
+    colors: list[Colors | None] = []
+    done = 0
+    for piece in _pieces(raw):
+        kept = finite[piece]
+        positions = _positions(raw.columns, piece)[kept]
+        far.count(positions)
+        with np.errstate(over="ignore"):  # what overflows is too far away, and refused below
+            points[done : done + len(positions)] = positions
+        done += len(positions)
+        colors.append(_colors(raw.columns, piece, kept))
+    far.refuse(n)
     return Scan(
         name=name,
-        points=np.ascontiguousarray(positions, np.float32),
-        colors=colors_of(columns),
+        points=points,
+        colors=_joined(colors),
         sensor_pose=raw.sensor_pose,
-        n_dropped=n_dropped,
+        n_dropped=len(finite) - n,
     )
+
+
+def _pieces(raw: RawCloud) -> Iterator[slice]:
+    """Yield the rows of the columns a piece at a time; one empty piece where there are none."""
+    n = len(raw.columns["x"])
+    return (slice(start, start + _AT_ONCE) for start in range(0, max(n, 1), _AT_ONCE))
+
+
+def _positions(columns: Columns, rows: slice | NDArray[np.intp]) -> NDArray[np.floating[Any]]:
+    """Return positions (K, 3) of some rows, in the file's type and this machine's byte order."""
+    with np.errstate(invalid="ignore"):  # of a signalling NaN, which is no more than another one
+        positions = np.stack([columns[axis][rows] for axis in "xyz"], axis=1)
+    return positions.astype(positions.dtype.newbyteorder("="), copy=False)
+
+
+def _sampled(raw: RawCloud, finite: Bools, n: int) -> NDArray[np.floating[Any]]:
+    """Return positions (K, 3) of every so manieth of the `n` finite rows, 100,000 or up to twice as many."""
+    step = max(1, n // _SAMPLE)
+    rows, before = [], 0
+    for piece in _pieces(raw):
+        there = np.flatnonzero(finite[piece])
+        rows.append(there[-before % step :: step] + piece.start)
+        before += len(there)
+    return _positions(raw.columns, np.concatenate(rows))
+
+
+def _colors(columns: Columns, piece: slice, kept: Bools) -> Colors | None:
+    """Return the colours (K, 3) of the kept rows of a piece, or None."""
+    return colors_of(
+        {key: column[piece][kept] for key, column in columns.items() if key not in ("x", "y", "z")}
+    )
+
+
+def _joined(colors: Sequence[Colors | None]) -> Colors | None:
+    """Join the colours of all pieces; None where one of them has none."""
+    there = [part for part in colors if part is not None]
+    return np.concatenate(there) if len(there) == len(colors) else None
 
 
 def check_units(positions: NDArray[np.floating[Any]]) -> None:
@@ -104,13 +153,25 @@ def check_units(positions: NDArray[np.floating[Any]]) -> None:
     raise ScanUnits(f"{span}: not a scan of a building in metres; check its units")
 
 
-def _check_distance(positions: NDArray[np.floating[Any]]) -> None:
-    """Raise ScanError when a point (N, 3) lies too far away for float32 to keep its millimetres."""
-    far = (np.abs(positions) > FARTHEST).any(axis=1)
-    if far.any():
-        first = int(np.argmax(far))
-        where = ", ".join(f"{v:.6g}" for v in positions[first])
-        raise ScanError(
-            f"{int(np.count_nonzero(far))} of {len(far)} points lie over {FARTHEST:g} m from the origin, "
-            f"one at ({where}); subtract the map's offset, and write missing returns as NaN"
-        )
+@dataclass(slots=True)
+class _FarPoints:
+    """Points that lie too far away for float32 to keep their millimetres."""
+
+    n: int = 0
+    first: NDArray[np.floating[Any]] | None = None  #: (3,)
+
+    def count(self, positions: NDArray[np.floating[Any]]) -> None:
+        """Add those among positions (K, 3)."""
+        far = (np.abs(positions) > FARTHEST).any(axis=1)
+        if far.any():
+            self.n += int(np.count_nonzero(far))
+            self.first = positions[int(np.argmax(far))] if self.first is None else self.first
+
+    def refuse(self, n: int) -> None:
+        """Raise ScanError where any of the `n` points is far."""
+        if self.first is not None:
+            where = ", ".join(f"{v:.6g}" for v in self.first)
+            raise ScanError(
+                f"{self.n} of {n} points lie over {FARTHEST:g} m from the origin, "
+                f"one at ({where}); subtract the map's offset, and write missing returns as NaN"
+            )

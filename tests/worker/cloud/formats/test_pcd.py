@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import mmap
 import struct
+import time
 from pathlib import Path
 
 import imagecodecs
@@ -10,7 +12,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from worker.cloud.formats.pcd import write_pcd
+from worker.cloud.formats.pcd import read_pcd, write_pcd
 from worker.cloud.formats.scan import read_scan
 from worker.errors import ScanError, ScanTooLarge
 
@@ -105,7 +107,7 @@ def test_ascii_decoded_in_several_bites_is_the_same_and_counts_points_on(read, m
 
 
 def test_a_line_of_over_a_megabyte_is_refused(read):
-    with pytest.raises(ScanError, match="a line of 1200000 bytes, the limit is 1048576"):
+    with pytest.raises(ScanError, match="a line of over 1048576 bytes"):
         read(pcd(data="ascii", body=b"0 0 0 " * 200_000))
 
 
@@ -225,3 +227,37 @@ def test_write_pcd_keeps_points_colours_and_sensor_pose(tmp_path):
     assert_array_equal(scan.colors, colors)
     np.testing.assert_allclose(scan.sensor_pose, pose, atol=1e-8)
     assert [p.name for p in tmp_path.iterdir()] == ["made.pcd"]
+
+
+def test_a_block_of_over_64_mib_with_the_gain_of_a_bomb_is_refused(read):
+    zeros = b"\x00\x00" + b"\xe0\xff\x00" * 363_636  # 264 zeros out of every three bytes
+    body = struct.pack("<II", len(zeros), 8_000_000 * 12) + zeros
+    with pytest.raises(ScanError, match="1090910 compressed bytes unpack to 96000000, as no scan's do"):
+        read(pcd(n=8_000_000, data="binary_compressed", body=body))
+
+
+def test_a_block_that_unpacks_to_more_than_the_most_points_take_is_refused(read):
+    body = struct.pack("<II", 70_000_000, 2_148_000_000) + bytes(70_000_000)
+    wide = {"fields": "x y z pad", "size": "4 4 4 8", "kind": "F F F F", "count": "1 1 1 267"}
+    with pytest.raises(ScanTooLarge, match="unpack to 2148000000 bytes, the limit is 1200000000"):
+        read(pcd(n=1_000_000, data="binary_compressed", body=body, **wide))
+
+
+def test_only_the_used_fields_of_a_block_are_kept(tmp_path):
+    n, pad = 1000, 500
+    plain = np.concatenate([CORNERS.repeat(250, axis=0).T.ravel(), np.zeros(n * pad, np.float32)])
+    header = {"fields": "x y z pad", "size": "4 4 4 4", "kind": "F F F F", "count": f"1 1 1 {pad}"}
+    path = tmp_path / "scan.pcd"
+    path.write_bytes(pcd(n=n, data="binary_compressed", body=compressed(plain.tobytes()), **header))
+    with path.open("rb") as file:
+        raw = read_pcd(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ), max_points=n)
+    assert sum(column.nbytes for column in raw.columns.values()) == n * 12
+    assert all(column.base is None for column in raw.columns.values())
+
+
+def test_thousands_of_fields_are_looked_through_at_once(read):
+    names, others = " ".join(f"{number:x}" for number in range(6_000)), 6_003
+    header = {"fields": f"x y z {names}", "size": " ".join(["4"] * others), "kind": " ".join("F" * others)}
+    begun = time.monotonic()
+    assert_array_equal(read(pcd(n=1, body=bytes(4 * others), **header)).points, [[0, 0, 0]])
+    assert time.monotonic() - begun < 1

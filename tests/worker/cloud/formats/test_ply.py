@@ -69,10 +69,10 @@ def test_a_negative_list_length_is_refused(read):
         read(ply(*lines, body=b"\xff" + CORNERS.tobytes()))
 
 
-def test_more_rows_of_lists_before_the_points_than_can_be_walked_are_refused(read, monkeypatch):
-    monkeypatch.setattr("worker.cloud.formats.ply._LIST_ROWS_LIMIT", 2)
+def test_more_lists_before_the_points_than_can_be_walked_are_refused(read, monkeypatch):
+    monkeypatch.setattr("worker.cloud.formats.ply._LISTS_LIMIT", 2)
     lines = ("element face 3", "property list uchar int v", *VERTEX)
-    with pytest.raises(ScanError, match="'face' has 3 rows of lists before the points, the limit is 2"):
+    with pytest.raises(ScanError, match="'face' has 3 lists before the points, the limit is 2"):
         read(ply(*lines, body=bytes(3) + CORNERS.tobytes()))
 
 

@@ -264,3 +264,52 @@ def test_memory_that_runs_out_is_a_scan_that_is_too_large(tmp_path, monkeypatch)
     monkeypatch.setattr("worker.cloud.formats.scan.read_ply", exhausted)
     with pytest.raises(ScanTooLarge, match=r"^big.ply: its points do not fit in memory"):
         read_scan(tmp_path / "big.ply")
+
+
+def test_a_scan_is_the_same_whatever_is_gone_through_at_once(tmp_path, monkeypatch):
+    rng = np.random.default_rng(3)
+    points = rng.uniform(-4, 4, (1000, 3)).astype(np.float32)
+    points[rng.random(1000) < 0.3] = np.nan
+    colors = rng.integers(0, 256, (1000, 3), np.uint8)
+    path = tmp_path / "scan.ply"
+    write_ply(path, points, colors=colors)
+    whole = read_scan(path)
+    monkeypatch.setattr("worker.cloud.formats.scan._AT_ONCE", 7)
+    pieces = read_scan(path)
+    assert_array_equal(pieces.points, whole.points)
+    assert_array_equal(pieces.colors, whole.colors)
+    assert pieces.n_dropped == whole.n_dropped == np.isnan(points).any(axis=1).sum()
+
+
+@pytest.mark.parametrize("at_once", [3, 1000])
+def test_a_far_point_is_named_wherever_it_lies(tmp_path, monkeypatch, at_once):
+    points = np.random.default_rng(3).uniform(-4, 4, (500, 3)).astype(np.float32)
+    points[[400, 450], 0] = 20_000, 30_000
+    path = tmp_path / "scan.ply"
+    write_ply(path, points)
+    monkeypatch.setattr("worker.cloud.formats.scan._AT_ONCE", at_once)
+    with pytest.raises(ScanError, match=r"2 of 500 points lie over 10000 m from the origin, one at \(20000"):
+        read_scan(path)
+
+
+def test_lines_are_found_whatever_block_they_lie_in(tmp_path, monkeypatch):
+    rows = [f"{i} {i * 0.5} 1" for i in range(200)]
+    path = tmp_path / "scan.pcd"
+    head = "FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 200\nHEIGHT 1\nDATA ascii\n"
+    path.write_text(head + "\r\n\n".join(rows))
+    for limit in (16, 17, 64, 100_000):
+        monkeypatch.setattr("worker.cloud.formats.fields.LINE_LIMIT", limit)
+        assert_allclose(read_scan(path).points[:, 0], np.arange(200))
+
+
+def test_long_lines_are_decoded_a_few_at_a_time(tmp_path):
+    rows = [" " * 900_000 + f"{i} 0 1" for i in range(60)]
+    path = tmp_path / "scan.pcd"
+    head = "FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 60\nHEIGHT 1\nDATA ascii\n"
+    path.write_text(head + "\n".join(rows))
+    tracemalloc.start()
+    try:
+        assert len(read_scan(path).points) == 60
+        assert tracemalloc.get_traced_memory()[1] < 40e6  # of 54 MB of text
+    finally:
+        tracemalloc.stop()

@@ -1,0 +1,1 @@
+"""Programs that break the service on purpose; each runs as `python -m tests.breaking.NAME`."""

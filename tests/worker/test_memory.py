@@ -1,0 +1,101 @@
+"""The memory of a step: past its limit an allocation fails in order."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from worker import memory
+from worker.errors import OutOfMemory
+
+GIB = 1024**3
+
+
+def in_a_process(code: str) -> str:
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.strip()
+
+
+def test_an_allocation_past_the_limit_fails_and_one_within_it_does_not() -> None:
+    code = """
+import numpy as np
+from worker.memory import limit_memory
+print(limit_memory(1 << 30))
+np.ones(50_000_000)
+try:
+    np.ones(200_000_000)
+except MemoryError:
+    print("refused")
+"""
+    assert in_a_process(code).split() == [str(GIB), "refused"]
+
+
+def test_a_process_that_is_started_has_the_limit_as_well() -> None:
+    code = """
+import resource
+from worker.memory import limit_memory
+from worker.processes import open_processes
+if __name__ == "__main__":
+    limit_memory(3 << 30)
+    with open_processes(2) as processes:
+        print(list(processes.map_unordered(resource.getrlimit, [resource.RLIMIT_DATA]))[0][0])
+"""
+    assert in_a_process(code) == str(3 * GIB)
+
+
+def test_a_scan_past_the_limit_is_too_large(tmp_path: Path) -> None:
+    path = tmp_path / "scan.pcd"
+    with path.open("wb") as file:
+        head = "FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 40000000\nHEIGHT 1\nDATA binary\n"
+        file.write(head.encode())
+        file.truncate(len(head) + 40_000_000 * 12)
+    code = f"""
+from pathlib import Path
+from worker.cloud.formats.scan import read_scan
+from worker.errors import ScanTooLarge
+from worker.memory import limit_memory
+limit_memory(400 << 20)
+try:
+    read_scan(Path({str(path)!r}))
+except ScanTooLarge as error:
+    print(error)
+"""
+    assert in_a_process(code) == "scan.pcd: its points do not fit in memory; split or thin the scan"
+
+
+def test_none_is_a_share_of_the_machine_and_nought_is_no_limit() -> None:
+    code = "from worker.memory import limit_memory; print(limit_memory(None), limit_memory(0))"
+    first, second = in_a_process(code).split()
+    assert int(first) == int(memory.SHARE * memory.available_memory())
+    assert second == "0"
+
+
+@pytest.mark.parametrize(("text", "expected"), [("1073741824\n", GIB), ("max\n", None)])
+def test_a_container_s_limit_counts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str, expected: int | None
+) -> None:
+    machine = memory.available_memory()
+    limit = tmp_path / "memory.max"
+    limit.write_text(text)
+    monkeypatch.setattr(memory, "_LIMITS", (limit, tmp_path / "missing"))
+    assert memory.available_memory() == expected or machine <= memory.available_memory()
+
+
+@pytest.mark.parametrize(
+    "error", [MemoryError(), RuntimeError("DefaultCPUAllocator: can't allocate memory: 8 bytes")]
+)
+def test_an_allocation_that_failed_is_told_with_what_to_do(error: Exception) -> None:
+    expected = pytest.raises(
+        OutOfMemory, match=r"the registration needs more memory .* SPICD_STEP_MEMORY_BYTES"
+    )
+    with expected, memory.as_out_of_memory("the registration"):
+        raise error
+
+
+def test_another_error_stays_what_it_is() -> None:
+    with pytest.raises(RuntimeError, match="shapes differ"), memory.as_out_of_memory("a step"):
+        raise RuntimeError("shapes differ")

@@ -1,0 +1,71 @@
+"""A folder for what a step writes aside, which goes with the step however it ends.
+
+The step holds a lock on its folder (flock(2)). The kernel lets go of it when the process ends, so whoever gets the lock
+knows that nobody works there any more, also across containers of one machine that share the folder.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import shutil
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+_LOCK = ".lock"
+_UNLOCKED_S = 60.0  #: a folder without a lock may be just in the making; after this it is not
+
+
+@contextmanager
+def scratch_folder(parent: Path, name: str) -> Iterator[Path]:
+    """Make a folder under `parent` for the length of the block; temporary files of any library go there too."""
+    parent.mkdir(parents=True, exist_ok=True)
+    folder = Path(tempfile.mkdtemp(prefix=f"{name}.", dir=parent))
+    lock = os.open(
+        folder / _LOCK, os.O_RDWR | os.O_CREAT, 0o600
+    )  # not inherited by programs that are started
+    before = tempfile.tempdir, os.environ.get("TMPDIR")
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        tempfile.tempdir = str(folder)
+        os.environ["TMPDIR"] = str(folder)  # of the processes that the step starts
+        yield folder
+    finally:
+        tempfile.tempdir = before[0]
+        if before[1] is None:
+            os.environ.pop("TMPDIR", None)
+        else:
+            os.environ["TMPDIR"] = before[1]
+        shutil.rmtree(folder, ignore_errors=True)
+        os.close(lock)
+
+
+def sweep(parent: Path) -> int:
+    """Remove the folders under `parent` that no step holds any more; return how many."""
+    with suppress(FileNotFoundError):
+        return sum(_swept(folder) for folder in list(parent.iterdir()))
+    return 0
+
+
+def _swept(folder: Path) -> bool:
+    try:
+        lock = os.open(folder / _LOCK, os.O_RDWR)
+    except FileNotFoundError:
+        with suppress(FileNotFoundError):
+            if time.time() - folder.stat().st_mtime > _UNLOCKED_S:
+                shutil.rmtree(folder, ignore_errors=True)
+                return True
+        return False
+    except OSError:
+        return False
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        shutil.rmtree(folder, ignore_errors=True)
+    except BlockingIOError:
+        return False
+    finally:
+        os.close(lock)
+    return True
