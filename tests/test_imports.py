@@ -34,6 +34,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "service.dispatch": ("service.catalog", "service.queue", "service.errors"),
     "service.api.http": (
         "service.dispatch",
+        "service.queue",
         "service.catalog",
         "service.errors",
         "service.logs",

@@ -11,7 +11,7 @@ from prometheus_client import CONTENT_TYPE_LATEST
 
 from service.api.http.dependencies import Provided
 from service.api.http.documents import Document
-from service.api.http.metrics import LookAtWorkers, Metrics
+from service.api.http.metrics import Metrics
 from service.api.http.problems import documented, response
 
 log = logging.getLogger(__name__)
@@ -61,10 +61,9 @@ def ready(services: Provided) -> Ready | Response:
 
 @router.get("/metrics", summary="Metrics for Prometheus", response_class=Response)
 def metrics(request: Request, services: Provided) -> Response:
-    """Requests by route, and what the catalog, the disk and the workers tell."""
+    """Requests by route, and what the catalog, the disk and the queue tell."""
     counted: Metrics = request.app.state.metrics
-    workers: LookAtWorkers | None = getattr(request.app.state, "workers", None)
-    text = counted.text(services.catalog, services.settings.data_dir, workers)
+    text = counted.text(services.catalog, services.settings.data_dir, services.queue.snapshot)
     return Response(text, media_type=CONTENT_TYPE_LATEST)
 
 

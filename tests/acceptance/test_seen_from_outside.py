@@ -61,7 +61,14 @@ def test_metrics_tell_what_became_of_it(service: Service, job_id: str) -> None:
     assert 0 < found["spicd_survey_observed_share_sum", "voxel-net/1"] <= 1
     assert 0.3 < found["spicd_registration_fitness_sum", "survey"] <= 1
     assert found["spicd_queue_depth", "survey", "geometry"] == 0
-    assert all(found["spicd_part_up", part] == 1 for part in ("database", "disk", "workers"))
+    assert all(found["spicd_part_up", part] == 1 for part in ("database", "disk", "queue"))
+    for step in ("register", "score", "export"):
+        assert found["spicd_step_seconds_count", "survey", "successful", step] == 1
+        assert 0 < found["spicd_step_seconds_sum", "survey", "successful", step] < 60
+        assert 0 <= found["spicd_step_wait_seconds_sum", "survey", "successful", step] < 60
+    for queue in ("geometry", "inference"):
+        assert found["spicd_workers", queue, "answering"] == 1
+        assert found["spicd_workers", queue, "silent"] == 0
 
 
 def test_the_log_leads_from_the_request_to_every_step_of_its_job(service: Service, job_id: str) -> None:

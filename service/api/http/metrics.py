@@ -10,7 +10,6 @@ import logging
 import shutil
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from typing import get_args
@@ -25,23 +24,15 @@ from service.catalog.jobs import OpenSteps
 from service.catalog.records import JobStatus
 from service.catalog.steps import STEPS
 from service.catalog.tables import now
+from service.queue import Snapshot
 
 log = logging.getLogger(__name__)
 
 _REMEMBERED_S = 15.0  #: how old the number of jobs by status may be
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Workers:
-    """Workers of one queue that answer, or that do not."""
-
-    queue: str
-    state: str  #: answering, silent
-    count: int
-
-
-#: Asks for the workers at a scrape.
-LookAtWorkers = Callable[[], Iterable[Workers]]
+#: Asks what the queues hold, and which workers answer. Raises QueueUnavailable.
+Look = Callable[[], Snapshot]
 
 
 class Metrics:
@@ -59,10 +50,10 @@ class Metrics:
 
         self._by_status: tuple[float, dict[str, int]] = (-_REMEMBERED_S, {})
 
-    def text(self, catalog: Catalog, data_dir: Path, workers: LookAtWorkers | None = None) -> bytes:
+    def text(self, catalog: Catalog, data_dir: Path, look: Look) -> bytes:
         """Return all metrics in Prometheus' text format; what cannot be read is left out."""
         whole = CollectorRegistry()
-        whole.register(_Collector(catalog, data_dir, workers or (lambda: ()), lambda: self._counts(catalog)))
+        whole.register(_Collector(catalog, data_dir, look, lambda: self._counts(catalog)))
         return generate_latest(self.registry) + generate_latest(whole)
 
     def _counts(self, catalog: Catalog) -> dict[str, int]:
@@ -81,10 +72,10 @@ class _Collector:
         self,
         catalog: Catalog,
         data_dir: Path,
-        workers: LookAtWorkers,
+        look: Look,
         counts: Callable[[], dict[str, int]],
     ) -> None:
-        self._catalog, self._data_dir, self._workers, self._counts = catalog, data_dir, workers, counts
+        self._catalog, self._data_dir, self._look, self._counts = catalog, data_dir, look, counts
 
     def describe(self) -> Iterable[Metric]:
         """Tell nothing in advance: the registry is made for one scrape."""
@@ -98,7 +89,7 @@ class _Collector:
         parts: dict[str, Callable[[], list[Metric]]] = {
             "database": self._database,
             "disk": self._disk,
-            "workers": self._of_workers,
+            "queue": self._workers,
         }
         for part, read in parts.items():
             try:
@@ -126,12 +117,13 @@ class _Collector:
             families.add_metric((state,), size)
         return [families]
 
-    def _of_workers(self) -> list[Metric]:
+    def _workers(self) -> list[Metric]:
         family = GaugeMetricFamily(
             "spicd_workers", "Workers by whether they answer", labels=("queue", "state")
         )
-        for workers in self._workers():
-            family.add_metric((workers.queue, workers.state), workers.count)
+        for queue, held in self._look().queues.items():
+            family.add_metric((queue, "answering"), len(held.answering))
+            family.add_metric((queue, "silent"), len(held.silent))
         return [family]
 
 

@@ -119,3 +119,38 @@ def test_the_tiles_of_a_survey_and_the_share_observed_are_counted_once(catalog: 
     catalog.surveys.save_result(survey_id, tiles=tiles, threshold=0.5)
     assert counted(catalog, "spicd_survey_tiles") == {("spicd-net/1",): (1, 4.0)}
     assert counted(catalog, "spicd_survey_observed_share") == {("spicd-net/1",): (1, 0.5)}
+
+
+def test_each_run_of_a_step_is_counted_by_how_it_ended(catalog: Catalog) -> None:
+    add_map(catalog)
+    _, job_id = add_survey(catalog, ready=False)
+    jobs = catalog.jobs
+    jobs.begin(job_id, "register")
+    jobs.lose_attempt(job_id, "register", "it crashed")
+    jobs.begin(job_id, "register")
+    jobs.interrupt(job_id, "register", "it was killed")
+    jobs.begin(job_id, "register")
+    jobs.put_back(job_id, "register", "gave way")
+    run = jobs.begin(job_id, "register")
+    assert run is not None
+    assert jobs.advance(run)
+    assert not jobs.advance(run)  # late
+    jobs.begin(job_id, "score")
+    jobs.fail(job_id, Problem(code="internal", detail="broken"), step="score")
+    ended = {key: count for key, (count, _) in counted(catalog, "spicd_step_seconds").items()}
+    outcomes = ("lost", "interrupted", "put_back", "successful")
+    assert ended == {
+        **{("survey", outcome, "register"): 1 for outcome in outcomes},
+        ("survey", "internal", "score"): 1,
+    }
+    assert counted(catalog, "spicd_step_attempts_lost") == {("survey", "register"): (1, 1.0)}
+    assert counted(catalog, "spicd_step_interruptions") == {("survey", "register"): (1, 1.0)}
+    assert all(total >= 0 for _, total in counted(catalog, "spicd_step_wait_seconds").values())
+
+
+def test_a_job_that_ends_while_no_worker_has_it_counts_no_run(catalog: Catalog) -> None:
+    add_map(catalog)
+    _, job_id = add_survey(catalog, ready=False)
+    catalog.jobs.dismiss(job_id)
+    assert counted(catalog, "spicd_step_seconds") == {}
+    assert counted(catalog, "spicd_jobs_ended")["survey", "dismissed"] == (1, 1.0)

@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 from datetime import timedelta
-from typing import cast
 
 import pytest
-from fastapi import FastAPI
 from fastapi.testclient import TestClient
 from prometheus_client.parser import text_string_to_metric_families
 from sqlalchemy import text, update
 
-from service.api.http.metrics import Workers
 from service.api.http.problems import PROBLEMS
 from service.catalog import tables, tallies
 from service.catalog.catalog import Catalog
-from tests.support.samples import add_map, add_survey
+from service.queue import QueueState, Snapshot
+from tests.support.samples import RememberingQueue, add_map, add_survey
 
 
 def scraped(client: TestClient) -> dict[tuple[str, ...], float]:
@@ -82,13 +80,21 @@ def test_what_somebody_is_called_for_is_0_before_it_happens(client: TestClient) 
     assert found["spicd_step_attempts_lost_total", "survey", "score"] == 0
 
 
-def test_the_disk_and_the_workers_are_told(client: TestClient) -> None:
-    state = cast("FastAPI", client.app).state
-    state.workers = lambda: [Workers(queue="geometry", state="silent", count=2)]
+def test_the_disk_and_the_workers_are_told(client: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
+    held = Snapshot(queues={"geometry": QueueState(answering=("a",), silent=("b", "c"))})
+    monkeypatch.setattr(RememberingQueue, "snapshot", lambda _: held)
     found = scraped(client)
     assert 0 < found["spicd_disk_bytes", "free"] < found["spicd_disk_bytes", "total"]
+    assert found["spicd_workers", "geometry", "answering"] == 1
     assert found["spicd_workers", "geometry", "silent"] == 2
-    assert found["spicd_part_up", "database"] == found["spicd_part_up", "disk"] == 1
+    assert all(found["spicd_part_up", part] == 1 for part in ("database", "disk", "queue"))
+
+
+def test_without_the_queue_the_rest_is_still_told(client: TestClient, queue: RememberingQueue) -> None:
+    queue.down = True
+    found = scraped(client)
+    assert found["spicd_part_up", "queue"] == 0
+    assert found["spicd_jobs", "accepted"] == 0
 
 
 def test_without_the_database_the_rest_is_still_told(client: TestClient, catalog: Catalog) -> None:
