@@ -20,10 +20,12 @@ test: $(INSTALLED) ## every test, on all cores
 test-fast: $(INSTALLED) ## the tests that take no longer than a second or so: under a minute on two cores
 	$(BIN)/pytest -m fast -n auto --dist loadscope
 
-check: $(INSTALLED) ## ruff and mypy, tests and examples included
+check: $(INSTALLED) ## ruff and mypy, tests and examples included; bandit, and an audit of what is installed
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/bandit -q -c pyproject.toml -r service worker examples
+	$(BIN)/python .ci/audit.py
 
 format: $(INSTALLED) ## let ruff put the code in shape
 	$(BIN)/ruff check --fix .

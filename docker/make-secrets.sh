@@ -25,6 +25,7 @@ keep() { # NAME, content on stdin; what is there stays
 }
 
 random 24 | keep postgres_password
+printf 'spicd_%s' "$(random 32)" | keep first_key
 random 10 | keep s3_access_key
 random 24 | keep s3_secret_key
 keep s3.json <<JSON

@@ -7,6 +7,7 @@ ServiceError
 ├── BadRequest           bad_request          a value that the schema admits and the service does not
 ├── ScanUnreadable       scan_unreadable      an uploaded file that is neither PLY nor PCD
 ├── TooLarge             too_large            a body over the limit
+├── TooSlow              too_slow             a body that takes too long
 ├── WrongMediaType       wrong_media_type     neither a scan nor JSON
 ├── DiskFull             disk_full            less space than the reserve is left, or none
 ├── QueueFull            queue_full           as many jobs wait as may
@@ -51,6 +52,10 @@ class ScanUnreadable(ServiceError):
 
 class TooLarge(ServiceError):
     code = "too_large"
+
+
+class TooSlow(ServiceError):
+    code = "too_slow"
 
 
 class WrongMediaType(ServiceError):

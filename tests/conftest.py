@@ -22,6 +22,7 @@ SLOW = (
     "integration",
     "service/api/http/test_uploads.py",
     "service/catalog/test_migrations.py",
+    "service/up/test_connections.py",
     "service/up/test_embedded_redis.py",
     "worker/benchmarks/paper/test_benchmark.py",
     "worker/benchmarks/paper/test_report.py",

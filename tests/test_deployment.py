@@ -38,6 +38,7 @@ WORKERS = {
     "worker-inference-gpu": "inference",
 }
 OURS = ("service", *WORKERS)
+ONCE = ("s3-bucket", "first-key")  #: they do one thing and end
 STORES = ("redis", "postgres", "s3")
 MANIFESTS = sorted((DOCKER / "kubernetes").glob("*.yaml"))
 KUBERNETES = "1.37"
@@ -164,7 +165,7 @@ def test_the_entry_point_reads_secrets_from_files_and_keeps_the_rest(tmp_path: P
         "PGPASSWORD_FILE": str(secret),
         "SSL_CERT_FILE": "/etc/ssl/certs.pem",  # no secret of ours
     }
-    command = ["sh", str(DOCKER / "entrypoint.sh"), "env"]
+    command = ["/bin/sh", str(DOCKER / "entrypoint.sh"), "env"]
     ran = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
     found = dict(line.split("=", 1) for line in ran.stdout.splitlines())
     assert found["PGPASSWORD"] == "s3cr$t `x`"
@@ -180,7 +181,10 @@ def test_secrets_are_made_once_and_for_nobody_elses_eyes(tmp_path: Path) -> None
     folder = tmp_path / "secrets"
     for _ in range(2):
         made = subprocess.run(
-            ["sh", str(DOCKER / "make-secrets.sh"), str(folder)], capture_output=True, text=True, check=True
+            ["/bin/sh", str(DOCKER / "make-secrets.sh"), str(folder)],
+            capture_output=True,
+            text=True,
+            check=True,
         )
     assert made.stdout == ""  # the second time
     assert folder.stat().st_mode & 0o777 == 0o700
@@ -189,6 +193,7 @@ def test_secrets_are_made_once_and_for_nobody_elses_eyes(tmp_path: Path) -> None
     keys = json.loads((folder / "s3.json").read_text())["identities"][0]["credentials"][0]
     assert keys["secretKey"] == (folder / "s3_secret_key").read_text()
     assert re.fullmatch(r"[0-9a-f]{48}", (folder / "postgres_password").read_text())
+    assert re.fullmatch(r"spicd_[0-9a-f]{64}", (folder / "first_key").read_text())
 
 
 # The compose file
@@ -217,7 +222,7 @@ def test_the_hosted_ci_builds_every_image_and_reads_every_file() -> None:
 
 
 def test_the_parts_of_the_compose_file_are_there_and_fit_together() -> None:
-    assert set(SERVICES) == {"proxy", *OURS, *STORES, "s3-bucket"}
+    assert set(SERVICES) == {"proxy", *OURS, *STORES, *ONCE}
     for part in SERVICES.values():
         assert set(part.get("depends_on", ())) <= set(SERVICES)
         assert set(part["networks"]) <= set(COMPOSE["networks"])
@@ -234,11 +239,11 @@ def test_every_container_is_hardened_and_pinned(name: str) -> None:
     assert part["cap_drop"] == ["ALL"]
     assert part["security_opt"] == ["no-new-privileges:true"]
     assert re.search(r":\d+\.\d+(\.\d+)?(-[\w.]+)?$", part["image"]), part["image"]
-    assert name == "s3-bucket" or part.get("healthcheck")
+    assert name in ONCE or part.get("healthcheck")
     assert name == "proxy" or "ports" not in part
     if name in OURS:
         assert part["user"] == "10001:10001"
-        assert any(entry.startswith("/tmp:") for entry in part["tmpfs"])
+        assert [entry.partition(":")[0] for entry in part["tmpfs"]] == [f"{os.sep}tmp"]
 
 
 def test_no_secret_stands_in_the_file() -> None:
@@ -280,6 +285,20 @@ def test_a_worker_container_starts_the_worker_of_its_queue_and_asks_it(name: str
     assert options.queue == queue
     assert options.grace < float(part["stop_grace_period"].removesuffix("s"))
     assert part["healthcheck"]["test"][-5:] == ["python", "-m", "worker", "alive", queue]
+
+
+def test_the_first_key_is_made_before_the_service_starts() -> None:
+    part = SERVICES["first-key"]
+    assert SERVICES["service"]["depends_on"]["first-key"] == {"condition": "service_completed_successfully"}
+    assert part["environment"] == COMPOSE["x-environment"]
+    (init,) = DEPLOYMENTS["Deployment service"]["template"]["spec"]["initContainers"]
+    for words, file in (
+        (part["command"], "/run/secrets/first_key"),
+        (init["args"], "/run/secrets/spicd/first_key"),
+    ):
+        assert words[:2] == ["sh", "-c"]
+        assert words[2] == f"spicd keys add first --scope admin --secret-file {file} || true"
+    assert "first_key" in part["secrets"]
 
 
 def test_a_gpu_is_asked_for_by_its_profile_alone() -> None:
@@ -356,9 +375,13 @@ def test_a_deployment_is_probed_limited_and_hardened(name: str) -> None:
     assert pod["securityContext"]["runAsNonRoot"] is True
     assert pod["securityContext"]["seccompProfile"] == {"type": "RuntimeDefault"}
     (container,) = pod["containers"]
-    assert container["securityContext"]["readOnlyRootFilesystem"] is True
-    assert container["securityContext"]["allowPrivilegeEscalation"] is False
-    assert container["securityContext"]["capabilities"] == {"drop": ["ALL"]}
+    for each in (container, *pod.get("initContainers", ())):
+        assert each["securityContext"] == {
+            "readOnlyRootFilesystem": True,
+            "allowPrivilegeEscalation": False,
+            "capabilities": {"drop": ["ALL"]},
+        }
+        assert each["volumeMounts"] == container["volumeMounts"]
     assert {"startupProbe", "livenessProbe"} <= set(container)
     assert set(container["resources"]["requests"]) >= {"cpu", "memory"}
     assert "memory" in container["resources"]["limits"]

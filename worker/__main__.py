@@ -22,6 +22,7 @@ from service.catalog.records import Problem
 from service.catalog.steps import ALLOWED_FUNCTIONS
 from service.dispatch import Dispatcher
 from service.logs import set_up_logging
+from service.permissions import PRIVATE_UMASK
 from service.queue import JobQueue
 from service.settings import Settings
 from service.up.lifetime import end_with_parent
@@ -44,6 +45,7 @@ def main(arguments: list[str] | None = None) -> int:
     options = _parse(arguments)
     if options.parent:
         end_with_parent(options.parent)
+    os.umask(PRIVATE_UMASK)
     settings = Settings()
     set_up_logging(settings.log_level, settings.log_format)
     if settings.redis_url is None:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 from collections.abc import AsyncIterator
 from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
 from typing import Any
 
 from fastapi import Depends, FastAPI
@@ -43,6 +45,8 @@ and `GET /jobs/{id}` says how far it is.
 Every error is a problem document (RFC 9457) with a stable `type`.
 """
 
+
+_SWEEP_EVERY_S = 600.0
 
 #: What FastAPI does not see, for it is read or written by hand: bodies of requests, problems, features.
 UNSEEN: dict[JsonSchemaMode, tuple[type[BaseModel], ...]] = {
@@ -123,7 +127,7 @@ def _lifespan(settings: Settings, queue: Queue | None) -> Any:
             raise ValueError("no SPICD_REDIS_URL: `spicd up` starts an embedded server and sets it")
         used = queue or JobQueue(settings.redis_url or "", timeout_s=settings.job_timeout_s)
         catalog = await run_in_threadpool(open_catalog, settings)
-        await run_in_threadpool(sweep, settings.data_dir / INCOMING)
+        sweeping = asyncio.create_task(_sweep(settings.data_dir / INCOMING))
         dispatcher = Dispatcher(catalog.jobs, used)
         app.state.services = Services(
             settings=settings,
@@ -138,10 +142,18 @@ def _lifespan(settings: Settings, queue: Queue | None) -> Any:
             async with housekeeping(app.state.services):
                 yield
         finally:
+            sweeping.cancel()
             await run_in_threadpool(ticker.__exit__)
             catalog.close()
 
     return lifespan
+
+
+async def _sweep(incoming: Path) -> None:
+    """Remove what uploads of killed processes left, now and from time to time."""
+    while True:
+        await run_in_threadpool(sweep, incoming)
+        await asyncio.sleep(_SWEEP_EVERY_S)
 
 
 def _version() -> str:

@@ -86,6 +86,10 @@ class Keys:
 
     def find(self, secret: str) -> KeyRecord | None:
         """Return the key of a secret; None where it is not known, was revoked or has expired."""
+        if not _SECRET.fullmatch(
+            secret
+        ):  # none of ours: no look at the database, which a stranger could repeat
+            return None
         query = select(Key).where(Key.digest == digest_of(secret), *_valid())
         with self._database.read() as session:
             row = session.scalar(query)
@@ -119,7 +123,7 @@ def new_secret() -> str:
 
 def digest_of(secret: str) -> str:
     """Return what is kept of a secret: its SHA-256, hexadecimal."""
-    return hashlib.sha256(secret.encode("utf-8", "surrogateescape")).hexdigest()
+    return hashlib.sha256(secret.encode("ascii")).hexdigest()
 
 
 def _valid() -> tuple[ColumnElement[bool], ...]:

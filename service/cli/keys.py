@@ -17,6 +17,7 @@ from service.cli.tables import columns, facts
 from service.cli.terminal import Terminal
 from service.client import ClientError, Document
 from service.errors import ServiceError
+from service.permissions import private_files
 
 if TYPE_CHECKING:
     from service.catalog.keys import Keys
@@ -79,6 +80,7 @@ def _keys(data_dir: Path | None) -> Iterator[Keys]:
 
     settings = read_settings(data_dir=data_dir)
     with contextlib.ExitStack() as stack:
+        stack.enter_context(private_files())
         try:
             keys = stack.enter_context(open_keys(settings))
         except Exception as error:  # whatever the driver raises

@@ -149,7 +149,8 @@ class WorkerPool:
     def _start(self, worker: WorkerProcess) -> None:
         worker.name = f"{worker.queue}-{socket.gethostname()}-{os.getpid()}-{next(self._numbers)}"
         options = ["--parent", str(os.getpid()), "--grace", str(GRACE_S), "--name", worker.name]
-        worker.process = subprocess.Popen(
+        # our own program, and a list: no shell reads it
+        worker.process = subprocess.Popen(  # noqa: S603  # nosec B603
             [*self._program, worker.queue, *options],
             env=self._environment,
             stdin=subprocess.DEVNULL,

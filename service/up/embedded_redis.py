@@ -97,7 +97,8 @@ class EmbeddedRedis:
         lock = self._take_folder()
         if len(os.fsencode(self._socket)) > _LONGEST_SOCKET_PATH:
             self._socket_folder = _short_folder(self._folder)
-        self._process = subprocess.Popen(
+        # a list of ours: no shell reads it
+        self._process = subprocess.Popen(  # noqa: S603  # nosec B603
             command_ending_with_parent([str(program), *self._options()]),
             cwd=self._folder,
             stdin=subprocess.DEVNULL,

@@ -7,6 +7,7 @@ process and end with it, also when it is killed.
 from __future__ import annotations
 
 import importlib.util
+import ipaddress
 import json
 import logging
 import os
@@ -28,9 +29,11 @@ from service.catalog.database import Database
 from service.catalog.jobs import Jobs
 from service.catalog.keys import open_keys
 from service.dispatch import Dispatcher
+from service.permissions import make_private, private_files
 from service.queue import QUEUES, JobQueue
 from service.settings import Settings
 from service.up.children import WorkerPool
+from service.up.connections import Limits, limited_protocol, limits_of
 from service.up.embedded_redis import EmbeddedRedis, LaunchFailed
 
 log = logging.getLogger("spicd")
@@ -72,11 +75,14 @@ def up(
     _require_worker_packages(settings)
     with ExitStack() as stack:
         stop = stack.enter_context(_Signals())
+        stack.enter_context(private_files())
         listening = stack.enter_context(_listen(settings.host, settings.port))
         redis = None
+        _make_private(settings.data_dir)
         if settings.redis_url is None:
             redis = stack.enter_context(EmbeddedRedis(settings.data_dir / "redis"))
             sweep_scratch(settings.scratch_dir())  # the folder is ours alone now
+            sweep_scratch(settings.data_dir / "incoming")
             _release_claims(redis)
         settings = _resolve(settings, redis, listening)
         _migrate(settings)
@@ -89,7 +95,7 @@ def up(
         )
         stack.enter_context(pool)
         stop.then = pool.kill
-        api = stack.enter_context(_serve((create_app or _app)(settings), listening))
+        api = stack.enter_context(_serve((create_app or _app)(settings), listening, limits_of(settings)))
         on_ready(_running(settings, redis, pool))
         while not stop.asked:
             pool.check()
@@ -125,10 +131,22 @@ class Supervision:
         return frozenset(name for queue in QUEUES for name in snapshot[queue].answering)
 
 
+def _make_private(data_dir: Path) -> None:
+    try:
+        make_private(data_dir)
+    except OSError as error:
+        raise LaunchFailed(
+            f"the data folder {data_dir} cannot be used ({error.strerror}); name another with SPICD_DATA_DIR"
+        ) from error
+
+
 def sweep_scratch(folder: Path) -> None:
     """Remove what steps left that were killed; only while no worker runs on this folder."""
     for left in folder.iterdir() if folder.is_dir() else ():
-        shutil.rmtree(left, ignore_errors=True)
+        if left.is_dir():
+            shutil.rmtree(left, ignore_errors=True)
+        else:
+            left.unlink(missing_ok=True)
 
 
 def _release_claims(redis: EmbeddedRedis) -> None:
@@ -185,9 +203,17 @@ def _listen(host: str, port: int) -> Iterator[socket.socket]:
 
 
 @contextmanager
-def _serve(app: FastAPI, listening: socket.socket) -> Iterator[threading.Thread]:
+def _serve(app: FastAPI, listening: socket.socket, limits: Limits) -> Iterator[threading.Thread]:
     """Serve the API in a thread, from its first answer on."""
-    config = uvicorn.Config(app, log_config=None, access_log=False, timeout_graceful_shutdown=2)
+    config = uvicorn.Config(
+        app,
+        http=limited_protocol(limits),
+        ws="none",
+        log_config=None,
+        access_log=False,
+        server_header=False,
+        timeout_graceful_shutdown=2,
+    )
     server = uvicorn.Server(config)
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listening]}, name="api", daemon=True)
     thread.start()
@@ -258,8 +284,7 @@ def _require_a_key(settings: Settings) -> None:
 
 
 def _running(settings: Settings, redis: EmbeddedRedis | None, pool: WorkerPool) -> Running:
-    wildcard = {"0.0.0.0": "127.0.0.1", "::": "[::1]"}  # what a browser can open
-    host = wildcard.get(settings.host) or (f"[{settings.host}]" if ":" in settings.host else settings.host)
+    host = _reachable(settings.host)
     url = f"http://{host}:{settings.port}"
     return Running(
         url=url,
@@ -270,3 +295,14 @@ def _running(settings: Settings, redis: EmbeddedRedis | None, pool: WorkerPool) 
         redis_pid=redis.pid if redis else None,
         workers=[{"queue": worker.queue, "pid": worker.pid} for worker in pool.workers],
     )
+
+
+def _reachable(host: str) -> str:
+    """Return the address that was listened on as a browser can open it."""
+    try:
+        address = ipaddress.ip_address(host)
+    except ValueError:
+        return host
+    if address.is_unspecified:
+        return "127.0.0.1" if address.version == 4 else "[::1]"
+    return host if address.version == 4 else f"[{host}]"

@@ -162,7 +162,7 @@ def finish(context: Context) -> None:
 @stage
 def stray(context: Context) -> None:
     """Start a process that outlives the step."""
-    pid = os.spawnlp(os.P_NOWAIT, "sleep", "sleep", "60")
+    pid = os.spawnlp(os.P_NOWAIT, "sleep", "sleep", "60")  # noqa: S606 - no shell is what is wanted
     record("stray", context.job.job_id, str(pid))
 
 

@@ -6,7 +6,7 @@ This is the one file of the benchmarks that calls a detector, or opens one.
 from __future__ import annotations
 
 import hashlib
-import pickle
+import pickle  # nosec B403  # for its error alone
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path

@@ -15,6 +15,7 @@ ENDS_WITHIN_S = 20.0
 
 #: Where a service listens and keeps things. The demo's own must not meet one that the environment names.
 _OWN = {
+    "AUTH",
     "HOST",
     "PORT",
     "DATA_DIR",
@@ -51,7 +52,8 @@ class ServiceChild:
         environment = {name: value for name, value in os.environ.items() if name not in hidden}
         with self._log.open("wb") as log:
             # A session of its own: Ctrl-C reaches the demo alone, which then ends the service in order.
-            self._process = subprocess.Popen(
+            # a list of ours: no shell reads it
+            self._process = subprocess.Popen(  # noqa: S603  # nosec B603
                 command, env=environment, stdout=log, stderr=log, start_new_session=True
             )
         return self

@@ -6,6 +6,7 @@ framework's own form would keep every file in a spool of its own and only then h
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 from collections.abc import AsyncIterator, Callable
 from contextlib import ExitStack
@@ -21,11 +22,12 @@ from python_multipart.multipart import MultipartParser, parse_options_header
 
 from service.api.http.json_text import read_json
 from service.api.http.uploads import Incoming, Upload
-from service.errors import BadRequest, TooLarge, WrongMediaType
+from service.errors import BadRequest, TooLarge, TooSlow, WrongMediaType
 from service.settings import Settings
 
-PIECE = 1 << 20  #: bytes handed to the disk at a time
+PIECE = 1 << 18  #: bytes handed to the disk at a time; each upload holds as many in memory
 MAX_JSON_BYTES = 1 << 20
+MAX_JSON_S = 300
 MAX_FIELDS_BYTES = 1 << 20  #: of all fields of a form together
 MAX_BOUNDARY = 70  #: letters
 MAX_PARTS = 2000  #: of a form
@@ -66,12 +68,13 @@ async def received(
         raise WrongMediaType(f"the body comes as {said}; send it as {' or '.join(takes)}")
     folder = settings.data_dir / INCOMING
     limit = MAX_JSON_BYTES if media_type == JSON else settings.max_upload_bytes
+    seconds = MAX_JSON_S if media_type == JSON else settings.upload_timeout_s
     await run_in_threadpool(folder.mkdir, parents=True, exist_ok=True)
     kept = ExitStack()
     try:
         if media_type == JSON:
             text = bytearray()
-            await _pour(request, text.extend, limit=limit)
+            await _pour(request, text.extend, limit=limit, seconds=seconds)
             yield Body(fields=await run_in_threadpool(_json, bytes(text)))
         elif media_type == FORM:
             if not options.get(b"boundary"):
@@ -81,12 +84,12 @@ async def received(
                     f"the boundary has more than {MAX_BOUNDARY} letters (RFC 2046, Section 5.1.1)"
                 )
             form = Form(options[b"boundary"], folder, kept, frozenset({files}))
-            await _pour(request, form.feed, limit=limit)
+            await _pour(request, form.feed, limit=limit, seconds=seconds)
             form.finish()
             yield Body(fields=form.fields, uploads=tuple(form.uploads))
         else:
             file = kept.enter_context(Incoming(folder, filename or ""))
-            await _pour(request, file.write, limit=limit)
+            await _pour(request, file.write, limit=limit, seconds=seconds)
             yield Body(uploads=(await run_in_threadpool(file.finish),))
     finally:
         await run_in_threadpool(kept.close)
@@ -118,11 +121,24 @@ def _reference(model: type[BaseModel]) -> dict[str, str]:
     return {"$ref": f"#/components/schemas/{model.__name__}"}
 
 
-async def _pour(request: Request, take: Callable[[bytes], None], *, limit: int) -> None:
-    """Hand the body to `take` in pieces, in a thread. Raises TooLarge as soon as it is, also without a length."""
+async def _pour(request: Request, take: Callable[[bytes], None], *, limit: int, seconds: float) -> None:
+    """Hand the body to `take` in pieces, in a thread. Raises TooLarge as soon as it is, and TooSlow.
+
+    The server ends a body that stalls before that, see service/up/connections.py.
+    """
+    try:
+        async with asyncio.timeout(seconds) as clock:
+            await _stream(request, take, limit)
+    except TimeoutError as error:
+        if not clock.expired():  # a disk has time limits too
+            raise
+        raise TooSlow(f"the body took longer than {seconds:g} s; send less at a time") from error
+
+
+async def _stream(request: Request, take: Callable[[bytes], None], limit: int) -> None:
     declared = request.headers.get("content-length", "")
-    if declared.isdigit() and int(declared) > limit:
-        raise TooLarge(f"the body has {declared} bytes, more than the {limit} that are taken")
+    if declared.isascii() and declared.isdigit() and (len(declared) > 18 or int(declared) > limit):
+        raise TooLarge(f"the body has {declared[:40]} bytes, more than the {limit} that are taken")
     size = 0
     piece = bytearray()
     async for chunk in request.stream():

@@ -33,7 +33,6 @@ EXPOSED_HEADERS = (
     "X-Request-ID",
 )
 _HOST = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[^\s:\[\]/@]+)(?::\d*)?")
-_WILDCARDS = frozenset({"0.0.0.0", "::", ""})
 
 
 def add_cross_site_checks(app: FastAPI, settings: Settings) -> None:
@@ -59,7 +58,7 @@ def allowed_hosts(settings: Settings) -> frozenset[str] | None:
         return None if "*" in named else frozenset(named)
     if settings.requires_key():
         return None
-    return frozenset({"localhost", socket.gethostname().lower(), settings.host.lower()}) - _WILDCARDS
+    return frozenset({"localhost", socket.gethostname().lower(), settings.host.lower()})
 
 
 class CrossSiteMiddleware:

@@ -31,6 +31,7 @@ PROBLEMS: dict[str, tuple[int | None, str]] = {
     "invalid_request": (422, "The request does not match the API"),
     "scan_unreadable": (422, "The file is no sound scan"),
     "too_large": (413, "The body is too large"),
+    "too_slow": (408, "The body took too long"),
     "wrong_media_type": (415, "The media type is not taken here"),
     "unauthorized": (401, "An API key is needed"),
     "forbidden": (403, "This may not be done here"),
@@ -95,7 +96,7 @@ def problem_of(problem: Problem | None) -> ProblemDocument | None:
 JobProblem = Annotated[ProblemDocument | None, BeforeValidator(problem_of)]
 
 #: What may be wrong with any body; documented in this order.
-BODY = ("incomplete_body", "too_large", "wrong_media_type", "bad_request", "invalid_request")
+BODY = ("incomplete_body", "too_slow", "too_large", "wrong_media_type", "bad_request", "invalid_request")
 
 
 def response(
@@ -190,7 +191,7 @@ def _disconnected(_request: Request, _error: Exception) -> Response:
 
 def _unexpected(request: Request, error: Exception) -> Response:
     instance = uuid4().urn
-    log.error("%s %s failed, %s", request.method, request.url.path, instance, exc_info=error)
+    log.error("%s %r failed, %s", request.method, request.url.path, instance, exc_info=error)
     return response(
         "internal",
         "the service failed on this request; its log says why under this instance",

@@ -17,7 +17,7 @@ from uuid import uuid4
 from service.catalog.records import ScanFormat
 from service.errors import ScanUnreadable
 
-ABANDONED_S = 24 * 3600
+ABANDONED_S = 3600  #: since the last write; a piece comes within ten minutes, or the server ends the upload
 _HEAD = 256  #: bytes that are enough to tell the format
 _PLY = re.compile(rb"ply[ \t]*\r?\n")
 _PCD = re.compile(rb"\s*(#[^\n]*\.PCD|(VERSION|FIELDS|COLUMNS)\s)")
@@ -84,11 +84,11 @@ class Incoming:
         self._path.unlink(missing_ok=True)
 
 
-def sweep(folder: Path) -> None:
-    """Remove what uploads left that a killed process could not clean up; a day is longer than any of them lasts."""
+def sweep(folder: Path, *, older_than_s: float = ABANDONED_S) -> None:
+    """Remove what uploads left that a killed process could not clean up; an upload that goes on writes more often."""
     for path in folder.glob("*.part"):
         with contextlib.suppress(OSError):  # another process sweeps as well
-            if time.time() - path.stat().st_mtime > ABANDONED_S:
+            if time.time() - path.stat().st_mtime >= older_than_s:
                 path.unlink()
 
 

@@ -28,6 +28,14 @@ def test_a_key_is_found_by_its_secret_alone(catalog: Catalog) -> None:
     assert catalog.keys.find("\udcff\x00") is None
 
 
+def test_what_is_no_secret_of_ours_is_not_looked_for(
+    catalog: Catalog, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(catalog.keys, "_database", None)
+    for secret in ("", "nonsense", "spicd_short", "x" * 10_000, "spicd_" + "\u00e9" * 43):
+        assert catalog.keys.find(secret) is None
+
+
 def test_no_secret_is_written_to_the_disk(catalog: Catalog, settings: Settings) -> None:
     _, secret = catalog.keys.add("robot", scopes=["scans:write"])
     catalog.keys.find(secret)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import stat
 from pathlib import Path
 from typing import Any
 
@@ -69,3 +71,24 @@ def test_loopback_may_be_told_to_need_one(tmp_path: Path) -> None:
 def test_workers_do_not_inherit_the_key_of_a_client(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SPICD_KEY", "spicd_secret")
     assert "spicd_secret" not in environment_of(Settings()).values()
+
+
+def test_nobody_else_on_the_machine_reads_what_the_service_keeps(tmp_path: Path) -> None:
+    before = os.umask(0o022)
+    try:
+        data = tmp_path / "data"
+        (data / "blobs").mkdir(parents=True)
+        (data / "blobs" / "of an earlier release").touch()
+        with pytest.raises(Started):
+            launch(data)
+        for path in (data, *data.rglob("*")):
+            assert stat.S_IMODE(path.stat().st_mode) == (0o700 if path.is_dir() else 0o600), path
+        assert (data / "spicd.sqlite").exists()
+    finally:
+        os.umask(before)
+
+
+def test_a_folder_that_cannot_be_made_is_told_in_a_sentence(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(LaunchFailed, match="SPICD_DATA_DIR"):
+        launch(tmp_path / "file" / "data")

@@ -26,6 +26,7 @@ from worker.cloud.formats.pcd import write_pcd
 from worker.cloud.formats.scan import read_scan
 from worker.cloud.poses import inverse
 from worker.cloud.types import Floats, Matrix4
+from worker.errors import MapFailed
 from worker.pipeline.flow import build_map
 from worker.pipeline.registration.results import ScanFile
 from worker.pipeline.settings import PipelineSettings
@@ -130,7 +131,8 @@ def real_site(place: RealPlace, settings: PipelineSettings) -> PlacementSite:
     """Build the map of a place's first file; the world is that file's frame. Raises MapFailed."""
     built = build_map([ScanFile(name=place.first.stem, path=place.first)], settings=settings)
     (outcome,) = built.outcomes
-    assert outcome.registration is not None  # build_map raises where no scan holds a pose
+    if outcome.registration is None:  # build_map raises where no scan holds a pose
+        raise MapFailed(f"{place.first.name} makes no map")
     return PlacementSite(
         name=place.name,
         reference=built.reference,

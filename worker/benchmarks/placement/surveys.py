@@ -177,7 +177,8 @@ def _half_covered(
             best = off, scan
         if off == 0.0:
             break
-    assert best is not None, f"{plan.name} has no stops"
+    if best is None:
+        raise ValueError(f"{plan.name} has no stops")
     return (best[1],)
 
 

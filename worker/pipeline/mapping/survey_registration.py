@@ -400,7 +400,8 @@ class _Visit:
 
 
 def _known(prior: Matrix4 | None) -> Matrix4:
-    assert prior is not None  # asked of scans with a prior alone
+    if prior is None:
+        raise ValueError("this is asked of scans with a prior alone")
     return prior
 
 

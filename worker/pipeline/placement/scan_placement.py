@@ -297,7 +297,8 @@ class _Search:
 
     def _overcome(self, placed: PlacedScan) -> PlacedScan:
         """Say by how much the prior was wrong; raise ScanRejected where that is too much, or the pose is not clear."""
-        assert self.prior is not None
+        if self.prior is None:
+            raise ValueError("a scan without a prior has none that is wrong")
         metres, radians = difference(placed.pose, self.prior)
         numbers = {"metres": metres, "degrees": float(np.degrees(radians))}
         off = f"{metres:.1f} m and {numbers['degrees']:.0f} degrees"

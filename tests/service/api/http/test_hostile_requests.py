@@ -35,11 +35,10 @@ DEEP = ["[" * 5000, '{"a":' * 5000, "[1," * 3000, "[" * 100_000]
 
 @pytest.fixture(scope="module")
 def asked(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
-    """A service with a map and a survey of it, whose id is `service.survey`."""
+    """A service with a map and a survey of it."""
     with running(settings_in(tmp_path_factory.mktemp("service")), RememberingQueue()) as client:
         add_map(catalog_of(client), "lobby")
-        survey, _ = add_survey(catalog_of(client), [tile(0, 0)], objects=[thing(1, now=place(1, 1))])
-        client.headers["X-Survey"] = survey
+        add_survey(catalog_of(client), [tile(0, 0)], objects=[thing(1, now=place(1, 1))])
         yield client
 
 
@@ -86,7 +85,8 @@ def cursor(*parts: object) -> str:
 def test_a_cursor_that_is_none_of_ours_never_reaches_the_database(
     asked: TestClient, path: str, parts: tuple[object, ...]
 ) -> None:
-    answer = asked.get(path.format(survey=asked.headers["X-Survey"]), params={"cursor": cursor(*parts)})
+    (survey,) = catalog_of(asked).surveys.page("lobby").items
+    answer = asked.get(path.format(survey=survey.survey_id), params={"cursor": cursor(*parts)})
     assert answer.status_code == 422, answer.text
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import socket
 import subprocess
@@ -14,6 +15,7 @@ from typing import Any
 import httpx
 import pytest
 
+from service.api.http.uploads import ABANDONED_S, sweep
 from tests.support.samples import settings_in
 
 PIECE = bytes(range(256)) * 4096  #: 1 MiB
@@ -122,3 +124,12 @@ def _until(true: Callable[[], bool]) -> None:
             return
         time.sleep(0.05)
     raise AssertionError("it did not come about")
+
+
+def test_what_a_killed_process_left_goes_after_an_hour_and_what_is_written_stays(tmp_path: Path) -> None:
+    old, new = tmp_path / "old.part", tmp_path / "new.part"
+    old.touch()
+    new.touch()
+    os.utime(old, (time.time() - ABANDONED_S - 1,) * 2)
+    sweep(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["new.part"]
