@@ -82,7 +82,18 @@ class Settings(BaseSettings):
         gt=0,
         description="most that a request may name; never more than four fifths of `SPICD_JOB_TIMEOUT_S`",
     )
+    keep_scans_days: float = Field(
+        0,
+        ge=0,
+        description="days that scans are kept of which no map and no kept survey is made; 0: for ever",
+    )
+    keep_surveys_days: float = Field(
+        0, ge=0, description="days that surveys are kept which no version of a map took over; 0: for ever"
+    )
     log_level: Literal["debug", "info", "warning", "error"] = Field("info", description="of every process")
+    log_format: Literal["text", "json"] = Field(
+        "text", description="lines for people, or a JSON object a line"
+    )
 
     @field_validator("allowed_origins")
     @classmethod

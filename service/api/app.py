@@ -18,6 +18,7 @@ from starlette.types import ASGIApp
 
 from service.api import changes, health, jobs, maps, models, objects, scans, surveys, versions
 from service.api.features import TileCollection
+from service.api.housekeeping import housekeeping
 from service.api.http import problems
 from service.api.http.access import authorize, secured
 from service.api.http.bodies import INCOMING
@@ -26,6 +27,7 @@ from service.api.http.cross_site import add_cross_site_checks
 from service.api.http.dependencies import Queue, Services
 from service.api.http.docs_pages import add_pages
 from service.api.http.metrics import Metrics, MetricsMiddleware
+from service.api.http.requests import RequestLog
 from service.api.http.security_headers import SecurityHeadersMiddleware
 from service.api.http.submission import Ticker
 from service.api.http.uploads import sweep
@@ -67,11 +69,11 @@ UNSEEN: dict[JsonSchemaMode, tuple[type[BaseModel], ...]] = {
 
 
 class Api(FastAPI):
-    """FastAPI with our own description of itself, and with security headers on every answer."""
+    """FastAPI with our own description of itself, a line in the log for each request, and security headers."""
 
     def build_middleware_stack(self) -> ASGIApp:
-        """Return the app; the headers lie around it all, for unexpected errors are answered outside of middleware."""
-        return SecurityHeadersMiddleware(super().build_middleware_stack())
+        """Return the app; log and headers lie around it all, for unexpected errors are answered outside of middleware."""
+        return RequestLog(SecurityHeadersMiddleware(super().build_middleware_stack()))
 
     def openapi(self) -> dict[str, Any]:
         """Return the OpenAPI document: what FastAPI derives, and the bodies that are read by hand."""
@@ -137,7 +139,8 @@ def _lifespan(settings: Settings, queue: Queue | None) -> Any:
         ticker = Ticker(dispatcher)
         await run_in_threadpool(ticker.__enter__)
         try:
-            yield
+            async with housekeeping(app.state.services):
+                yield
         finally:
             await run_in_threadpool(ticker.__exit__)
             sweeping.cancel()

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Literal
 
 from fastapi import APIRouter, Request, Response
-from prometheus_client import CONTENT_TYPE_LATEST, generate_latest
+from prometheus_client import CONTENT_TYPE_LATEST
 
 from service.api.http.dependencies import Provided
 from service.api.http.documents import Document
@@ -61,10 +61,10 @@ def ready(services: Provided) -> Ready | Response:
 
 @router.get("/metrics", summary="Metrics for Prometheus", response_class=Response)
 def metrics(request: Request, services: Provided) -> Response:
-    """Requests by route, and jobs by state."""
+    """Requests by route, and what the catalog, the disk and the queue tell."""
     counted: Metrics = request.app.state.metrics
-    counted.count_jobs(services.catalog.jobs.counts())
-    return Response(generate_latest(counted.registry), media_type=CONTENT_TYPE_LATEST)
+    text = counted.text(services.catalog, services.settings.data_dir, services.queue.snapshot)
+    return Response(text, media_type=CONTENT_TYPE_LATEST)
 
 
 def _check(name: str, ping: Callable[[], None]) -> Check:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 
+ROOTS = ("scans", "maps", "models", "surveys")  #: in each a folder for each row that keeps files
+
 _UNSAFE = re.compile(r"[^A-Za-z0-9._-]+")
 
 

@@ -10,6 +10,7 @@ import errno
 import shutil
 import tempfile
 from collections.abc import Iterator
+from datetime import UTC, datetime
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
 from uuid import uuid4
@@ -117,6 +118,23 @@ class Blobs:
     def size(self, key: str) -> int:
         """Return the number of bytes under `key`. Raises FileNotFoundError."""
         return int(obstore.head(self._store, key)["size"])
+
+    def folders(self, prefix: str) -> list[str]:
+        """Return the folders right under the folder `prefix`, each as a prefix of its keys, in order."""
+        listed = obstore.list_with_delimiter(self._store, prefix)
+        return sorted(f"{str(name).rstrip('/')}/" for name in listed["common_prefixes"])
+
+    def written(self, prefix: str) -> datetime | None:
+        """Return when the newest file under the folder `prefix` was written; None where nothing is there.
+
+        In a local folder what was never written to its end counts too.
+        """
+        if self._root is not None:
+            folder = self._root / prefix
+            times = [path.stat().st_mtime for path in (folder, *folder.rglob("*")) if path.exists()]
+            return datetime.fromtimestamp(max(times), UTC) if times else None
+        entries = (entry for page in obstore.list(self._store, prefix) for entry in page)
+        return max((entry["last_modified"] for entry in entries), default=None)
 
     def delete_prefix(self, prefix: str) -> None:
         """Remove every blob whose key starts with the folder `prefix`; none is fine."""

@@ -24,6 +24,7 @@ class Service:
     """`spicd up`, and its API as a client sees it."""
 
     def __init__(self, folder: Path, model_store: Path, **settings: str) -> None:
+        """Start it and wait; `settings` are further variables of its environment."""
         ready, self.log = folder / "ready.json", folder / "log"
         command = [sys.executable, "-m", "service", "up", "--port", "0", "--end-with-parent"]
         command += ["--data-dir", str(folder / "data"), "--ready-file", str(ready)]

@@ -13,6 +13,7 @@ from fastapi import Request as HttpRequest
 from fastapi import Response
 from pydantic import BeforeValidator, Field
 
+from service import tracing
 from service.api.http.bodies import Body
 from service.api.http.dependencies import Services
 from service.api.http.documents import Link, Request, link
@@ -21,6 +22,7 @@ from service.catalog.catalog import Catalog
 from service.catalog.records import JobRecord, ScanRecord
 from service.dispatch import Dispatcher
 from service.errors import QueueFull, QueueUnavailable, ServiceError, Unavailable
+from service.logs import about
 
 log = logging.getLogger(__name__)
 
@@ -83,7 +85,9 @@ def submit(services: Services, job: JobRecord, *, forget: Callable[[], None]) ->
     except BaseException:
         forget()
         raise
-    log.info("job %s (%s) waits", job.job_id, job.kind)
+    tracing.link_job(job.job_id)
+    with about(job_id=job.job_id):  # the one line that has the ids of request and job
+        log.info("the %s job waits", job.kind)
 
 
 class Ticker:
