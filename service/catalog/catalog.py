@@ -12,6 +12,7 @@ from service.catalog.jobs import Jobs
 from service.catalog.maps import Maps
 from service.catalog.models import Models
 from service.catalog.objects import Objects
+from service.catalog.patience import JOBS, REQUESTS, Patience
 from service.catalog.scans import Scans
 from service.catalog.surveys import Surveys
 from service.catalog.versions import Versions
@@ -38,16 +39,18 @@ class Catalog:
         self.database.close()
 
 
-def open_catalog(settings: Settings, *, migrate: bool = True) -> Catalog:
+def open_catalog(settings: Settings, *, migrate: bool = True, patience: Patience = JOBS) -> Catalog:
     """Open the catalog that `settings` name; `migrate` brings its tables up to date first.
 
-    A process that forks opens the catalog in the child: a connection to PostgreSQL does not survive a fork.
+    A process that forks opens the catalog in the child: a connection to PostgreSQL does not survive a fork. One that
+    answers requests opens it with the patience of those, and keeps it open.
     """
-    database = Database(settings.resolved_database_url())
+    keep_open = patience is REQUESTS
+    database = Database(settings.resolved_database_url(), patience=patience, keep_open=keep_open)
     if migrate:
         database.upgrade()
         history.catch_up(database)
-    blobs = Blobs(settings.resolved_blob_url())
+    blobs = Blobs(settings.resolved_blob_url(), patience=patience)
     return Catalog(
         database=database,
         blobs=blobs,

@@ -1,0 +1,156 @@
+"""PostgreSQL for tests: a server of its own in a temporary folder, where its programs are installed.
+
+Looked for on the PATH, then where Debian puts them. Started by root it runs as the user `postgres` or `nobody`, for it
+refuses to run as root.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import pwd
+import shutil
+import signal
+import socket
+import subprocess
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from uuid import uuid4
+
+import psycopg
+import pytest
+
+from tests.support.processes import until
+
+NO_POSTGRESQL = "no PostgreSQL on this machine: initdb and postgres are not on the PATH"
+_STARTS_S = 30
+
+
+class PostgreSQL:
+    """A server on a free port of the loopback address, which trusts everybody there."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._programs = _programs()
+        self._user = _user()
+        self.port = free_port()
+        self.process: subprocess.Popen[bytes] | None = None
+        if self._user is not None:
+            os.chown(folder, self._user.pw_uid, self._user.pw_gid)
+        options = ["--auth=trust", "--username=spicd", "--encoding=UTF8", "--no-sync"]
+        self._run("initdb", "-D", str(folder / "data"), *options).wait(60)
+        self.start()
+
+    def start(self) -> None:
+        """Start the server, or start it again."""
+        settings = [
+            f"port={self.port}",
+            "listen_addresses=127.0.0.1",
+            "fsync=off",
+            "unix_socket_directories=",
+        ]
+        options = [word for setting in settings for word in ("-c", setting)]
+        self.process = self._run("postgres", "-D", str(self._folder / "data"), *options)
+        until(self._answers, _STARTS_S)
+
+    def freeze(self) -> None:
+        """Stop every process of the server in its tracks: connections stay open, and nobody answers."""
+        self._signal(signal.SIGSTOP)
+
+    def thaw(self) -> None:
+        self._signal(signal.SIGCONT)
+
+    def kill(self) -> None:
+        """End the server as a crash does; `start` recovers it."""
+        assert self.process is not None
+        self._signal(signal.SIGKILL)
+        self.process.wait()
+
+    def stop(self) -> None:
+        """End the server for good."""
+        if self.process is not None and self.process.poll() is None:
+            self.thaw()
+            self.process.send_signal(signal.SIGINT)
+            self.process.wait(30)
+
+    def database(self) -> str:
+        """Make a new database; returns its URL."""
+        name = f"spicd_{uuid4().hex[:12]}"
+        with psycopg.connect(self.url("postgres"), autocommit=True) as connection:
+            connection.execute(f"CREATE DATABASE {name}")  # type: ignore[call-overload]
+        return self.url(name)
+
+    def url(self, name: str) -> str:
+        return f"postgresql://spicd@127.0.0.1:{self.port}/{name}"
+
+    def _answers(self) -> bool:
+        assert self.process is not None
+        assert self.process.poll() is None, "PostgreSQL ended"
+        with contextlib.suppress(psycopg.OperationalError):
+            psycopg.connect(self.url("postgres"), connect_timeout=2).close()
+            return True
+        return False
+
+    def _run(self, program: str, *arguments: str) -> subprocess.Popen[bytes]:
+        user = {} if self._user is None else {"user": self._user.pw_uid, "group": self._user.pw_gid}
+        with (self._folder / f"{program}.log").open("ab") as log:
+            return subprocess.Popen(
+                [str(self._programs / program), *arguments],
+                cwd=self._folder,
+                env={"PATH": os.environ["PATH"], "LC_ALL": "C"},
+                stdout=log,
+                stderr=log,
+                start_new_session=True,
+                **user,  # type: ignore[call-overload]
+            )
+
+    def _signal(self, number: signal.Signals) -> None:
+        """Signal the whole family: each connection has a process, all in sessions of their own."""
+        assert self.process is not None
+        children = Path(f"/proc/{self.process.pid}/task/{self.process.pid}/children").read_text().split()
+        for pid in (self.process.pid, *map(int, children)):
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, number)
+
+
+@contextlib.contextmanager
+def postgresql() -> Iterator[PostgreSQL]:
+    """Run a server; skip the test where there is none to run."""
+    if _programs_or_none() is None:
+        pytest.skip(NO_POSTGRESQL)
+    with tempfile.TemporaryDirectory(prefix="spicd-postgresql-") as folder:
+        server = PostgreSQL(Path(folder))
+        try:
+            yield server
+        finally:
+            server.stop()
+
+
+def free_port() -> int:
+    """Return a port that nobody listens on now."""
+    with socket.socket() as listening:
+        listening.bind(("127.0.0.1", 0))
+        return int(listening.getsockname()[1])
+
+
+def _programs() -> Path:
+    folder = _programs_or_none()
+    assert folder is not None, NO_POSTGRESQL
+    return folder
+
+
+def _programs_or_none() -> Path | None:
+    found = shutil.which("postgres")
+    folders = [Path(found).resolve().parent] if found else []
+    folders += sorted(Path("/usr/lib/postgresql").glob("*/bin"), reverse=True)
+    return next((folder for folder in folders if (folder / "initdb").exists()), None)
+
+
+def _user() -> pwd.struct_passwd | None:
+    if os.getuid() != 0:
+        return None
+    for name in ("postgres", "nobody"):
+        with contextlib.suppress(KeyError):
+            return pwd.getpwnam(name)
+    return None
