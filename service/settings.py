@@ -40,6 +40,11 @@ class Settings(BaseSettings):
     inference_workers: int = Field(1, ge=0, description="worker processes of the inference queue")
     max_upload_bytes: int = Field(2 * 1024**3, gt=0, description="largest body of one request")
     max_scan_points: int = Field(50_000_000, gt=0, description="most points that one scan may declare")
+    min_free_bytes: int = Field(
+        1024**3,
+        ge=0,
+        description="of the data folder's disk; uploads and jobs that would leave less are refused; 0: off",
+    )
     job_timeout_s: int = Field(3600, gt=0, description="longest time of one step of a job")
     training_minutes: float = Field(
         10.0, gt=0, description="of a model's training where a request names none"

@@ -19,10 +19,13 @@ from service.api.http import problems
 from service.api.http.bodies import INCOMING
 from service.api.http.cards import Cards
 from service.api.http.dependencies import Queue, Services
+from service.api.http.lanes import Lane
 from service.api.http.metrics import Metrics, MetricsMiddleware
+from service.api.http.monitor import HealthMonitor
 from service.api.http.submission import resubmit
 from service.api.http.uploads import sweep
 from service.catalog.catalog import open_catalog
+from service.catalog.patience import REQUESTS
 from service.queue import JobQueue
 from service.settings import Settings
 
@@ -94,7 +97,7 @@ def create_app(settings: Settings, *, queue: Queue | None = None) -> FastAPI:
     app.add_middleware(MetricsMiddleware, metrics=app.state.metrics)
     problems.add_handlers(app)
     for part in (scans, maps, versions, surveys, changes, objects, jobs, models, health):
-        app.include_router(part.router)
+        app.include_router(part.router, responses=None if part is health else problems.OUTAGES)
     return app
 
 
@@ -104,15 +107,23 @@ def _lifespan(settings: Settings, queue: Queue | None) -> Any:
         if queue is None and settings.redis_url is None:
             raise ValueError("no SPICD_REDIS_URL: `spicd up` starts an embedded server and sets it")
         used = queue or JobQueue(settings.redis_url or "", timeout_s=settings.job_timeout_s)
-        catalog = await run_in_threadpool(open_catalog, settings)
+        catalog = await run_in_threadpool(open_catalog, settings, patience=REQUESTS)
         await run_in_threadpool(sweep, settings.data_dir / INCOMING)
+        await run_in_threadpool(catalog.disk.load_ballast)
         app.state.services = Services(
-            settings=settings, catalog=catalog, queue=used, cards=Cards(settings.model_store, catalog.models)
+            settings=settings,
+            catalog=catalog,
+            queue=used,
+            cards=Cards(settings.model_store, catalog.models),
+            writes=Lane(),
         )
+        app.state.monitor = HealthMonitor(health.parts(app.state.services))
+        await run_in_threadpool(app.state.monitor.start)
         await run_in_threadpool(resubmit, app.state.services)
         try:
             yield
         finally:
+            app.state.monitor.stop()
             catalog.close()
 
     return lifespan

@@ -8,6 +8,7 @@ from service.catalog import history
 from service.catalog.blobs import Blobs
 from service.catalog.changes import Changes
 from service.catalog.database import Database
+from service.catalog.disk import BALLAST_BYTES, Disk
 from service.catalog.jobs import Jobs
 from service.catalog.maps import Maps
 from service.catalog.models import Models
@@ -25,6 +26,7 @@ class Catalog:
 
     database: Database
     blobs: Blobs
+    disk: Disk
     scans: Scans
     maps: Maps
     versions: Versions
@@ -54,6 +56,7 @@ def open_catalog(settings: Settings, *, migrate: bool = True, patience: Patience
     return Catalog(
         database=database,
         blobs=blobs,
+        disk=disk_of(settings),
         scans=Scans(database, blobs),
         maps=Maps(database, blobs),
         versions=Versions(database, blobs),
@@ -63,3 +66,10 @@ def open_catalog(settings: Settings, *, migrate: bool = True, patience: Patience
         objects=Objects(database),
         jobs=Jobs(database),
     )
+
+
+def disk_of(settings: Settings) -> Disk:
+    """Return the disk of the data folder, with a ballast where the database lies on it."""
+    settings.data_dir.mkdir(parents=True, exist_ok=True)
+    is_ours = settings.resolved_database_url().startswith("sqlite")
+    return Disk(settings.data_dir, reserve=settings.min_free_bytes, ballast=BALLAST_BYTES if is_ours else 0)

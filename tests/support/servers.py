@@ -1,4 +1,6 @@
-"""PostgreSQL for tests: a server of its own in a temporary folder, where its programs are installed.
+"""Servers for tests, and servers that fail them.
+
+PostgreSQL is a server of its own in a temporary folder, where its programs are installed.
 
 Looked for on the PATH, then where Debian puts them. Started by root it runs as the user `postgres` or `nobody`, for it
 refuses to run as root.
@@ -12,8 +14,10 @@ import pwd
 import shutil
 import signal
 import socket
+import sqlite3
 import subprocess
 import tempfile
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 from uuid import uuid4
@@ -154,3 +158,42 @@ def _user() -> pwd.struct_passwd | None:
         with contextlib.suppress(KeyError):
             return pwd.getpwnam(name)
     return None
+
+
+class Locked:
+    """A SQLite database under somebody else's write lock, for as long as the block lasts."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def __enter__(self) -> None:
+        self._other = sqlite3.connect(self._path, isolation_level=None)
+        self._other.execute("BEGIN IMMEDIATE")
+
+    def __exit__(self, *_: object) -> None:
+        self._other.rollback()
+        self._other.close()
+
+
+class SilentServer:
+    """A port that takes every connection, and never says a word; with `words`, these and then nothing more."""
+
+    def __init__(self, words: bytes = b"") -> None:
+        self._words = words
+        self._listening = socket.create_server(("127.0.0.1", 0), backlog=200)
+        self._taken: list[socket.socket] = []
+        self.port = self._listening.getsockname()[1]
+        threading.Thread(target=self._take, daemon=True).start()
+
+    def close(self) -> None:
+        for open_one in (self._listening, *self._taken):
+            open_one.close()
+
+    def _take(self) -> None:
+        with contextlib.suppress(OSError):
+            while True:
+                taken, _ = self._listening.accept()
+                self._taken.append(taken)
+                if self._words:
+                    taken.recv(1 << 16)
+                    taken.sendall(self._words)

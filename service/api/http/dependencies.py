@@ -8,6 +8,7 @@ from typing import Annotated, Protocol, cast
 from fastapi import Depends, Request
 
 from service.api.http.cards import Cards
+from service.api.http.lanes import Lane
 from service.catalog.catalog import Catalog
 from service.catalog.steps import JobKind
 from service.settings import Settings
@@ -37,9 +38,10 @@ class Services:
     catalog: Catalog
     queue: Queue
     cards: Cards
+    writes: Lane  #: threads of what changes something; reads have the framework's
 
 
-def _services(request: Request) -> Services:
+async def _services(request: Request) -> Services:
     return cast("Services", request.app.state.services)
 
 

@@ -15,7 +15,7 @@ from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 
 from service.catalog.records import Problem
-from service.errors import ServiceError
+from service.errors import ServiceError, Unavailable, is_disk_full
 
 log = logging.getLogger(__name__)
 
@@ -93,7 +93,7 @@ def problem_of(problem: Problem | None) -> ProblemDocument | None:
 JobProblem = Annotated[ProblemDocument | None, BeforeValidator(problem_of)]
 
 #: What may be wrong with any body; documented in this order.
-BODY = ("incomplete_body", "too_large", "wrong_media_type", "bad_request", "invalid_request")
+BODY = ("incomplete_body", "too_large", "wrong_media_type", "bad_request", "invalid_request", "disk_full")
 
 
 def response(
@@ -104,6 +104,9 @@ def response(
     status = 500 if status is None else status
     content = {"type": _type(code), "title": title, "status": status, "detail": detail, **members}
     return JSONResponse(content, status, headers=headers, media_type=MEDIA_TYPE)
+
+
+_RETRY_AFTER = {"description": "seconds, where it helps to wait", "schema": {"type": "integer"}}
 
 
 def documented(*codes: str) -> dict[int | str, dict[str, Any]]:
@@ -119,8 +122,13 @@ def documented(*codes: str) -> dict[int | str, dict[str, Any]]:
             "description": meaning if known is None else f"{known['description']}; {meaning}",
             "content": {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/ProblemDocument"}}},
         }
+        if status in (429, 503):
+            answers[status]["headers"] = {"Retry-After": _RETRY_AFTER}
     return answers
 
+
+#: What any route may answer that needs the database or the blob store.
+OUTAGES = documented("database_unavailable", "blobs_unavailable", "unavailable")
 
 #: The answers of a route that names one thing, of one that lists, and of one that gives what a job makes.
 NAMED = documented("not_found", "invalid_request")
@@ -139,7 +147,10 @@ def add_handlers(app: FastAPI) -> None:
 
 def _service_error(_request: Request, error: Exception) -> Response:
     code = error.code if isinstance(error, ServiceError) and error.code in PROBLEMS else "internal"
-    return response(code, str(error))
+    if isinstance(error, Unavailable) and is_disk_full(error):  # Redis, whose own disk is full
+        code = "disk_full"
+    wait = getattr(error, "retry_after_s", None)
+    return response(code, str(error), headers=None if wait is None else {"Retry-After": str(wait)})
 
 
 def _invalid(_request: Request, error: Exception) -> Response:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import logging
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
-from typing import Annotated
+from typing import Annotated, ParamSpec
 
 from fastapi import Request as HttpRequest
 from fastapi import Response
@@ -21,6 +22,8 @@ from service.catalog.records import JobRecord, ScanRecord
 from service.errors import QueueUnavailable, ServiceError
 
 log = logging.getLogger(__name__)
+
+P = ParamSpec("P")
 
 
 class ScansRequest(Request):
@@ -99,6 +102,11 @@ def dismiss(services: Services, job_id: str) -> JobRecord:
     except QueueUnavailable as error:
         log.warning("job %s is dismissed, but the queue was not told: %s", job_id, error)
     return job
+
+
+async def delete(services: Services, call: Callable[P, None], *args: P.args, **kwargs: P.kwargs) -> None:
+    """Delete something, in a thread, also where no space is left to note that it is gone."""
+    await services.writes.run(services.catalog.disk.freeing, functools.partial(call, *args, **kwargs))
 
 
 def stop_if_open(services: Services, job_id: str) -> None:
