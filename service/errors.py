@@ -25,6 +25,7 @@ from collections.abc import Iterator
 
 _NO_SPACE = (errno.ENOSPC, errno.EDQUOT)
 _SQLITE_FULL = 13  #: sqlite.org, result codes
+_SQLITE_NO_SHM = 4874  #: SQLITE_IOERR_SHMSIZE: no space for the index of its log
 _POSTGRESQL_FULL = "53100"  #: PostgreSQL, Appendix A: disk_full
 _SAYS_FULL = ("no space left on device", "disk quota exceeded", "os error 28", "os error 122")
 
@@ -108,7 +109,8 @@ def is_disk_full(error: BaseException) -> bool:
 def _says_full(error: BaseException) -> bool:
     if isinstance(error, DiskFull) or (isinstance(error, OSError) and error.errno in _NO_SPACE):
         return True
-    if (getattr(error, "sqlite_errorcode", None) or 0) & 0xFF == _SQLITE_FULL:
+    code = getattr(error, "sqlite_errorcode", None) or 0
+    if code & 0xFF == _SQLITE_FULL or code == _SQLITE_NO_SHM:
         return True
     if getattr(error, "sqlstate", None) == _POSTGRESQL_FULL:
         return True

@@ -49,14 +49,15 @@ def open_catalog(settings: Settings, *, migrate: bool = True, patience: Patience
     """
     keep_open = patience is REQUESTS
     database = Database(settings.resolved_database_url(), patience=patience, keep_open=keep_open)
+    disk = disk_of(settings)
     if migrate:
-        database.upgrade()
+        disk.freeing(database.upgrade)  # where it is full, the log of the database alone may not fit
         history.catch_up(database)
     blobs = Blobs(settings.resolved_blob_url(), patience=patience)
     return Catalog(
         database=database,
         blobs=blobs,
-        disk=disk_of(settings),
+        disk=disk,
         scans=Scans(database, blobs),
         maps=Maps(database, blobs),
         versions=Versions(database, blobs),

@@ -21,6 +21,7 @@ log = logging.getLogger(__name__)
 T = TypeVar("T")
 
 BALLAST_BYTES = 16 << 20  #: the log of deleting a map of some ten thousand tiles, with room to spare
+_LEAST_BYTES = 4 << 20  #: to start with: the logs of the database and of Redis
 _NAME = "ballast"
 _MIB = 1 << 20
 
@@ -43,13 +44,22 @@ class Disk:
         """Return while `coming` further bytes leave the reserve untouched. Raises DiskFull."""
         if self._reserve == 0:
             return
-        free = self.free()
+        lacks_ballast = self._ballast > 0 and not self._path.exists()
+        free = self.free() - (
+            self._ballast if lacks_ballast else 0
+        )  # what was given up for deleting is for deleting
         if free - coming < self._reserve:
             raise DiskFull(
-                f"{free // _MIB} MiB are free in the data folder, and {self._reserve // _MIB} MiB of them are kept "
+                f"{max(free, 0) // _MIB} MiB are free in the data folder, and {self._reserve // _MIB} MiB of them are kept "
                 f"(SPICD_MIN_FREE_BYTES){f'; {coming} bytes were to come' if coming else ''}; delete surveys or maps, "
                 "or enlarge the disk"
             )
+        if lacks_ballast:
+            self.load_ballast()
+
+    def make_room(self) -> bool:
+        """Give the ballast up where hardly anything else is left; False where that is not enough to work with."""
+        return self.free() >= _LEAST_BYTES or (self.drop_ballast() and self.free() >= _LEAST_BYTES)
 
     def freeing(self, call: Callable[[], T]) -> T:
         """Call something that deletes; where no space is left to do so, once more without the ballast."""

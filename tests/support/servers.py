@@ -82,7 +82,7 @@ class PostgreSQL:
         """Make a new database; returns its URL."""
         name = f"spicd_{uuid4().hex[:12]}"
         with psycopg.connect(self.url("postgres"), autocommit=True) as connection:
-            connection.execute(f"CREATE DATABASE {name}")  # type: ignore[call-overload]
+            connection.execute(f"CREATE DATABASE {name}")
         return self.url(name)
 
     def url(self, name: str) -> str:
@@ -129,6 +129,17 @@ def postgresql() -> Iterator[PostgreSQL]:
             yield server
         finally:
             server.stop()
+
+
+def s3_environment(port: int) -> dict[str, str]:
+    """Return the environment of a client of an S3 server on this machine."""
+    return {
+        "AWS_ENDPOINT_URL": f"http://127.0.0.1:{port}",
+        "AWS_ALLOW_HTTP": "true",
+        "AWS_ACCESS_KEY_ID": "key",
+        "AWS_SECRET_ACCESS_KEY": "secret",
+        "AWS_REGION": "us-east-1",
+    }
 
 
 def free_port() -> int:
@@ -184,6 +195,10 @@ class SilentServer:
         self._taken: list[socket.socket] = []
         self.port = self._listening.getsockname()[1]
         threading.Thread(target=self._take, daemon=True).start()
+
+    def as_s3(self) -> dict[str, str]:
+        """The environment of a client that takes it for S3."""
+        return s3_environment(self.port)
 
     def close(self) -> None:
         for open_one in (self._listening, *self._taken):

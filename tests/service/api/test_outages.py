@@ -29,13 +29,7 @@ HASTY = Patience(connect_s=1, lock_s=1, statement_s=1, blob_s=0.5, blob_request_
 @pytest.fixture
 def silent(monkeypatch: pytest.MonkeyPatch) -> Iterator[SilentServer]:
     server = SilentServer()
-    for name, value in {
-        "AWS_ENDPOINT_URL": f"http://127.0.0.1:{server.port}",
-        "AWS_ALLOW_HTTP": "true",
-        "AWS_ACCESS_KEY_ID": "key",
-        "AWS_SECRET_ACCESS_KEY": "secret",
-        "AWS_REGION": "us-east-1",
-    }.items():
+    for name, value in server.as_s3().items():
         monkeypatch.setenv(name, value)
     yield server
     server.close()
