@@ -22,13 +22,18 @@ from collections.abc import Iterator
 from pathlib import Path
 from uuid import uuid4
 
+import httpx
 import psycopg
 import pytest
 
+from service.up.embedded_redis import EmbeddedRedis
 from tests.support.processes import until
 
+SERVERS = Path(__file__).parents[2] / "build" / "servers"  #: where `make acceptance-shared` installs one
+NO_S3 = "no S3 server on this machine: `make acceptance-shared` installs one"
 NO_POSTGRESQL = "no PostgreSQL on this machine: initdb and postgres are not on the PATH"
 _STARTS_S = 30
+_SIGNED = {"Authorization": "AWS4-HMAC-SHA256 Credential=key/20260301/us-east-1/s3/aws4_request"}
 
 
 class PostgreSQL:
@@ -212,3 +217,59 @@ class SilentServer:
                 if self._words:
                     taken.recv(1 << 16)
                     taken.sendall(self._words)
+
+
+class S3Server:
+    """moto's S3, in a process of its own and in memory, with one bucket."""
+
+    def __init__(self, program: Path, folder: Path) -> None:
+        self.port = free_port()
+        with (folder / "s3.log").open("wb") as log:
+            self.process = subprocess.Popen(
+                [str(program), "-H", "127.0.0.1", "-p", str(self.port)],
+                cwd=folder,
+                stdout=log,
+                stderr=log,
+                start_new_session=True,
+            )
+        until(self._answers, _STARTS_S)
+
+    def environment(self) -> dict[str, str]:
+        """Return what a client needs beside `s3://bucket`."""
+        return s3_environment(self.port)
+
+    def stop(self) -> None:
+        self.process.kill()
+        self.process.wait()
+
+    def _answers(self) -> bool:
+        assert self.process.poll() is None, "the S3 server ended"
+        with contextlib.suppress(httpx.TransportError):
+            made = httpx.put(f"http://127.0.0.1:{self.port}/bucket", timeout=10, headers=_SIGNED)
+            return made.status_code in (200, 409)
+        return False
+
+
+@contextlib.contextmanager
+def s3_server(folder: Path) -> Iterator[S3Server]:
+    """Run an S3 server; skip the test where there is none to run."""
+    program = shutil.which("moto_server", path=f"{SERVERS / 'bin'}:{os.environ['PATH']}")
+    if program is None:
+        pytest.skip(NO_S3)
+    server = S3Server(Path(program), folder)
+    try:
+        yield server
+    finally:
+        server.stop()
+
+
+@contextlib.contextmanager
+def shared_parts(folder: Path) -> Iterator[dict[str, str]]:
+    """Run a Redis, a PostgreSQL and an S3; yields the settings of a service that works on them."""
+    with postgresql() as database, s3_server(folder) as s3, EmbeddedRedis(folder / "redis") as redis:
+        yield {
+            "redis_url": redis.url,
+            "database_url": database.database(),
+            "blob_url": "s3://bucket/spicd",
+            **s3.environment(),
+        }

@@ -16,7 +16,7 @@ from service.catalog import blob_keys
 from service.catalog.blobs import Blobs
 from service.catalog.patience import Patience
 from service.errors import BlobsUnavailable
-from tests.support.servers import SilentServer
+from tests.support.servers import SilentServer, free_port, s3_environment
 
 
 @pytest.fixture
@@ -212,9 +212,7 @@ def test_a_stream_that_stalls_is_given_up_and_its_copy_goes(
 
 
 def test_a_store_that_is_not_there_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    server = SilentServer()
-    server.close()
-    for name, value in server.as_s3().items():
+    for name, value in s3_environment(free_port()).items():
         monkeypatch.setenv(name, value)
     with pytest.raises(BlobsUnavailable, match="connection refused"):
         Blobs("s3://bucket/prefix", patience=HASTY).ping()
