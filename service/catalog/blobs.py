@@ -101,6 +101,15 @@ class Blobs:
         with _errors():
             return sorted(str(entry["path"]) for page in obstore.list(self._store, prefix) for entry in page)
 
+    def stamps(self, prefix: str) -> dict[str, str]:
+        """Return the keys under the folder `prefix`, each with a stamp that another content would not have."""
+        with _errors():
+            entries = [entry for page in obstore.list(self._store, prefix) for entry in page]
+        return {
+            str(entry["path"]): f"{entry['size']} {entry['last_modified'].isoformat()} {entry['e_tag']}"
+            for entry in entries
+        }
+
     def get_bytes(self, key: str) -> bytes:
         """Return the bytes under `key`. Raises FileNotFoundError."""
         with _errors():

@@ -89,8 +89,21 @@ class Database:
             ]  # one more tells of a next page
         return Page(items=records[:limit], more=len(records) > limit)
 
-    def upgrade(self) -> None:
-        """Bring the tables up to date; several processes may do so at once. Raises WrongRevision."""
+    @contextlib.contextmanager
+    def snapshot(self) -> Iterator[Session]:
+        """Open a session that sees one state of all tables for as long as it lasts, and changes nothing.
+
+        A transaction of SQLite is that by itself; PostgreSQL would show each statement what was committed before it.
+        """
+        is_sqlite = self._url.get_backend_name() == "sqlite"
+        engine = (
+            self.engine if is_sqlite else self.engine.execution_options(isolation_level="REPEATABLE READ")
+        )
+        with _outages(), Session(engine) as session:
+            yield session
+
+    def upgrade(self, revision: str = "head") -> None:
+        """Bring the tables up to date, or to `revision`; several processes may do so at once. Raises WrongRevision."""
         config = Config()
         config.set_main_option("script_location", "service.catalog:migrations")
         engine = _engine(self._url, MIGRATIONS)
@@ -100,7 +113,7 @@ class Database:
                     _check_revision(MigrationContext.configure(connection).get_current_revision(), config)
                 with engine.connect() as connection:
                     config.attributes["connection"] = connection
-                    command.upgrade(config, "head")
+                    command.upgrade(config, revision)
             if self._keeps_open:
                 self._keep()
         finally:

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
-from service.errors import ServiceError
+from service.errors import ServiceError, is_disk_full
 
 log = logging.getLogger(__name__)
 
@@ -77,8 +77,8 @@ def _asked(ping: Callable[[], None]) -> str | None:
     """Return why a part does not answer: the sentence of our own errors, else the kind, for it may hold an address."""
     try:
         ping()
-    except ServiceError as error:
-        return str(error)
     except Exception as error:  # whatever it is, this part does not answer
-        return type(error).__name__
+        if is_disk_full(error):
+            return "its disk is full"
+        return str(error) if isinstance(error, ServiceError) else type(error).__name__
     return None

@@ -147,8 +147,8 @@ def add_handlers(app: FastAPI) -> None:
 
 def _service_error(_request: Request, error: Exception) -> Response:
     code = error.code if isinstance(error, ServiceError) and error.code in PROBLEMS else "internal"
-    if isinstance(error, Unavailable) and is_disk_full(error):  # Redis, whose own disk is full
-        code = "disk_full"
+    if isinstance(error, Unavailable) and is_disk_full(error):  # Redis says that it cannot write
+        return response("disk_full", "the disk of the job queue is full; delete surveys or maps, or enlarge it")
     wait = getattr(error, "retry_after_s", None)
     return response(code, str(error), headers=None if wait is None else {"Retry-After": str(wait)})
 
