@@ -21,7 +21,8 @@ test: $(INSTALLED) ## every test, on all cores
 test-fast: $(INSTALLED) ## the tests that take no longer than a second or so: under a minute on two cores
 	$(BIN)/pytest -m fast -n auto --dist loadscope
 
-acceptance-shared: $(INSTALLED) $(SERVERS)/bin/moto_server ## the acceptance test on PostgreSQL and S3, one host and two
+acceptance-shared: $(INSTALLED) $(SERVERS)/bin/moto_server ## tests of the catalog on PostgreSQL; acceptance with S3 too, one host and two
+	SPICD_TEST_DATABASE_URL=postgresql $(BIN)/pytest tests/service/catalog tests/service/api -m fast -n auto --dist loadscope
 	$(BIN)/pytest tests/acceptance -k "one-host or two-hosts"
 
 check: $(INSTALLED) ## ruff and mypy, tests and examples included

@@ -93,7 +93,17 @@ def problem_of(problem: Problem | None) -> ProblemDocument | None:
 JobProblem = Annotated[ProblemDocument | None, BeforeValidator(problem_of)]
 
 #: What may be wrong with any body; documented in this order.
-BODY = ("incomplete_body", "too_large", "wrong_media_type", "bad_request", "invalid_request", "disk_full")
+BODY = (
+    "incomplete_body",
+    "too_large",
+    "wrong_media_type",
+    "bad_request",
+    "invalid_request",
+    "disk_full",
+    "unavailable",
+    "database_unavailable",
+    "blobs_unavailable",
+)
 
 
 def response(
@@ -148,7 +158,9 @@ def add_handlers(app: FastAPI) -> None:
 def _service_error(_request: Request, error: Exception) -> Response:
     code = error.code if isinstance(error, ServiceError) and error.code in PROBLEMS else "internal"
     if isinstance(error, Unavailable) and is_disk_full(error):  # Redis says that it cannot write
-        return response("disk_full", "the disk of the job queue is full; delete surveys or maps, or enlarge it")
+        return response(
+            "disk_full", "the disk of the job queue is full; delete surveys or maps, or enlarge it"
+        )
     wait = getattr(error, "retry_after_s", None)
     return response(code, str(error), headers=None if wait is None else {"Retry-After": str(wait)})
 
