@@ -19,7 +19,7 @@ from service.api.http import problems
 from service.api.http.bodies import INCOMING
 from service.api.http.cards import Cards
 from service.api.http.dependencies import Queue, Services
-from service.api.http.lanes import Lane
+from service.api.http.lanes import UPLOAD_TURN_S, Lane
 from service.api.http.metrics import Metrics, MetricsMiddleware
 from service.api.http.monitor import HealthMonitor
 from service.api.http.submission import resubmit
@@ -116,6 +116,7 @@ def _lifespan(settings: Settings, queue: Queue | None) -> Any:
             queue=used,
             cards=Cards(settings.model_store, catalog.models),
             writes=Lane(),
+            uploads=Lane(turn_s=UPLOAD_TURN_S),
         )
         app.state.monitor = HealthMonitor(health.parts(app.state.services))
         await run_in_threadpool(app.state.monitor.start)

@@ -17,7 +17,7 @@ from service.api.http.fields import Id, Model, Text, from_text
 from service.api.http.files import blob_response
 from service.api.http.paging import PageRequest, list_links
 from service.api.http.problems import BODY, LISTED, MADE, NAMED, JobProblem, documented
-from service.api.http.submission import ScansRequest, delete, kept_scans, monitor, stop_if_open, submit
+from service.api.http.submission import ScansRequest, delete, kept_scans, lane, monitor, stop_if_open, submit
 from service.catalog import blob_keys
 from service.catalog.records import Anchor, Built, JobRecord, MapRecord, MapStatus
 
@@ -156,7 +156,7 @@ async def create_map(request: HttpRequest, response: Response, services: Provide
     """From scans uploaded before (`scan_ids`) or sent here (`scans`); their poses, where given, set the frame of the map."""
     async with bodies.received(request, services) as body:
         wanted = checked(MapRequest, body.fields)
-        record, job = await services.writes.run(_create, services, wanted, body)
+        record, job = await lane(services, body).run(_create, services, wanted, body)
     links = [link(request, f"/maps/{record.map_id}", "self"), monitor(request, response, job)]
     return AcceptedMap(map_id=record.map_id, job_id=job.job_id, status=record.status, links=links)
 

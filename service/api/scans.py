@@ -16,7 +16,7 @@ from service.api.http.documents import Document, Link, Request, checked
 from service.api.http.fields import DeviceId, Id, Instant, Pose, Text
 from service.api.http.paging import PageRequest, list_links
 from service.api.http.problems import BODY, LISTED, NAMED, documented
-from service.api.http.submission import delete
+from service.api.http.submission import delete, lane
 from service.catalog.catalog import Catalog
 from service.catalog.records import ScanRecord
 from service.errors import BadRequest
@@ -91,7 +91,7 @@ async def upload_scan(
         filename=asked.filename,
     ) as body:
         wanted = checked(ScanRequest, {**query, **body.fields})
-        record, is_new = await services.writes.run(_keep, services.catalog, body, wanted)
+        record, is_new = await lane(services, body).run(_keep, services.catalog, body, wanted)
     response.status_code = 201 if is_new else 200
     response.headers["Location"] = f"{request.scope.get('root_path', '')}/scans/{record.scan_id}"
     return ScanDocument.of_row(record)

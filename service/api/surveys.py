@@ -19,7 +19,7 @@ from service.api.http.fields import DeviceId, Id, Instant, Model
 from service.api.http.files import blob_response
 from service.api.http.paging import PageRequest, list_links
 from service.api.http.problems import BODY, MADE, NAMED, JobProblem, documented
-from service.api.http.submission import ScansRequest, delete, kept_scans, monitor, stop_if_open, submit
+from service.api.http.submission import ScansRequest, delete, kept_scans, lane, monitor, stop_if_open, submit
 from service.catalog import blob_keys
 from service.catalog.records import JobRecord, MapRecord, SurveyRecord, SurveyStatus
 
@@ -77,7 +77,7 @@ async def create_survey(
     reference = await run_in_threadpool(services.catalog.maps.ready, map_id)  # before a long upload
     async with bodies.received(request, services) as body:
         wanted = checked(SurveyRequest, body.fields)
-        record, job = await services.writes.run(_create, services, reference, wanted, body)
+        record, job = await lane(services, body).run(_create, services, reference, wanted, body)
     return AcceptedSurvey(
         survey_id=record.survey_id,
         map_id=map_id,

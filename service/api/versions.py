@@ -16,7 +16,7 @@ from service.api.http.documents import Document, Link, checked, link
 from service.api.http.fields import Id
 from service.api.http.paging import PageRequest, list_links
 from service.api.http.problems import BODY, MADE, NAMED, JobProblem, documented
-from service.api.http.submission import ScansRequest, delete, kept_scans, monitor, submit
+from service.api.http.submission import ScansRequest, delete, kept_scans, lane, monitor, submit
 from service.api.maps import BuiltDocument, MapId, cloud_response, file_links, manifest_response
 from service.catalog.records import JobRecord, MapStatus, VersionRecord
 
@@ -73,7 +73,7 @@ async def create_version(
     await run_in_threadpool(services.catalog.maps.ready, map_id)  # before a long upload
     async with bodies.received(request, services) as body:
         wanted = checked(VersionRequest, body.fields)
-        record, job = await services.writes.run(_create, services, map_id, wanted, body)
+        record, job = await lane(services, body).run(_create, services, map_id, wanted, body)
     here = link(request, f"/maps/{map_id}/versions/{record.version}", "self")
     return AcceptedVersion(
         map_id=map_id,

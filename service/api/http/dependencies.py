@@ -39,6 +39,7 @@ class Services:
     queue: Queue
     cards: Cards
     writes: Lane  #: threads of what changes something; reads have the framework's
+    uploads: Lane  #: and of what takes files into the blob store besides, which lasts longer
 
 
 async def _services(request: Request) -> Services:

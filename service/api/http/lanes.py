@@ -20,6 +20,7 @@ T = TypeVar("T")
 
 WRITERS = 8  #: more of them wait in the database, which takes one at a time (SQLite) or a few (PostgreSQL)
 TURN_S = 5.0  #: how long a request waits for a thread
+UPLOAD_TURN_S = 60.0  #: and one that has sent files, which it would have to send again
 
 
 class Lane:

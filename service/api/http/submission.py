@@ -17,6 +17,7 @@ from service.api.http.bodies import Body
 from service.api.http.dependencies import Services
 from service.api.http.documents import Link, Request, link
 from service.api.http.fields import DeviceId, Id, Instant, names_from_text
+from service.api.http.lanes import Lane
 from service.catalog.catalog import Catalog
 from service.catalog.records import JobRecord, ScanRecord
 from service.errors import QueueUnavailable, ServiceError
@@ -102,6 +103,11 @@ def dismiss(services: Services, job_id: str) -> JobRecord:
     except QueueUnavailable as error:
         log.warning("job %s is dismissed, but the queue was not told: %s", job_id, error)
     return job
+
+
+def lane(services: Services, body: Body) -> Lane:
+    """Return the threads in which a request is carried out: files take their time, and hold up no other write."""
+    return services.uploads if body.uploads else services.writes
 
 
 async def delete(services: Services, call: Callable[P, None], *args: P.args, **kwargs: P.kwargs) -> None:

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import sqlite3
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from sqlalchemy.exc import OperationalError
+from sqlalchemy.orm import Session
 
 from service.catalog.blobs import Blobs
+from service.catalog.catalog import Catalog
 from service.catalog.database import Database
 from service.catalog.disk import Disk
 from service.errors import DiskFull, QueueUnavailable, is_disk_full
+from tests.support.samples import add_scan
 from tests.support.small_disk import small_disk
 
 HUGE = 1 << 60
@@ -122,3 +127,21 @@ def fill_a_table(database: Database) -> None:
             "INSERT INTO tallies (name, labels, count, total) VALUES (?, ?, 0, 0)", ("name", "x" * (1 << 20))
         )
         connection.exec_driver_sql("DELETE FROM tallies")
+
+
+def test_a_scan_whose_row_finds_no_space_leaves_no_file(
+    catalog: Catalog, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write, turns = catalog.database.write, iter([False, True])  # the look at what is known, then the row
+
+    @contextlib.contextmanager
+    def full_at_the_second() -> Iterator[Session]:
+        if next(turns):
+            raise DiskFull("the disk of the database is full")
+        with write() as session:
+            yield session
+
+    monkeypatch.setattr(catalog.database, "write", full_at_the_second)
+    with pytest.raises(DiskFull):
+        add_scan(catalog)
+    assert catalog.blobs.under("scans/") == []
