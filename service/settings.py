@@ -67,6 +67,11 @@ class Settings(BaseSettings):
         description="most that each process of a geometry step may allocate; 0: no limit, "
         "unset: four fifths of the machine's or the container's memory",
     )
+    min_free_bytes: int = Field(
+        1024**3,
+        ge=0,
+        description="of the data folder's disk; uploads and jobs that would leave less are refused; 0: off",
+    )
     job_timeout_s: int = Field(3600, gt=0, description="longest time of one step of a job")
     max_waiting_jobs: int = Field(
         1000, gt=0, description="jobs that may wait; a request for one more is answered with 429"

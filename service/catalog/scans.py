@@ -18,7 +18,7 @@ from service.catalog import blob_keys, tables
 from service.catalog.blobs import Blobs
 from service.catalog.database import Database
 from service.catalog.records import Matrix, Page, Position, ScanFormat, ScanOutcome, ScanRecord
-from service.errors import BadRequest, Conflict, NotFound
+from service.errors import BadRequest, Conflict, DiskFull, NotFound
 
 Row = TypeVar("Row", tables.VersionScan, tables.SurveyScan)
 
@@ -129,13 +129,16 @@ class Scans:
             return False
 
     def _insert(self, row: tables.Scan) -> tuple[ScanRecord, bool]:
-        """Record a scan whose file is kept, unless the same upload came a moment earlier. Raises Conflict."""
+        """Record a scan whose file is kept, unless the same upload came a moment earlier. Raises Conflict, DiskFull."""
         scan_id, key = row.scan_id, row.key
         try:
             with self._database.write() as session:
                 session.add(row)
                 session.flush()
                 return ScanRecord.of_row(row), True
+        except DiskFull:  # which says for sure that no row was kept, as a lost connection does not
+            self._blobs.delete_prefix(blob_keys.folder_of(key))
+            raise
         except IntegrityError:
             self._blobs.delete_prefix(blob_keys.folder_of(key))
             if known := self._sent_again(scan_id):
