@@ -47,7 +47,7 @@ def content(catalog: Catalog) -> dict[str, list[tuple[object, ...]]]:
 
 
 def blobs(catalog: Catalog) -> dict[str, bytes]:
-    keys = [key for prefix in blob_keys.KEPT for key in catalog.blobs.under(prefix)]
+    keys = [key for root in blob_keys.ROOTS for key in catalog.blobs.under(f"{root}/")]
     return {key: catalog.blobs.get_bytes(key) for key in keys}
 
 
