@@ -3,8 +3,9 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
+SERVERS := build/servers
 
-.PHONY: help demo up test test-fast check format bench chaos fuzz load soak openapi clean
+.PHONY: help demo up test test-fast acceptance-shared check format bench chaos fuzz load soak openapi clean
 help: ## this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
 
@@ -19,6 +20,10 @@ test: $(INSTALLED) ## every test, on all cores
 
 test-fast: $(INSTALLED) ## the tests that take no longer than a second or so: under a minute on two cores
 	$(BIN)/pytest -m fast -n auto --dist loadscope
+
+acceptance-shared: $(INSTALLED) $(SERVERS)/bin/moto_server ## tests of the catalog on PostgreSQL; acceptance with S3 too, one host and two
+	SPICD_TEST_DATABASE_URL=postgresql $(BIN)/pytest tests/service/catalog tests/service/api -m fast -n auto --dist loadscope
+	$(BIN)/pytest tests/acceptance -k "one-host or two-hosts"
 
 check: $(INSTALLED) ## ruff and mypy, tests and examples included; bandit, and an audit of what is installed
 	$(BIN)/ruff check .
@@ -60,3 +65,8 @@ $(INSTALLED): pyproject.toml docker/constraints.txt docker/system-libraries.sh
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -c docker/constraints.txt -e '.[worker,dev]'
 	@PYTHON=$(BIN)/python sh docker/system-libraries.sh
 	@touch $@
+
+# An environment of its own: it wants other versions of what Open3D brings (docs/decisions/0009-dependencies.md).
+$(SERVERS)/bin/moto_server:
+	@$(PYTHON) -m venv $(SERVERS)
+	@$(SERVERS)/bin/python -m pip install --quiet --disable-pip-version-check 'moto[s3]==5.2.5' 'flask==3.1.3' 'flask-cors==6.0.5'

@@ -22,6 +22,13 @@ ServiceError
 from __future__ import annotations
 
 import errno
+from collections.abc import Iterator
+
+_NO_SPACE = (errno.ENOSPC, errno.EDQUOT)
+_SQLITE_FULL = 13  #: sqlite.org, result codes
+_SQLITE_NO_SHM = 4874  #: SQLITE_IOERR_SHMSIZE: no space for the index of its log
+_POSTGRESQL_FULL = "53100"  #: PostgreSQL, Appendix A: disk_full
+_SAYS_FULL = ("no space left on device", "disk quota exceeded", "os error 28", "os error 122")
 
 
 class ServiceError(Exception):
@@ -68,6 +75,7 @@ class DiskFull(ServiceError):
 
 class QueueFull(ServiceError):
     code = "queue_full"
+    retry_after_s = 30  #: seconds that the API asks a client to wait
 
 
 class Unauthorized(ServiceError):
@@ -80,6 +88,7 @@ class Forbidden(ServiceError):
 
 class Unavailable(ServiceError):
     code = "unavailable"
+    retry_after_s = 5  #: seconds that the API asks a client to wait
 
 
 class QueueUnavailable(Unavailable):
@@ -94,10 +103,34 @@ class BlobsUnavailable(Unavailable):
     code = "blobs_unavailable"
 
 
-def is_disk_full(error: BaseException | None) -> bool:
-    """Tell whether an error, or one that it comes from, says that no space is left."""
-    while error is not None:
-        if isinstance(error, DiskFull) or getattr(error, "errno", None) in (errno.ENOSPC, errno.EDQUOT):
-            return True
-        error = error.__cause__ or error.__context__
-    return False
+def is_disk_full(error: BaseException) -> bool:
+    """Tell whether an error, or one that it came of, says that a disk or a quota is full.
+
+    Redis and obstore say it in words alone.
+    """
+    return any(_says_full(cause) for cause in _causes(error))
+
+
+def _says_full(error: BaseException) -> bool:
+    if isinstance(error, DiskFull) or (isinstance(error, OSError) and error.errno in _NO_SPACE):
+        return True
+    code = getattr(error, "sqlite_errorcode", None) or 0
+    if code & 0xFF == _SQLITE_FULL or code == _SQLITE_NO_SHM:
+        return True
+    if getattr(error, "sqlstate", None) == _POSTGRESQL_FULL:
+        return True
+    return any(words in str(error).lower() for words in _SAYS_FULL)
+
+
+def _causes(error: BaseException) -> Iterator[BaseException]:
+    """Yield the error and, each once, what it came of: `raise ... from`, while another was handled, SQLAlchemy's `orig`."""
+    waiting, seen = [error], set[int]()
+    while waiting:
+        cause = waiting.pop()
+        if id(cause) in seen:
+            continue
+        seen.add(id(cause))
+        yield cause
+        hidden = cause.__cause__ is not None or cause.__suppress_context__
+        of = (cause.__cause__, None if hidden else cause.__context__, getattr(cause, "orig", None))
+        waiting += [other for other in of if isinstance(other, BaseException)]

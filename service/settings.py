@@ -67,6 +67,11 @@ class Settings(BaseSettings):
         description="most that each process of a geometry step may allocate; 0: no limit, "
         "unset: four fifths of the machine's or the container's memory",
     )
+    min_free_bytes: int = Field(
+        1024**3,
+        ge=0,
+        description="of the data folder's disk; uploads and jobs that would leave less are refused; 0: off",
+    )
     job_timeout_s: int = Field(3600, gt=0, description="longest time of one step of a job")
     max_waiting_jobs: int = Field(
         1000, gt=0, description="jobs that may wait; a request for one more is answered with 429"
@@ -82,7 +87,18 @@ class Settings(BaseSettings):
         gt=0,
         description="most that a request may name; never more than four fifths of `SPICD_JOB_TIMEOUT_S`",
     )
+    keep_scans_days: float = Field(
+        0,
+        ge=0,
+        description="days that scans are kept of which no map and no kept survey is made; 0: for ever",
+    )
+    keep_surveys_days: float = Field(
+        0, ge=0, description="days that surveys are kept which no version of a map took over; 0: for ever"
+    )
     log_level: Literal["debug", "info", "warning", "error"] = Field("info", description="of every process")
+    log_format: Literal["text", "json"] = Field(
+        "text", description="lines for people, or a JSON object a line"
+    )
 
     @field_validator("allowed_origins")
     @classmethod

@@ -21,6 +21,8 @@ SLOW = (
     "acceptance",
     "integration",
     "service/api/http/test_uploads.py",
+    "service/api/test_disk_full.py",
+    "service/api/test_outages.py",
     "service/catalog/test_migrations.py",
     "service/up/test_connections.py",
     "service/up/test_embedded_redis.py",

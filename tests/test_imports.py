@@ -25,6 +25,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "service.errors": (),
     "service.settings": (),
     "service.logs": (),
+    "service.tracing": (),
     "service.permissions": (),
     "service.client": (),
     "service.tile_features": (),
@@ -34,8 +35,11 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "service.dispatch": ("service.catalog", "service.queue", "service.errors"),
     "service.api.http": (
         "service.dispatch",
+        "service.queue",
         "service.catalog",
         "service.errors",
+        "service.logs",
+        "service.tracing",
         "service.settings",
     ),
     "service.api": (
@@ -60,8 +64,8 @@ ROOMS: dict[str, tuple[str, ...]] = {
     ),
     "service.cli": (
         "service.up",
-        "service.client",
         "service.catalog",
+        "service.client",
         "service.permissions",
         "service.settings",
         "service.logs",
@@ -132,6 +136,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "worker.watch": (),
     "worker.rq_jobs": ("service.queue",),
     "worker.rq_workers": (
+        "service.logs",
         "service.settings",
         "service.up.lifetime",
         "worker.rq_jobs",
@@ -143,6 +148,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
         "service.catalog",
         "service.errors",
         "service.settings",
+        "service.tracing",
         "worker.scratch",
         "worker.pipeline",
         "worker.training",
@@ -225,6 +231,7 @@ ONLY_IN = {
     "sqlalchemy": ("service.catalog",),
     "obstore": ("service.catalog",),
     "fastapi": ("service.api", "service.up"),
+    "opentelemetry": ("service.tracing",),
 }
 
 #: The files of the worker that know the service; the demo and the rest are in ROOMS.

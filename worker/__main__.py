@@ -47,7 +47,7 @@ def main(arguments: list[str] | None = None) -> int:
         end_with_parent(options.parent)
     os.umask(PRIVATE_UMASK)
     settings = Settings()
-    set_up_logging(settings.log_level)
+    set_up_logging(settings.log_level, settings.log_format)
     if settings.redis_url is None:
         print(
             "no queue to work on: set SPICD_REDIS_URL, or start everything with `spicd up`", file=sys.stderr

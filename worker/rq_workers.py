@@ -32,6 +32,7 @@ from rq.timeouts import JobTimeoutException, UnixSignalDeathPenalty
 from rq.utils import now
 from rq.worker.base import BaseWorker, WorkerStatus
 
+from service.logs import about
 from service.settings import Settings
 from service.up.lifetime import end_with_parent
 from worker.errors import PipelineError
@@ -148,16 +149,17 @@ class _StepWorker(BaseWorker):  # type: ignore[misc]  # rq is untyped here
         """Claim a step, have it run, and give the claim back once the catalog knows how it ended."""
         begun = time.monotonic()
         self._claim(job, queue)
-        log.info("%s: %s started", self.queues[0].name, job.id)
-        try:
-            self._work_on(job)
-        finally:
-            log.info("%s: %s ended after %.1f s", self.queues[0].name, job.id, time.monotonic() - begun)
-            with suppress(RedisError):  # the claim ends by itself
-                self._give_back(job)
-            self._tell(self._records.tick)
-            with suppress(RedisError):
-                self.set_state(WorkerStatus.IDLE)
+        with about(job_id=job.catalog_id):  # a process that is forked for the step inherits it
+            log.info("%s: %s started", self.queues[0].name, job.id)
+            try:
+                self._work_on(job)
+            finally:
+                log.info("%s: %s ended after %.1f s", self.queues[0].name, job.id, time.monotonic() - begun)
+                with suppress(RedisError):  # the claim ends by itself
+                    self._give_back(job)
+                self._tell(self._records.tick)
+                with suppress(RedisError):
+                    self.set_state(WorkerStatus.IDLE)
 
     def _shutdown(self) -> None:
         self._stop_requested = True  # rq notes it of a busy worker only

@@ -18,6 +18,7 @@ from starlette.types import ASGIApp
 
 from service.api import changes, health, jobs, maps, models, objects, scans, surveys, versions
 from service.api.features import TileCollection
+from service.api.housekeeping import housekeeping
 from service.api.http import problems
 from service.api.http.access import authorize, secured
 from service.api.http.bodies import INCOMING
@@ -25,11 +26,15 @@ from service.api.http.cards import Cards
 from service.api.http.cross_site import add_cross_site_checks
 from service.api.http.dependencies import Queue, Services
 from service.api.http.docs_pages import add_pages
+from service.api.http.lanes import UPLOAD_TURN_S, Lane
 from service.api.http.metrics import Metrics, MetricsMiddleware
+from service.api.http.monitor import HealthMonitor
+from service.api.http.requests import RequestLog
 from service.api.http.security_headers import SecurityHeadersMiddleware
 from service.api.http.submission import Ticker
 from service.api.http.uploads import sweep
 from service.catalog.catalog import open_catalog
+from service.catalog.patience import REQUESTS
 from service.dispatch import Dispatcher
 from service.queue import JobQueue
 from service.settings import Settings
@@ -67,11 +72,11 @@ UNSEEN: dict[JsonSchemaMode, tuple[type[BaseModel], ...]] = {
 
 
 class Api(FastAPI):
-    """FastAPI with our own description of itself, and with security headers on every answer."""
+    """FastAPI with our own description of itself, a line in the log for each request, and security headers."""
 
     def build_middleware_stack(self) -> ASGIApp:
-        """Return the app; the headers lie around it all, for unexpected errors are answered outside of middleware."""
-        return SecurityHeadersMiddleware(super().build_middleware_stack())
+        """Return the app; log and headers lie around it all, for unexpected errors are answered outside of middleware."""
+        return RequestLog(SecurityHeadersMiddleware(super().build_middleware_stack()))
 
     def openapi(self) -> dict[str, Any]:
         """Return the OpenAPI document: what FastAPI derives, and the bodies that are read by hand."""
@@ -114,7 +119,7 @@ def create_app(settings: Settings, *, queue: Queue | None = None) -> FastAPI:
     problems.add_handlers(app)
     add_pages(app)
     for part in (scans, maps, versions, surveys, changes, objects, jobs, models, health):
-        app.include_router(part.router)
+        app.include_router(part.router, responses=None if part is health else problems.OUTAGES)
     return app
 
 
@@ -124,24 +129,31 @@ def _lifespan(settings: Settings, queue: Queue | None) -> Any:
         if queue is None and settings.redis_url is None:
             raise ValueError("no SPICD_REDIS_URL: `spicd up` starts an embedded server and sets it")
         used = queue or JobQueue(settings.redis_url or "", timeout_s=settings.job_timeout_s)
-        catalog = await run_in_threadpool(open_catalog, settings)
+        catalog = await run_in_threadpool(open_catalog, settings, patience=REQUESTS)
         dispatcher = Dispatcher(catalog.jobs, used)
         await run_in_threadpool(sweep, settings.data_dir / INCOMING)
         sweeping = asyncio.create_task(_sweep(settings.data_dir / INCOMING))
+        await run_in_threadpool(catalog.disk.load_ballast)
         app.state.services = Services(
             settings=settings,
             catalog=catalog,
             queue=used,
             dispatcher=dispatcher,
             cards=Cards(settings.model_store, catalog.models),
+            writes=Lane(),
+            uploads=Lane(turn_s=UPLOAD_TURN_S),
         )
+        app.state.monitor = HealthMonitor(health.parts(app.state.services))
+        await run_in_threadpool(app.state.monitor.start)
         ticker = Ticker(dispatcher)
         await run_in_threadpool(ticker.__enter__)
         try:
-            yield
+            async with housekeeping(app.state.services):
+                yield
         finally:
             await run_in_threadpool(ticker.__exit__)
             sweeping.cancel()
+            app.state.monitor.stop()
             catalog.close()
 
     return lifespan

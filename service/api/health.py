@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Callable
 from typing import Literal
 
 from fastapi import APIRouter, Request, Response
-from prometheus_client import CONTENT_TYPE_LATEST, generate_latest
+from prometheus_client import CONTENT_TYPE_LATEST
 
-from service.api.http.dependencies import Provided
+from service.api.http.dependencies import Provided, Services
 from service.api.http.documents import Document
 from service.api.http.metrics import Metrics
+from service.api.http.monitor import HealthMonitor, Part
 from service.api.http.problems import documented, response
 
-log = logging.getLogger(__name__)
 router = APIRouter(tags=["health"])
 
 Check = Literal["ok", "failed"]
+
+_ELSEWHERE_S = 10.0  #: between two looks at a store that takes money for each
 
 
 class Live(Document):
@@ -33,8 +33,18 @@ class Ready(Document):
     checks: dict[str, Check]
 
 
+def parts(services: Services) -> dict[str, Part]:
+    """Return what the service needs, and how each part is asked."""
+    blobs = services.catalog.blobs
+    return {
+        "database": Part(ping=services.catalog.database.ping),
+        "queue": Part(ping=services.queue.ping),
+        "blobs": Part(ping=blobs.ping, every_s=2.0 if blobs.is_local else _ELSEWHERE_S),
+    }
+
+
 @router.get("/health/live", summary="Is the process alive")
-def live() -> Live:
+async def live() -> Live:
     """Always, while it answers at all."""
     return Live()
 
@@ -45,32 +55,24 @@ def live() -> Live:
     response_model=Ready,
     responses=documented("unhealthy"),
 )
-def ready(services: Provided) -> Ready | Response:
-    """Asks the database, the queue and the blob store."""
-    parts: dict[str, Callable[[], None]] = {
-        "database": services.catalog.database.ping,
-        "queue": services.queue.ping,
-        "blobs": services.catalog.blobs.ping,
-    }
-    checks = {name: _check(name, ping) for name, ping in parts.items()}
-    failed = [name for name, check in checks.items() if check == "failed"]
-    if failed:
-        return response("unhealthy", f"no answer from: {', '.join(failed)}", checks=checks)
+async def ready(request: Request) -> Ready | Response:
+    """What the database, the queue and the blob store said when they were asked last, some seconds ago at most.
+
+    `reasons` says of each part that failed why. Never waits for one of them.
+    """
+    monitor: HealthMonitor = request.app.state.monitor
+    failures = monitor.failures()
+    checks: dict[str, Check] = {name: "failed" if why else "ok" for name, why in failures.items()}
+    reasons = {name: why for name, why in failures.items() if why}
+    if reasons:
+        detail = f"no answer from: {', '.join(reasons)}"
+        return response("unhealthy", detail, checks=checks, reasons=reasons)
     return Ready(checks=checks)
 
 
 @router.get("/metrics", summary="Metrics for Prometheus", response_class=Response)
 def metrics(request: Request, services: Provided) -> Response:
-    """Requests by route, and jobs by state."""
+    """Requests by route, and what the catalog, the disk and the queue tell."""
     counted: Metrics = request.app.state.metrics
-    counted.count_jobs(services.catalog.jobs.counts())
-    return Response(generate_latest(counted.registry), media_type=CONTENT_TYPE_LATEST)
-
-
-def _check(name: str, ping: Callable[[], None]) -> Check:
-    try:
-        ping()
-    except Exception:  # whatever it is, this part does not answer
-        log.warning("the %s does not answer", name, exc_info=True)
-        return "failed"
-    return "ok"
+    text = counted.text(services.catalog, services.settings.data_dir, services.queue.snapshot)
+    return Response(text, media_type=CONTENT_TYPE_LATEST)

@@ -86,13 +86,13 @@ def get_job(request: Request, services: Provided, job_id: JobId) -> JobDocument:
     summary="Dismiss a job",
     responses=documented("not_found", "conflict", "invalid_request"),
 )
-def dismiss_job(request: Request, services: Provided, job_id: JobId) -> JobDocument:
+async def dismiss_job(request: Request, services: Provided, job_id: JobId) -> JobDocument:
     """Stops the work for good, and answers the same when asked again.
 
     The standard (requirements class Dismiss) wants a 200 to say `dismissed`; a job that had ended by itself
     keeps its state, so it answers 409.
     """
-    return job_document(dismiss(services, job_id), request)
+    return job_document(await services.writes.run(dismiss, services, job_id), request)
 
 
 Wait = tuple[int, float]  #: position in its queue, seconds waited

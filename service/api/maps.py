@@ -18,7 +18,16 @@ from service.api.http.fields import Id, Model, Text, from_text
 from service.api.http.files import blob_response
 from service.api.http.paging import PageRequest, list_links
 from service.api.http.problems import BODY, LISTED, MADE, NAMED, JobProblem, documented
-from service.api.http.submission import ScansRequest, admit, kept_scans, monitor, stop_if_open, submit
+from service.api.http.submission import (
+    ScansRequest,
+    admit,
+    delete,
+    kept_scans,
+    lane,
+    monitor,
+    stop_if_open,
+    submit,
+)
 from service.catalog import blob_keys
 from service.catalog.records import Anchor, Built, JobRecord, MapRecord, MapStatus
 
@@ -158,10 +167,10 @@ class MapList(Document):
 async def create_map(request: HttpRequest, response: Response, services: Provided) -> AcceptedMap:
     """From scans uploaded before (`scan_ids`) or sent here (`scans`); their poses, where given, set the frame of the map."""
     await run_in_threadpool(admit, services)
-    async with bodies.received(request, services.settings) as body:
+    async with bodies.received(request, services) as body:
         wanted = checked(MapRequest, body.fields)
         require_map(request, wanted.id)
-        record, job = await run_in_threadpool(_create, services, wanted, body)
+        record, job = await lane(services, body).run(_create, services, wanted, body)
     links = [link(request, f"/maps/{record.map_id}", "self"), monitor(request, response, job)]
     return AcceptedMap(map_id=record.map_id, job_id=job.job_id, status=record.status, links=links)
 
@@ -184,12 +193,9 @@ def get_map(request: HttpRequest, services: Provided, map_id: MapId) -> MapDocum
 
 
 @router.delete("/maps/{map_id}", status_code=204, summary="Delete a map", responses=NAMED)
-def delete_map(services: Provided, map_id: MapId) -> None:
+async def delete_map(services: Provided, map_id: MapId) -> None:
     """With its versions, surveys, jobs and files; jobs that still run are stopped first. Its scans stay."""
-    services.catalog.maps.get(map_id)
-    for job in services.catalog.jobs.unfinished(map_id):
-        stop_if_open(services, job.job_id)
-    services.catalog.maps.delete(map_id)
+    await delete(services, _delete, services, map_id)
 
 
 @router.get(
@@ -198,9 +204,10 @@ def delete_map(services: Provided, map_id: MapId) -> None:
     response_model=dict[str, Any],
     responses={200: {"description": "The tile manifest, fields as in Table A1 of the paper"}, **MADE},
 )
-def get_manifest(services: Provided, map_id: MapId) -> Response:
+async def get_manifest(services: Provided, map_id: MapId) -> Response:
     """Tile size, bounds, and every tile that is kept."""
-    return manifest_response(services, services.catalog.maps.ready(map_id).job_id)
+    ready = await run_in_threadpool(services.catalog.maps.ready, map_id)
+    return await manifest_response(services, ready.job_id)
 
 
 @router.get(
@@ -209,9 +216,10 @@ def get_manifest(services: Provided, map_id: MapId) -> Response:
     response_class=Response,
     responses=files.documented(bodies.RAW, "The fused reference map, PLY") | MADE,
 )
-def get_map_cloud(services: Provided, map_id: MapId) -> Response:
+async def get_map_cloud(services: Provided, map_id: MapId) -> Response:
     """The fused reference map, in metres."""
-    return cloud_response(services, services.catalog.maps.ready(map_id).job_id, f"{map_id}.ply")
+    ready = await run_in_threadpool(services.catalog.maps.ready, map_id)
+    return await cloud_response(services, ready.job_id, f"{map_id}.ply")
 
 
 @router.put(
@@ -222,16 +230,16 @@ def get_map_cloud(services: Provided, map_id: MapId) -> Response:
 )
 async def put_anchor(request: HttpRequest, services: Provided, map_id: MapId) -> MapDocument:
     """From now on every feature of the map, old or new, carries its footprint in WGS 84 as `geometry`."""
-    async with bodies.received(request, services.settings, takes=(bodies.JSON,)) as body:
+    async with bodies.received(request, services, takes=(bodies.JSON,), needs_space=False) as body:
         wanted = checked(AnchorRequest, body.fields)
-    record = await run_in_threadpool(services.catalog.maps.set_anchor, map_id, wanted)
+    record = await services.writes.run(services.catalog.maps.set_anchor, map_id, wanted)
     return map_document(record, request)
 
 
 @router.delete("/maps/{map_id}/anchor", status_code=204, summary="Take a map off the Earth", responses=NAMED)
-def delete_anchor(services: Provided, map_id: MapId) -> None:
+async def delete_anchor(services: Provided, map_id: MapId) -> None:
     """Features have no `geometry` then; once more changes nothing."""
-    services.catalog.maps.set_anchor(map_id, None)
+    await services.writes.run(services.catalog.maps.set_anchor, map_id, None)
 
 
 def _create(services: Services, wanted: MapRequest, body: Body) -> tuple[MapRecord, JobRecord]:
@@ -248,6 +256,13 @@ def _create(services: Services, wanted: MapRequest, body: Body) -> tuple[MapReco
         )
         submit(services, job, forget=lambda: catalog.maps.delete(record.map_id))
     return record, job
+
+
+def _delete(services: Services, map_id: str) -> None:
+    services.catalog.maps.get(map_id)
+    for job in services.catalog.jobs.unfinished(map_id):
+        stop_if_open(services, job.job_id)
+    services.catalog.maps.delete(map_id)
 
 
 def map_document(record: MapRecord, request: HttpRequest) -> MapDocument:
@@ -275,12 +290,12 @@ def file_links(request: HttpRequest, here: str) -> list[Link]:
     ]
 
 
-def manifest_response(services: Services, job_id: str) -> Response:
+async def manifest_response(services: Services, job_id: str) -> Response:
     """Answer with the tile manifest of the version that a job built."""
-    return blob_response(services.catalog.blobs, blob_keys.map_manifest(job_id), media_type=bodies.JSON)
+    return await blob_response(services.catalog.blobs, blob_keys.map_manifest(job_id), media_type=bodies.JSON)
 
 
-def cloud_response(services: Services, job_id: str, filename: str) -> Response:
+async def cloud_response(services: Services, job_id: str, filename: str) -> Response:
     """Answer with the cloud of the version that a job built."""
     key = blob_keys.map_cloud(job_id)
-    return blob_response(services.catalog.blobs, key, media_type=bodies.RAW, filename=filename)
+    return await blob_response(services.catalog.blobs, key, media_type=bodies.RAW, filename=filename)

@@ -7,7 +7,6 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Path, Query, Response
 from fastapi import Request as HttpRequest
-from fastapi.concurrency import run_in_threadpool
 from pydantic import Field
 
 from service.api.http import bodies
@@ -86,9 +85,9 @@ async def train_model(
 
     Its threshold is chosen on a part of the map that was kept out of training. Surveys then name the model.
     """
-    async with bodies.received(request, services.settings, takes=(bodies.JSON,)) as body:
+    async with bodies.received(request, services, takes=(bodies.JSON,)) as body:
         wanted = checked(TrainingRequest, body.fields)
-    record, job = await run_in_threadpool(_create, services, map_id, wanted, maps_of_key(request))
+    record, job = await services.writes.run(_create, services, map_id, wanted, maps_of_key(request))
     return AcceptedModel(
         model=record.model,
         map_id=map_id,

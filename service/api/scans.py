@@ -7,7 +7,6 @@ from typing import Annotated
 
 from fastapi import APIRouter, Path, Query, Response
 from fastapi import Request as HttpRequest
-from fastapi.concurrency import run_in_threadpool
 from pydantic import Field
 
 from service.api.http import bodies
@@ -17,6 +16,7 @@ from service.api.http.documents import Document, Link, Request, checked
 from service.api.http.fields import DeviceId, Id, Instant, Pose, Text
 from service.api.http.paging import PageRequest, list_links
 from service.api.http.problems import BODY, LISTED, NAMED, documented
+from service.api.http.submission import delete, lane
 from service.catalog.catalog import Catalog
 from service.catalog.records import ScanRecord
 from service.errors import BadRequest
@@ -85,13 +85,13 @@ async def upload_scan(
     checked(ScanRequest, query, place="query")  # before a long upload
     async with bodies.received(
         request,
-        services.settings,
+        services,
         takes=(bodies.RAW, bodies.FORM),
         files="file",
         filename=asked.filename,
     ) as body:
         wanted = checked(ScanRequest, {**query, **body.fields})
-        record, is_new = await run_in_threadpool(_keep, services.catalog, body, wanted)
+        record, is_new = await lane(services, body).run(_keep, services.catalog, body, wanted)
     response.status_code = 201 if is_new else 200
     response.headers["Location"] = f"{request.scope.get('root_path', '')}/scans/{record.scan_id}"
     return ScanDocument.of_row(record)
@@ -117,9 +117,9 @@ def get_scan(services: Provided, scan_id: Annotated[Id, Path()]) -> ScanDocument
     summary="Delete a scan",
     responses=documented("not_found", "conflict", "invalid_request"),
 )
-def delete_scan(services: Provided, scan_id: Annotated[Id, Path()]) -> None:
+async def delete_scan(services: Provided, scan_id: Annotated[Id, Path()]) -> None:
     """Only while no map or survey rests on it."""
-    services.catalog.scans.delete(scan_id)
+    await delete(services, services.catalog.scans.delete, scan_id)
 
 
 def _keep(catalog: Catalog, body: Body, wanted: ScanRequest) -> tuple[ScanRecord, bool]:

@@ -21,7 +21,16 @@ from service.api.http.fields import DeviceId, Id, Instant, Model
 from service.api.http.files import blob_response
 from service.api.http.paging import PageRequest, list_links
 from service.api.http.problems import BODY, MADE, NAMED, JobProblem, documented
-from service.api.http.submission import ScansRequest, admit, kept_scans, monitor, stop_if_open, submit
+from service.api.http.submission import (
+    ScansRequest,
+    admit,
+    delete,
+    kept_scans,
+    lane,
+    monitor,
+    stop_if_open,
+    submit,
+)
 from service.catalog import blob_keys
 from service.catalog.records import JobRecord, MapRecord, SurveyRecord, SurveyStatus
 
@@ -80,9 +89,9 @@ async def create_survey(
     """Of scans uploaded before (`scan_ids`) or sent here (`scans`), with the version of the map that is in use now."""
     reference = await run_in_threadpool(services.catalog.maps.ready, map_id)  # before a long upload
     await run_in_threadpool(admit, services)
-    async with bodies.received(request, services.settings) as body:
+    async with bodies.received(request, services) as body:
         wanted = checked(SurveyRequest, body.fields)
-        record, job = await run_in_threadpool(
+        record, job = await lane(services, body).run(
             _create, services, reference, wanted, body, maps_of_key(request)
         )
     return AcceptedSurvey(
@@ -121,13 +130,12 @@ def get_survey(request: HttpRequest, services: Provided, survey_id: SurveyId) ->
     summary="Delete a survey",
     responses=documented("not_found", "conflict", "invalid_request"),
 )
-def delete_survey(services: Provided, survey_id: SurveyId) -> None:
+async def delete_survey(services: Provided, survey_id: SurveyId) -> None:
     """With its job and files; a job that still runs is stopped first. Its scans stay.
 
     Versions of the map that took the survey over stay as well; while one is being built of it, this is a conflict.
     """
-    stop_if_open(services, services.catalog.surveys.get(survey_id).job_id)
-    services.catalog.surveys.delete(survey_id)
+    await delete(services, _delete, services, survey_id)
 
 
 @router.get(
@@ -152,10 +160,10 @@ def get_tiles(request: HttpRequest, services: Provided, survey_id: SurveyId) -> 
     response_class=Response,
     responses=files.documented(bodies.RAW, "The current map coloured by result, PLY") | MADE,
 )
-def get_survey_cloud(services: Provided, survey_id: SurveyId) -> Response:
+async def get_survey_cloud(services: Provided, survey_id: SurveyId) -> Response:
     """With the scalar fields `change_score` and `tile_state` beside the colours."""
-    services.catalog.surveys.ready(survey_id)
-    return blob_response(
+    await run_in_threadpool(services.catalog.surveys.ready, survey_id)
+    return await blob_response(
         services.catalog.blobs,
         blob_keys.survey_cloud(survey_id),
         media_type=bodies.RAW,
@@ -169,11 +177,12 @@ def get_survey_cloud(services: Provided, survey_id: SurveyId) -> Response:
     response_class=Response,
     responses=files.documented("image/png", "Top view of the map, tiles by state") | MADE,
 )
-def get_picture(services: Provided, survey_id: SurveyId) -> Response:
+async def get_picture(services: Provided, survey_id: SurveyId) -> Response:
     """Top view of the map with objects and tiles by state; where every scan was refused, the map and why."""
-    if not _refused(services.catalog.surveys.get(survey_id)):
-        services.catalog.surveys.ready(survey_id)
-    return blob_response(services.catalog.blobs, blob_keys.survey_picture(survey_id), media_type="image/png")
+    if not _refused(await run_in_threadpool(services.catalog.surveys.get, survey_id)):
+        await run_in_threadpool(services.catalog.surveys.ready, survey_id)
+    key = blob_keys.survey_picture(survey_id)
+    return await blob_response(services.catalog.blobs, key, media_type="image/png")
 
 
 def _refused(survey: SurveyRecord) -> bool:
@@ -203,6 +212,11 @@ def _create(
         )
         submit(services, job, forget=lambda: catalog.surveys.delete(record.survey_id))
     return record, job
+
+
+def _delete(services: Services, survey_id: str) -> None:
+    stop_if_open(services, services.catalog.surveys.get(survey_id).job_id)
+    services.catalog.surveys.delete(survey_id)
 
 
 def survey_document(record: SurveyRecord, request: HttpRequest) -> SurveyDocument:

@@ -16,7 +16,7 @@ from service.api.http.documents import Document, Link, checked, link
 from service.api.http.fields import Id
 from service.api.http.paging import PageRequest, list_links
 from service.api.http.problems import BODY, MADE, NAMED, JobProblem, documented
-from service.api.http.submission import ScansRequest, admit, kept_scans, monitor, submit
+from service.api.http.submission import ScansRequest, admit, delete, kept_scans, lane, monitor, submit
 from service.api.maps import BuiltDocument, MapId, cloud_response, file_links, manifest_response
 from service.catalog.records import JobRecord, MapStatus, VersionRecord
 
@@ -74,9 +74,9 @@ async def create_version(
     """
     await run_in_threadpool(services.catalog.maps.ready, map_id)  # before a long upload
     await run_in_threadpool(admit, services)
-    async with bodies.received(request, services.settings) as body:
+    async with bodies.received(request, services) as body:
         wanted = checked(VersionRequest, body.fields)
-        record, job = await run_in_threadpool(_create, services, map_id, wanted, body)
+        record, job = await lane(services, body).run(_create, services, map_id, wanted, body)
     here = link(request, f"/maps/{map_id}/versions/{record.version}", "self")
     return AcceptedVersion(
         map_id=map_id,
@@ -113,12 +113,12 @@ def get_version(request: HttpRequest, services: Provided, map_id: MapId, number:
     summary="Delete a version of a map",
     responses=documented("not_found", "conflict", "invalid_request"),
 )
-def delete_version(services: Provided, map_id: MapId, number: Number) -> None:
+async def delete_version(services: Provided, map_id: MapId, number: Number) -> None:
     """With its job and files. Surveys that were compared with it stay readable, and so do its scans.
 
     The version in use, one that builds and one that a survey is being compared with are a conflict.
     """
-    services.catalog.versions.delete(map_id, number)
+    await delete(services, services.catalog.versions.delete, map_id, number)
 
 
 @router.get(
@@ -127,9 +127,10 @@ def delete_version(services: Provided, map_id: MapId, number: Number) -> None:
     response_model=dict[str, Any],
     responses={200: {"description": "The tile manifest, fields as in Table A1 of the paper"}, **MADE},
 )
-def get_version_manifest(services: Provided, map_id: MapId, number: Number) -> Response:
+async def get_version_manifest(services: Provided, map_id: MapId, number: Number) -> Response:
     """Tile size, bounds, and every tile that is kept; a place has the same tile id in every version."""
-    return manifest_response(services, services.catalog.versions.ready(map_id, number).job_id)
+    version = await run_in_threadpool(services.catalog.versions.ready, map_id, number)
+    return await manifest_response(services, version.job_id)
 
 
 @router.get(
@@ -138,10 +139,10 @@ def get_version_manifest(services: Provided, map_id: MapId, number: Number) -> R
     response_class=Response,
     responses=files.documented(bodies.RAW, "The fused reference map, PLY") | MADE,
 )
-def get_version_cloud(services: Provided, map_id: MapId, number: Number) -> Response:
+async def get_version_cloud(services: Provided, map_id: MapId, number: Number) -> Response:
     """The fused reference map, in metres."""
-    job_id = services.catalog.versions.ready(map_id, number).job_id
-    return cloud_response(services, job_id, f"{map_id}-{number}.ply")
+    version = await run_in_threadpool(services.catalog.versions.ready, map_id, number)
+    return await cloud_response(services, version.job_id, f"{map_id}-{number}.ply")
 
 
 def _create(

@@ -5,6 +5,13 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 
+ROOTS = (
+    "scans",
+    "maps",
+    "models",
+    "surveys",
+)  #: in each a folder for each row that keeps files; what lies beside is of no account
+
 _UNSAFE = re.compile(r"[^A-Za-z0-9._-]+")
 
 
@@ -28,6 +35,11 @@ def scan_file(scan_id: str, token: str, filename: str) -> str:
 def folder_of(key: str) -> str:
     """Name the prefix of a key and of what lies beside it."""
     return key.rsplit("/", 1)[0] + "/"
+
+
+def owner_of(key: str) -> str:
+    """Name the folder of the id that a blob belongs to, such as `surveys/survey-91c4/`."""
+    return "/".join(key.split("/")[:2]) + "/"
 
 
 def probe(token: str) -> str:

@@ -8,11 +8,13 @@ from service.catalog import history
 from service.catalog.blobs import Blobs
 from service.catalog.changes import Changes
 from service.catalog.database import Database
+from service.catalog.disk import BALLAST_BYTES, Disk
 from service.catalog.jobs import Jobs
 from service.catalog.keys import Keys
 from service.catalog.maps import Maps
 from service.catalog.models import Models
 from service.catalog.objects import Objects
+from service.catalog.patience import JOBS, REQUESTS, Patience
 from service.catalog.scans import Scans
 from service.catalog.surveys import Surveys
 from service.catalog.versions import Versions
@@ -25,6 +27,7 @@ class Catalog:
 
     database: Database
     blobs: Blobs
+    disk: Disk
     scans: Scans
     maps: Maps
     versions: Versions
@@ -40,19 +43,23 @@ class Catalog:
         self.database.close()
 
 
-def open_catalog(settings: Settings, *, migrate: bool = True) -> Catalog:
+def open_catalog(settings: Settings, *, migrate: bool = True, patience: Patience = JOBS) -> Catalog:
     """Open the catalog that `settings` name; `migrate` brings its tables up to date first.
 
-    A process that forks opens the catalog in the child: a connection to PostgreSQL does not survive a fork.
+    A process that forks opens the catalog in the child: a connection to PostgreSQL does not survive a fork. One that
+    answers requests opens it with the patience of those, and keeps it open.
     """
-    database = Database(settings.resolved_database_url())
+    keep_open = patience is REQUESTS
+    database = Database(settings.resolved_database_url(), patience=patience, keep_open=keep_open)
+    disk = disk_of(settings)
     if migrate:
-        database.upgrade()
+        disk.freeing(database.upgrade)  # where it is full, the log of the database alone may not fit
         history.catch_up(database)
-    blobs = Blobs(settings.resolved_blob_url())
+    blobs = Blobs(settings.resolved_blob_url(), patience=patience)
     return Catalog(
         database=database,
         blobs=blobs,
+        disk=disk,
         scans=Scans(database, blobs),
         maps=Maps(database, blobs),
         versions=Versions(database, blobs),
@@ -63,3 +70,10 @@ def open_catalog(settings: Settings, *, migrate: bool = True) -> Catalog:
         jobs=Jobs(database),
         keys=Keys(database),
     )
+
+
+def disk_of(settings: Settings) -> Disk:
+    """Return the disk of the data folder, with a ballast where the database lies on it."""
+    settings.data_dir.mkdir(parents=True, exist_ok=True)
+    is_ours = settings.resolved_database_url().startswith("sqlite")
+    return Disk(settings.data_dir, reserve=settings.min_free_bytes, ballast=BALLAST_BYTES if is_ours else 0)

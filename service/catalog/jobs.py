@@ -20,7 +20,7 @@ from typing import Any, cast
 from sqlalchemy import ColumnElement, CursorResult, func, select, update
 from sqlalchemy.orm import Session
 
-from service.catalog import history, tables
+from service.catalog import history, tables, tallies
 from service.catalog.database import Database
 from service.catalog.records import JobRecord, JobStatus, Page, Position, Problem
 from service.catalog.steps import STEPS, JobKind, Step, first_step, step_after, step_of
@@ -34,6 +34,17 @@ _LONGEST_DELAY_S = 30.0  #: before a step that was interrupted again and again
 WORKER_DIED = "worker_died"  #: code of the problem of a job that is given up
 
 _OPEN = tables.Job.status.in_(("accepted", "running"))
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class OpenSteps:
+    """Steps of one name that wait, or that run."""
+
+    kind: JobKind
+    step: str  #: empty: the first one
+    waits: bool
+    count: int
+    since: datetime  #: when the oldest came due, or began
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -109,6 +120,18 @@ class Jobs:
         with self._database.read() as session:
             return dict(session.execute(query).all())
 
+    def open_steps(self) -> tuple[OpenSteps, ...]:
+        """Count the steps that wait and those that run, by kind of job and step, with the oldest of each."""
+        table = tables.Job
+        waits, since = table.begun.is_(None), func.min(func.coalesce(table.begun, table.due, table.created))
+        query = select(table.kind, table.step, waits, func.count(), since).where(_OPEN)
+        with self._database.read() as session:
+            rows = session.execute(query.group_by(table.kind, table.step, waits)).all()
+        return tuple(
+            OpenSteps(kind=cast("JobKind", kind), step=step, waits=bool(waits), count=count, since=since)
+            for kind, step, waits, count, since in rows
+        )
+
     def open_jobs(self) -> tuple[OpenJob, ...]:
         """Return all that has not ended, in the order they were asked for."""
         job = tables.Job
@@ -170,12 +193,13 @@ class Jobs:
     def advance(self, run: Run) -> bool:
         """Go on to the step behind one that ended well; False when the job had ended, or another run has the step."""
         with self._database.write() as session:
-            kind = session.scalar(select(tables.Job.kind).where(tables.Job.job_id == run.job_id))
-            following = None if kind is None else step_after(cast("JobKind", kind), run.step)
+            ran = _ran(session, run.job_id)
+            following = None if ran is None else step_after(ran.kind, run.step)
             if following is None:
                 return False
             fresh = {"attempts": 0, "interruptions": 0, "updated": now()}
-            return _changed(session, run.job_id, {"step": following.name, **fresh, **_due()}, *_of_run(run))
+            values = {"step": following.name, **fresh, **_due()}
+            return _changed(session, run.job_id, values, *_of_run(run), ran=ran, outcome="successful")
 
     def succeed(self, job_id: str) -> bool:
         """Mark the job as done and its map's version, survey or model as ready; False when it had ended or gone."""
@@ -205,12 +229,14 @@ class Jobs:
         """
         count = tables.Job.attempts
         with self._database.write() as session:
+            ran = _ran(session, job_id)
             attempts = _counted(session, job_id, step, count)
-            if attempts is None:
+            if attempts is None or ran is None:
                 return False
+            tallies.tally_attempt(session, kind=ran.kind, step=step)
             if attempts < MAX_ATTEMPTS:
                 message = f"started again ({attempts + 1} of {MAX_ATTEMPTS}): {reason}"
-                return _changed(session, job_id, {**_started(message), **_due()})
+                return _changed(session, job_id, {**_started(message), **_due()}, ran=ran, outcome="lost")
         self._give_up(job_id, step, f"{reason}; given up after {attempts} attempts")
         return False
 
@@ -221,19 +247,24 @@ class Jobs:
         """
         same = () if begun is None else (tables.Job.begun == begun,)
         with self._database.write() as session:
+            ran = _ran(session, job_id)
             times = _counted(session, job_id, step, tables.Job.interruptions, *same)
-            if times is None:
+            if times is None or ran is None:
                 return False
+            tallies.tally_interruption(session, kind=ran.kind, step=step)
             if times < MAX_INTERRUPTIONS:
                 delay = min(2.0 ** (times - 3), _LONGEST_DELAY_S) if times > 3 else 0.0
                 message = f"interrupted, goes on with the next worker that is free: {reason}"
-                return _changed(session, job_id, {**_started(message), **_due(delay)})
+                values = {**_started(message), **_due(delay)}
+                return _changed(session, job_id, values, ran=ran, outcome="interrupted")
         self._give_up(job_id, step, f"{reason}; given up after {times} interruptions")
         return False
 
     def put_back(self, job_id: str, step: str, message: str) -> bool:
         """Have a step wait again that gave way; False when the job had ended, gone, or gone on."""
-        return self._advance(job_id, tables.Job.step == step, **_started(message), **_due())
+        with self._database.write() as session:
+            ran, values = _ran(session, job_id), {**_started(message), **_due()}
+            return _changed(session, job_id, values, tables.Job.step == step, ran=ran, outcome="put_back")
 
     def _give_up(self, job_id: str, step: str, detail: str) -> None:
         problem = Problem(code=WORKER_DIED, detail=f"{detail}, look at the worker's log and memory")
@@ -254,8 +285,12 @@ class Jobs:
                 tables.Map, job.map_id, with_for_update=True
             )  # map, then survey, then job: in one order
             ended = {"status": status, "finished": instant, "updated": instant, "begun": None, "due": None}
-            if not _changed(session, job_id, {**values, **ended}, *where):
+            problem = values.get("problem")
+            outcome = status if problem is None else problem["code"]
+            ran = _ran(session, job_id)
+            if not _changed(session, job_id, {**values, **ended}, *where, ran=ran, outcome=outcome):
                 return False
+            tallies.tally_job(session, kind=job.kind, outcome=outcome)
             subject = _subject(session, job)
             if subject is not None:
                 subject.status = "ready" if status == "successful" else "failed"
@@ -335,6 +370,39 @@ def _row(session: Session, job_id: str) -> tables.Job:
     return row
 
 
-def _changed(session: Session, job_id: str, values: dict[str, Any], *where: ColumnElement[bool]) -> bool:
+@dataclass(frozen=True, kw_only=True, slots=True)
+class _Ran:
+    """The step that a job is at, and its times."""
+
+    kind: JobKind
+    step: str
+    due: datetime | None
+    begun: datetime | None
+
+
+def _ran(session: Session, job_id: str) -> _Ran | None:
+    """Return what the job is at, before that is changed."""
+    job = tables.Job
+    row = session.execute(select(job.kind, job.step, job.due, job.begun).where(job.job_id == job_id)).first()
+    if row is None:
+        return None
+    return _Ran(kind=cast("JobKind", row.kind), step=row.step, due=row.due, begun=row.begun)
+
+
+def _changed(
+    session: Session,
+    job_id: str,
+    values: dict[str, Any],
+    *where: ColumnElement[bool],
+    ran: _Ran | None = None,
+    outcome: str = "",
+) -> bool:
+    """Change an open job where that holds, and tell whether it did; a step that `ran` and ends so is tallied."""
     statement = update(tables.Job).where(tables.Job.job_id == job_id, _OPEN, *where).values(values)
-    return cast("CursorResult[Any]", session.execute(statement)).rowcount == 1
+    if cast("CursorResult[Any]", session.execute(statement)).rowcount != 1:
+        return False
+    if ran is not None and ran.begun is not None:
+        waited, took = ran.begun - (ran.due or ran.begun), now() - ran.begun
+        times = {"waited_s": waited.total_seconds(), "ran_s": took.total_seconds()}
+        tallies.tally_step(session, kind=ran.kind, step=ran.step, outcome=outcome, **times)
+    return True

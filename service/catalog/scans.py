@@ -18,7 +18,7 @@ from service.catalog import blob_keys, tables
 from service.catalog.blobs import Blobs
 from service.catalog.database import Database
 from service.catalog.records import Matrix, Page, Position, ScanFormat, ScanOutcome, ScanRecord
-from service.errors import BadRequest, Conflict, NotFound
+from service.errors import BadRequest, Conflict, DiskFull, NotFound
 
 Row = TypeVar("Row", tables.VersionScan, tables.SurveyScan)
 
@@ -121,14 +121,24 @@ class Scans:
         with contextlib.suppress(IntegrityError):
             self._forget(tables.Scan.key == added.key, tables.Scan.resent.is_(None))
 
+    def forget(self, scan_id: str, condition: ColumnElement[bool]) -> bool:
+        """Delete a scan with its file if a condition on its row holds; False where not, or where something uses it."""
+        try:
+            return self._forget(tables.Scan.scan_id == scan_id, condition)
+        except IntegrityError:
+            return False
+
     def _insert(self, row: tables.Scan) -> tuple[ScanRecord, bool]:
-        """Record a scan whose file is kept, unless the same upload came a moment earlier. Raises Conflict."""
+        """Record a scan whose file is kept, unless the same upload came a moment earlier. Raises Conflict, DiskFull."""
         scan_id, key = row.scan_id, row.key
         try:
             with self._database.write() as session:
                 session.add(row)
                 session.flush()
                 return ScanRecord.of_row(row), True
+        except DiskFull:  # which says for sure that no row was kept, as a lost connection does not
+            self._blobs.delete_prefix(blob_keys.folder_of(key))
+            raise
         except IntegrityError:
             self._blobs.delete_prefix(blob_keys.folder_of(key))
             if known := self._sent_again(scan_id):
@@ -177,6 +187,11 @@ def scans_in_order(session: Session, scan_ids: Sequence[str]) -> tuple[ScanRecor
 def outcome_columns(outcome: ScanOutcome) -> dict[str, Any]:
     """Return the columns of an outcome, less its scan."""
     return outcome.model_dump(mode="json", exclude={"scan_id"})
+
+
+def known_outcomes(rows: Iterable[Row]) -> list[str]:
+    """Return the ids of the scans of which it is known what became of them."""
+    return [row.scan_id for row in rows if row.accepted is not None]
 
 
 def write_outcomes(rows: Iterable[Row], outcomes: Iterable[ScanOutcome]) -> None:

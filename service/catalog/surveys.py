@@ -10,7 +10,7 @@ from typing import get_args
 from sqlalchemy import delete, select
 from sqlalchemy.orm import Session, selectinload
 
-from service.catalog import blob_keys, history, tables
+from service.catalog import blob_keys, history, tables, tallies
 from service.catalog.blobs import Blobs
 from service.catalog.database import Database
 from service.catalog.jobs import new_job
@@ -26,7 +26,7 @@ from service.catalog.records import (
     TileRecord,
     TileState,
 )
-from service.catalog.scans import checked_scan_ids, scans_in_order, write_outcomes
+from service.catalog.scans import checked_scan_ids, known_outcomes, scans_in_order, write_outcomes
 from service.catalog.tables import Survey, SurveyObject, SurveyTile, new_id, now
 from service.catalog.versions import map_row, version_in_use
 from service.errors import Conflict, NotFound, NotReady
@@ -107,8 +107,10 @@ class Surveys:
 
         `placement` is None where nobody judged it.
         """
+        outcomes = tuple(outcomes)
         with self._database.write() as session:
             row = _row(session, survey_id)
+            tallies.tally_outcomes(session, "survey", outcomes, known_outcomes(row.scans))
             write_outcomes(row.scans, outcomes)
             row.placement = None if placement is None else placement.model_dump()
             row.updated = now()
@@ -139,6 +141,8 @@ class Surveys:
         with self._database.write() as session:
             row = _locked(session, survey_id)
             _check_doubt(row, by_state, told=told)
+            if not row.counts:  # the first run of the step that tells them
+                tallies.tally_tiles(session, row.model, tiles)
             _replace_tiles(session, survey_id, tiles)
             _replace_objects(session, survey_id, things)
             row.threshold = threshold

@@ -8,12 +8,18 @@ from typing import Any
 from sqlalchemy import Select, delete, exists, func, select
 from sqlalchemy.orm import Session, aliased, contains_eager, selectinload
 
-from service.catalog import blob_keys, tables
+from service.catalog import blob_keys, tables, tallies
 from service.catalog.blobs import Blobs
 from service.catalog.database import Database
 from service.catalog.jobs import new_job
 from service.catalog.records import Bounds, JobRecord, Page, Position, ScanOutcome, VersionRecord
-from service.catalog.scans import checked_scan_ids, outcome_columns, scans_in_order, write_outcomes
+from service.catalog.scans import (
+    checked_scan_ids,
+    known_outcomes,
+    outcome_columns,
+    scans_in_order,
+    write_outcomes,
+)
 from service.catalog.tables import MapVersion, now
 from service.errors import BadRequest, Conflict, NotFound, NotReady
 
@@ -78,8 +84,10 @@ class Versions:
 
     def save_outcomes(self, job_id: str, outcomes: Iterable[ScanOutcome]) -> None:
         """Record what became of the scans, also when the version then fails. Raises NotFound."""
+        outcomes = tuple(outcomes)
         with self._database.write() as session:
             row = _row_of_job(session, job_id)
+            tallies.tally_outcomes(session, "map", outcomes, known_outcomes(row.scans))
             write_outcomes(row.scans, outcomes)
             row.updated = now()
 
@@ -96,8 +104,10 @@ class Versions:
 
         Raises NotFound, also where the version was deleted since.
         """
+        outcomes = tuple(outcomes)
         with self._database.write() as session:
             row = _row_of_job(session, job_id)
+            tallies.tally_outcomes(session, "map", outcomes, known_outcomes(row.scans))
             write_outcomes(row.scans, outcomes)
             row.bounds = bounds.model_dump(mode="json")
             row.counts = dict(counts)

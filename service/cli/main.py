@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from service.cli import jobs, keys, maps, models, objects, scans, surveys, up, versions
+from service.cli import backups, jobs, keys, maps, models, objects, scans, surveys, sweep, up, versions
 from service.cli.terminal import Terminal
 from service.client import DEFAULT_URL, ClientError
 from service.up.embedded_redis import LaunchFailed
@@ -37,6 +37,9 @@ def _commands() -> typer.Typer:
     )
     commands.callback()(_options)
     commands.command()(up.up)
+    commands.command()(sweep.sweep)
+    commands.command()(backups.backup)
+    commands.command()(backups.restore)
     _add_group(commands, "scans", "Upload scans.", scans.add)
     _add_group(commands, "maps", "Reference maps.", maps.create, maps.list_, maps.show, maps.delete)
     of_versions = (versions.add, versions.list_, versions.show, versions.delete)

@@ -49,7 +49,7 @@ def up(
         geometry_workers=geometry_workers,
         inference_workers=inference_workers,
     )
-    set_up_logging(settings.log_level)
+    set_up_logging(settings.log_level, settings.log_format)
 
     def ready(running: Running) -> None:
         if ready_file is not None:

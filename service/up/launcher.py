@@ -25,6 +25,7 @@ from typing import Any, Self
 import uvicorn
 from fastapi import FastAPI
 
+from service.catalog.catalog import disk_of
 from service.catalog.database import Database
 from service.catalog.jobs import Jobs
 from service.catalog.keys import open_keys
@@ -77,6 +78,7 @@ def up(
         stop = stack.enter_context(_Signals())
         stack.enter_context(private_files())
         listening = stack.enter_context(_listen(settings.host, settings.port))
+        _require_space(settings)
         redis = None
         _make_private(settings.data_dir)
         if settings.redis_url is None:
@@ -260,11 +262,26 @@ def _resolve(settings: Settings, redis: EmbeddedRedis | None, listening: socket.
     )
 
 
+def _require_space(settings: Settings) -> None:
+    """Give up the ballast of a full disk. Raises LaunchFailed where there is none, and where the folder cannot be used."""
+    try:
+        enough = disk_of(settings).make_room()
+    except OSError as error:
+        raise LaunchFailed(
+            f"the data folder {settings.data_dir} cannot be used ({error.strerror}); name another with SPICD_DATA_DIR"
+        ) from error
+    if not enough:
+        raise LaunchFailed(
+            f"the disk of the data folder {settings.data_dir} is full: remove what is not the service's from it, or "
+            "enlarge it, and start again; then surveys and maps can be deleted"
+        )
+
+
 def _migrate(settings: Settings) -> None:
     """Migrate the database once, before the API and the workers look at the tables."""
     try:
         database = Database(settings.resolved_database_url())
-        database.upgrade()
+        disk_of(settings).freeing(database.upgrade)
         database.close()
     except Exception as error:  # whatever the driver raises
         raise LaunchFailed(f"the database cannot be opened: {' '.join(str(error).split())}") from error

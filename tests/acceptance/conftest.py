@@ -1,14 +1,20 @@
-"""A service of real processes, and a room that was scanned twice."""
+"""A service of real processes, and a room that was scanned twice.
+
+The same tests run on the parts that come with the service, and on PostgreSQL and S3: on one host, and on two that share
+nothing else but Redis. Where those servers are not installed, these are skipped.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
 
 from tests.support.models import make_untrained
-from tests.support.running_service import ROOT, Service
+from tests.support.running_service import ROOT, OneOfMany, Service, TwoHosts
+from tests.support.servers import shared_parts
 from tests.support.two_visits import Visits, simulated_visits
 
 MODEL = "spicd-net/1"
@@ -25,12 +31,21 @@ def model_store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return store
 
 
-@pytest.fixture(scope="module")
-def service(tmp_path_factory: pytest.TempPathFactory, model_store: Path) -> Iterator[Service]:
-    service = Service(tmp_path_factory.mktemp("service"), model_store)
-    yield service
-    if service.process.poll() is None:
-        service.end()
+@pytest.fixture(scope="module", params=["embedded", "one-host", "two-hosts"])
+def service(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory, model_store: Path
+) -> Iterator[Service]:
+    folder = tmp_path_factory.mktemp("service")
+    with ExitStack() as stack:
+        if request.param == "embedded":
+            service = Service(folder, model_store)
+        else:
+            shared = stack.enter_context(shared_parts(tmp_path_factory.mktemp("shared")))
+            kind = OneOfMany if request.param == "one-host" else TwoHosts
+            service = kind(folder, model_store, **shared)
+        yield service
+        if service.process.poll() is None:
+            service.end()
 
 
 @pytest.fixture(scope="session")

@@ -251,6 +251,8 @@ def _transform(path: Path) -> np.ndarray:
 def test_real_scans_without_a_pose_are_found_within_3_cm_and_half_a_degree(
     service: Service, shared_data: Path, before: str, after: str, truth: str
 ) -> None:
+    if type(service) is not Service:
+        pytest.skip("where the files are kept has no say in this")
     built = service.post("/maps", shared_data / before)
     service.succeeded(built["job_id"])
     accepted = service.post(f"/maps/{built['map_id']}/surveys", shared_data / after)
@@ -276,7 +278,7 @@ def test_a_deleted_map_is_gone_with_its_surveys(
 
 def test_asked_to_end_the_service_leaves_no_process(service: Service) -> None:
     processes = service.processes()
-    assert len(processes) >= 4  # the API, Redis, and a worker of each queue
+    assert len(processes) >= service.least
     service.end()
     assert service.process.returncode == 0
     left = [pid for pid in processes if Path(f"/proc/{pid}/cmdline").exists()]

@@ -138,7 +138,7 @@ def started(folder: Path, workers: int) -> Service:
     """Start the service on a folder, for the first time or again."""
     (folder / "ready.json").unlink(missing_ok=True)
     (folder / "tmp").mkdir(exist_ok=True)
-    settings = {"SPICD_GEOMETRY_WORKERS": str(workers), "SPICD_MIN_FREE_BYTES": "0"}
+    settings = {"geometry_workers": workers, "min_free_bytes": 0}
     return Service(folder, ROOT / "model_store", **settings, TMPDIR=str(folder / "tmp"))
 
 

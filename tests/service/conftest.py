@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,6 +12,18 @@ from fastapi.testclient import TestClient
 from service.catalog.catalog import Catalog, open_catalog
 from service.settings import Settings
 from tests.support.samples import RememberingQueue, catalog_of, running, settings_in
+from tests.support.servers import postgresql
+
+
+@pytest.fixture(scope="session", autouse=True)
+def test_database() -> Iterator[None]:
+    """Start a PostgreSQL for the tests where SPICD_TEST_DATABASE_URL says `postgresql` and no more."""
+    if os.environ.get("SPICD_TEST_DATABASE_URL") != "postgresql":
+        yield
+        return
+    with postgresql() as server, pytest.MonkeyPatch.context() as patch:
+        patch.setenv("SPICD_TEST_DATABASE_URL", server.url("postgres"))
+        yield
 
 
 @pytest.fixture

@@ -23,12 +23,19 @@ ORDER = ("accepted", "running", "successful", "failed", "dismissed")
 class Service:
     """`spicd up`, and its API as a client sees it."""
 
-    def __init__(self, folder: Path, model_store: Path, **settings: str) -> None:
+    #: processes at least: the API, Redis, and a worker of each queue
+    least = 4
+
+    def __init__(self, folder: Path, model_store: Path, **settings: str | int) -> None:
+        """Start it in `folder`; `settings` are those of SPICD_*, and what begins with AWS_ or is TMPDIR."""
         ready, self.log = folder / "ready.json", folder / "log"
         command = [sys.executable, "-m", "service", "up", "--port", "0", "--end-with-parent"]
         command += ["--data-dir", str(folder / "data"), "--ready-file", str(ready)]
         environment = {key: value for key, value in os.environ.items() if not key.startswith("SPICD_")}
-        environment |= {"SPICD_MODEL_STORE": str(model_store), **settings}
+        environment["SPICD_MODEL_STORE"] = str(model_store)
+        for name, value in settings.items():
+            as_it_is = name.startswith("AWS_") or name == "TMPDIR"
+            environment[name if as_it_is else f"SPICD_{name.upper()}"] = str(value)
         with self.log.open("ab") as log:
             self.process = subprocess.Popen(command, cwd=ROOT, env=environment, stdout=log, stderr=log)
         until = time.monotonic() + STARTS_WITHIN_S
@@ -91,3 +98,33 @@ class Service:
     def end(self) -> None:
         self.process.send_signal(signal.SIGTERM)
         self.process.wait(ENDS_WITHIN_S)
+
+
+class OneOfMany(Service):
+    """A host that has Redis, PostgreSQL and S3 elsewhere."""
+
+    least = 3
+
+
+class TwoHosts(Service):
+    """Two hosts that share Redis, PostgreSQL and S3, and no folder: every job crosses from one to the other.
+
+    The first has the API that the tests ask and the worker of the geometry queue, the second that of the inference
+    queue, and an API as well.
+    """
+
+    least = 4
+
+    def __init__(self, folder: Path, model_store: Path, **settings: str | int) -> None:
+        first, second = folder / "first", folder / "second"
+        first.mkdir()
+        second.mkdir()
+        super().__init__(first, model_store, **{**settings, "inference_workers": 0})
+        self.other = Service(second, model_store, **{**settings, "geometry_workers": 0})
+
+    def processes(self) -> set[int]:
+        return super().processes() | self.other.processes()
+
+    def end(self) -> None:
+        self.other.end()
+        super().end()

@@ -1,7 +1,7 @@
 """What the tests of the service put into the catalog, and a queue that only remembers.
 
 The tests run on SQLite. With SPICD_TEST_DATABASE_URL (a PostgreSQL server, any database of it) each test makes a
-database of its own there, and leaves it.
+database of its own there, and leaves it; where it says `postgresql` alone, a server is started for the tests.
 """
 
 from __future__ import annotations

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
+from service import tracing
 from service.catalog.catalog import Catalog, open_catalog
 from service.catalog.jobs import Run
 from service.catalog.records import JobRecord, Problem
@@ -79,7 +80,7 @@ def step(run: Callable[[Context], None]) -> Callable[[str], None]:
     @functools.wraps(run)
     def call(job_id: str) -> None:
         settings = Settings()
-        with ExitStack() as stack:
+        with tracing.step(job_id, run.__name__), ExitStack() as stack:
             catalog = open_catalog(settings, migrate=False)
             stack.callback(catalog.close)
             begun = _begun(catalog, job_id, run.__name__)
@@ -125,6 +126,7 @@ def _context(settings: Settings, catalog: Catalog, job: JobRecord, run: Run, scr
 
 
 def _report(catalog: Catalog, run: Run, stage: str, share: float) -> bool:
+    tracing.stage(stage)
     return catalog.jobs.report(run, message=stage, progress=share)
 
 

@@ -20,10 +20,11 @@ from pydantic import BaseModel
 from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import MultipartParser, parse_options_header
 
+from service.api.http.dependencies import Services
 from service.api.http.json_text import read_json
 from service.api.http.uploads import Incoming, Upload
-from service.errors import BadRequest, TooLarge, TooSlow, WrongMediaType
-from service.settings import Settings
+from service.catalog.disk import Disk
+from service.errors import BadRequest, DiskFull, TooLarge, TooSlow, WrongMediaType, is_disk_full
 
 PIECE = 1 << 18  #: bytes handed to the disk at a time; each upload holds as many in memory
 MAX_JSON_BYTES = 1 << 20
@@ -51,17 +52,21 @@ class Body:
 @contextlib.asynccontextmanager
 async def received(
     request: Request,
-    settings: Settings,
+    services: Services,
     *,
     takes: tuple[str, ...] = (JSON, FORM),
     files: str = "scans",
     filename: str | None = None,
+    needs_space: bool = True,
 ) -> AsyncIterator[Body]:
     """Receive the body of a request in one of the media types `takes`.
 
-    `files` names the form field of files; `filename` that of a raw body. Raises WrongMediaType, TooLarge,
-    BadRequest, ScanUnreadable; leaves nothing behind whichever way it ends.
+    `files` names the form field of files; `filename` that of a raw body. `needs_space` is said of a request that makes
+    anything larger than its row. Raises WrongMediaType, TooLarge, BadRequest, ScanUnreadable, DiskFull; leaves nothing
+    behind whichever way it ends.
     """
+    settings = services.settings
+    disk = services.catalog.disk if needs_space else None
     media_type, options = _media_type(request)
     if media_type not in takes:
         said = media_type or "no media type"
@@ -70,6 +75,8 @@ async def received(
     limit = MAX_JSON_BYTES if media_type == JSON else settings.max_upload_bytes
     seconds = MAX_JSON_S if media_type == JSON else settings.upload_timeout_s
     await run_in_threadpool(folder.mkdir, parents=True, exist_ok=True)
+    if disk is not None:
+        await run_in_threadpool(disk.require, 0 if media_type == JSON else _declared(request, limit))
     kept = ExitStack()
     try:
         if media_type == JSON:
@@ -84,12 +91,12 @@ async def received(
                     f"the boundary has more than {MAX_BOUNDARY} letters (RFC 2046, Section 5.1.1)"
                 )
             form = Form(options[b"boundary"], folder, kept, frozenset({files}))
-            await _pour(request, form.feed, limit=limit, seconds=seconds)
+            await _pour(request, form.feed, limit=limit, seconds=seconds, disk=disk)
             form.finish()
             yield Body(fields=form.fields, uploads=tuple(form.uploads))
         else:
             file = kept.enter_context(Incoming(folder, filename or ""))
-            await _pour(request, file.write, limit=limit, seconds=seconds)
+            await _pour(request, file.write, limit=limit, seconds=seconds, disk=disk)
             yield Body(uploads=(await run_in_threadpool(file.finish),))
     finally:
         await run_in_threadpool(kept.close)
@@ -121,24 +128,40 @@ def _reference(model: type[BaseModel]) -> dict[str, str]:
     return {"$ref": f"#/components/schemas/{model.__name__}"}
 
 
-async def _pour(request: Request, take: Callable[[bytes], None], *, limit: int, seconds: float) -> None:
-    """Hand the body to `take` in pieces, in a thread. Raises TooLarge as soon as it is, and TooSlow.
+def _declared(request: Request, limit: int) -> int:
+    """Return how long the body says it is, in bytes, 0 where it does not. Raises TooLarge."""
+    declared = request.headers.get("content-length", "")
+    if not (declared.isascii() and declared.isdigit()):
+        return 0
+    if len(declared) > 18 or int(declared) > limit:
+        raise TooLarge(f"the body has {declared[:40]} bytes, more than the {limit} that are taken")
+    return int(declared)
 
-    The server ends a body that stalls before that, see service/up/connections.py.
+
+async def _pour(
+    request: Request,
+    take: Callable[[bytes], None],
+    *,
+    limit: int,
+    seconds: float,
+    disk: Disk | None = None,
+) -> None:
+    """Hand the body to `take` in pieces, in a thread.
+
+    Raises TooLarge and DiskFull as soon as it is, also without a length, and TooSlow. The server ends a body that
+    stalls before that, see service/up/connections.py.
     """
     try:
         async with asyncio.timeout(seconds) as clock:
-            await _stream(request, take, limit)
+            await _stream(request, take, limit, disk)
     except TimeoutError as error:
         if not clock.expired():  # a disk has time limits too
             raise
         raise TooSlow(f"the body took longer than {seconds:g} s; send less at a time") from error
 
 
-async def _stream(request: Request, take: Callable[[bytes], None], limit: int) -> None:
-    declared = request.headers.get("content-length", "")
-    if declared.isascii() and declared.isdigit() and (len(declared) > 18 or int(declared) > limit):
-        raise TooLarge(f"the body has {declared[:40]} bytes, more than the {limit} that are taken")
+async def _stream(request: Request, take: Callable[[bytes], None], limit: int, disk: Disk | None) -> None:
+    _declared(request, limit)
     size = 0
     piece = bytearray()
     async for chunk in request.stream():
@@ -147,10 +170,23 @@ async def _stream(request: Request, take: Callable[[bytes], None], limit: int) -
             raise TooLarge(f"the body has more than the {limit} bytes that are taken")
         piece += chunk
         if len(piece) >= PIECE:
-            await run_in_threadpool(take, bytes(piece))
+            await run_in_threadpool(_hand_on, take, bytes(piece), disk)
             piece.clear()
     if piece:
-        await run_in_threadpool(take, bytes(piece))
+        await run_in_threadpool(_hand_on, take, bytes(piece), disk)
+
+
+def _hand_on(take: Callable[[bytes], None], piece: bytes, disk: Disk | None) -> None:
+    if disk is not None:
+        disk.require(len(piece))
+    try:
+        take(piece)
+    except OSError as error:
+        if not is_disk_full(error):
+            raise
+        raise DiskFull(
+            "the disk of the data folder is full; delete surveys or maps, or enlarge it"
+        ) from error
 
 
 def _media_type(request: Request) -> tuple[str, dict[bytes, bytes]]:

@@ -24,7 +24,14 @@ from service.settings import Settings
 SAFE_METHODS = frozenset(
     {"GET", "HEAD", "OPTIONS"}
 )  #: change nothing (RFC 9110, Section 9.2.1), here as well
-EXPOSED_HEADERS = ("Location", "Content-Disposition", "ETag", "Retry-After", "WWW-Authenticate")
+EXPOSED_HEADERS = (
+    "Location",
+    "Content-Disposition",
+    "ETag",
+    "Retry-After",
+    "WWW-Authenticate",
+    "X-Request-ID",
+)
 _HOST = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[^\s:\[\]/@]+)(?::\d*)?")
 
 
@@ -36,7 +43,7 @@ def add_cross_site_checks(app: FastAPI, settings: Settings) -> None:
             CORSMiddleware,
             allow_origins=origins,
             allow_methods=("GET", "POST", "PUT", "DELETE"),
-            allow_headers=("Authorization", "Content-Type"),
+            allow_headers=("Authorization", "Content-Type", "X-Request-ID"),
             expose_headers=EXPOSED_HEADERS,
         )
     app.add_middleware(CrossSiteMiddleware, hosts=allowed_hosts(settings), origins=frozenset(origins))

@@ -8,6 +8,7 @@ from typing import Annotated, Protocol, cast
 from fastapi import Depends, Request
 
 from service.api.http.cards import Cards
+from service.api.http.lanes import Lane
 from service.catalog.catalog import Catalog
 from service.catalog.steps import JobKind
 from service.dispatch import Dispatcher, Hands
@@ -33,9 +34,11 @@ class Services:
     queue: Queue
     dispatcher: Dispatcher
     cards: Cards
+    writes: Lane  #: threads of what changes something; reads have the framework's
+    uploads: Lane  #: and of what takes files into the blob store besides, which lasts longer
 
 
-def _services(request: Request) -> Services:
+async def _services(request: Request) -> Services:
     return cast("Services", request.app.state.services)
 
 

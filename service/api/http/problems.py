@@ -15,7 +15,7 @@ from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 
 from service.catalog.records import Problem
-from service.errors import ServiceError
+from service.errors import ServiceError, Unavailable, is_disk_full
 
 log = logging.getLogger(__name__)
 
@@ -96,7 +96,18 @@ def problem_of(problem: Problem | None) -> ProblemDocument | None:
 JobProblem = Annotated[ProblemDocument | None, BeforeValidator(problem_of)]
 
 #: What may be wrong with any body; documented in this order.
-BODY = ("incomplete_body", "too_slow", "too_large", "wrong_media_type", "bad_request", "invalid_request")
+BODY = (
+    "incomplete_body",
+    "too_slow",
+    "too_large",
+    "wrong_media_type",
+    "bad_request",
+    "invalid_request",
+    "disk_full",
+    "unavailable",
+    "database_unavailable",
+    "blobs_unavailable",
+)
 
 
 def response(
@@ -107,6 +118,9 @@ def response(
     status = 500 if status is None else status
     content = {"type": _type(code), "title": title, "status": status, "detail": detail, **members}
     return JSONResponse(content, status, headers=headers, media_type=MEDIA_TYPE)
+
+
+_RETRY_AFTER = {"description": "seconds, where it helps to wait", "schema": {"type": "integer"}}
 
 
 def documented(*codes: str) -> dict[int | str, dict[str, Any]]:
@@ -122,8 +136,13 @@ def documented(*codes: str) -> dict[int | str, dict[str, Any]]:
             "description": meaning if known is None else f"{known['description']}; {meaning}",
             "content": {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/ProblemDocument"}}},
         }
+        if status in (429, 503):
+            answers[status]["headers"] = {"Retry-After": _RETRY_AFTER}
     return answers
 
+
+#: What any route may answer that needs the database or the blob store.
+OUTAGES = documented("database_unavailable", "blobs_unavailable", "unavailable")
 
 #: The answers of a route that names one thing, of one that lists, and of one that gives what a job makes.
 NAMED = documented("not_found", "invalid_request")
@@ -142,8 +161,16 @@ def add_handlers(app: FastAPI) -> None:
 
 def _service_error(_request: Request, error: Exception) -> Response:
     code = error.code if isinstance(error, ServiceError) and error.code in PROBLEMS else "internal"
-    headers = {"WWW-Authenticate": 'Bearer realm="spicd"'} if code == "unauthorized" else None  # RFC 6750, 3
-    return response(code, str(error), headers=headers)
+    if isinstance(error, Unavailable) and is_disk_full(error):  # Redis says that it cannot write
+        return response(
+            "disk_full", "the disk of the job queue is full; delete surveys or maps, or enlarge it"
+        )
+    headers = {}
+    if code == "unauthorized":
+        headers["WWW-Authenticate"] = 'Bearer realm="spicd"'  # RFC 6750, Section 3
+    if (wait := getattr(error, "retry_after_s", None)) is not None:
+        headers["Retry-After"] = str(wait)
+    return response(code, str(error), headers=headers or None)
 
 
 def _invalid(_request: Request, error: Exception) -> Response:

@@ -3,26 +3,32 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import logging
 import threading
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
-from typing import Annotated, Self
+from typing import Annotated, ParamSpec, Self
 
 from fastapi import Request as HttpRequest
 from fastapi import Response
 from pydantic import BeforeValidator, Field
 
+from service import tracing
 from service.api.http.bodies import Body
 from service.api.http.dependencies import Services
 from service.api.http.documents import Link, Request, link
 from service.api.http.fields import MAX_LISTED, DeviceId, Id, Instant, names_from_text
+from service.api.http.lanes import Lane
 from service.catalog.catalog import Catalog
 from service.catalog.records import JobRecord, ScanRecord
 from service.dispatch import Dispatcher
 from service.errors import QueueFull, QueueUnavailable, ServiceError, Unavailable
+from service.logs import about
 
 log = logging.getLogger(__name__)
+
+P = ParamSpec("P")
 
 
 class ScansRequest(Request):
@@ -83,7 +89,9 @@ def submit(services: Services, job: JobRecord, *, forget: Callable[[], None]) ->
     except BaseException:
         forget()
         raise
-    log.info("job %s (%s) waits", job.job_id, job.kind)
+    tracing.link_job(job.job_id)
+    with about(job_id=job.job_id):  # the one line that has the ids of request and job
+        log.info("the %s job waits", job.kind)
 
 
 class Ticker:
@@ -128,6 +136,16 @@ def dismiss(services: Services, job_id: str) -> JobRecord:
     except QueueUnavailable as error:
         log.warning("job %s is dismissed, but the queue was not told: %s", job_id, error)
     return job
+
+
+def lane(services: Services, body: Body) -> Lane:
+    """Return the threads in which a request is carried out: files take their time, and hold up no other write."""
+    return services.uploads if body.uploads else services.writes
+
+
+async def delete(services: Services, call: Callable[P, None], *args: P.args, **kwargs: P.kwargs) -> None:
+    """Delete something, in a thread, also where no space is left to note that it is gone."""
+    await services.writes.run(services.catalog.disk.freeing, functools.partial(call, *args, **kwargs))
 
 
 def stop_if_open(services: Services, job_id: str) -> None:

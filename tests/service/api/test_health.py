@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import json
 import shutil
+import threading
 
+import pytest
 from fastapi.testclient import TestClient
 from sqlalchemy import text
 
+from service.api.http.monitor import HealthMonitor, Part
 from service.api.http.problems import MEDIA_TYPE
 from service.catalog.catalog import Catalog
 from service.settings import Settings
+from tests.support.processes import until
 from tests.support.samples import RememberingQueue, add_map
 
 
@@ -44,21 +48,48 @@ def test_a_healthy_service_names_its_parts(client: TestClient) -> None:
     )
 
 
+@pytest.mark.slow
 def test_a_part_that_fails_is_named_and_the_others_stay_ok(
     client: TestClient, catalog: Catalog, queue: RememberingQueue, settings: Settings
 ) -> None:
+    def seen(part: str, check: str) -> bool:
+        """Whether the monitor, which asks every two seconds, has come to this."""
+        return bool(client.get("/health/ready").json()["checks"][part] == check)
+
     queue.down = True
+    until(lambda: seen("queue", "failed"))
     answer = client.get("/health/ready")
     assert (answer.status_code, answer.headers["content-type"]) == (503, MEDIA_TYPE)
     assert answer.json()["checks"] == {"database": "ok", "queue": "failed", "blobs": "ok"}
+    assert answer.json()["reasons"] == {"queue": "the job queue does not answer"}
     queue.down = False
     shutil.rmtree(settings.data_dir / "blobs")
     (settings.data_dir / "blobs").write_text("in the way")
-    assert client.get("/health/ready").json()["checks"]["blobs"] == "failed"
+    until(lambda: seen("blobs", "failed"))
     with catalog.database.write() as session:
         session.execute(text("ALTER TABLE jobs RENAME TO gone"))
-    assert client.get("/health/ready").json()["checks"]["database"] == "failed"
+    until(lambda: seen("database", "failed"))
+    until(lambda: seen("queue", "ok"))
     assert client.get("/health/live").status_code == 200
+
+
+def test_a_part_that_hangs_is_told_of_and_nobody_waits_for_it() -> None:
+    gate = threading.Event()
+    parts = {
+        "hangs": Part(ping=lambda: assert_true(gate.wait(60)), limit_s=0.1),
+        "well": Part(ping=lambda: None),
+    }
+    monitor = HealthMonitor(parts)
+    monitor.start()
+    until(lambda: (monitor.failures()["hangs"] or "").startswith("no answer for"))
+    assert monitor.failures()["well"] is None
+    gate.set()
+    until(lambda: monitor.failures()["hangs"] is None)
+    monitor.stop()
+
+
+def assert_true(value: bool) -> None:
+    assert value
 
 
 def test_metrics_count_requests_by_route_and_jobs_by_state(client: TestClient, catalog: Catalog) -> None:

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import errno
+import tempfile
+import time
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -11,6 +14,9 @@ import pytest
 
 from service.catalog import blob_keys
 from service.catalog.blobs import Blobs
+from service.catalog.patience import Patience
+from service.errors import BlobsUnavailable
+from tests.support.servers import SilentServer, free_port, s3_environment
 
 
 @pytest.fixture
@@ -154,3 +160,59 @@ def test_a_description_belongs_to_one_model() -> None:
     assert key == "maps/lobby/description-spicd-net-1-0123456789ab.npz"
     assert key != blob_keys.map_embedding("lobby", "spicd-net/2", "0123456789abcdef")
     assert key != blob_keys.map_embedding("lobby", "spicd-net/1", "fedcba9876543210")
+
+
+HASTY = Patience(connect_s=1, lock_s=1, statement_s=1, blob_s=0.5, blob_request_s=1, blob_retry_s=0.2)
+HALF_AN_ANSWER = (
+    b'HTTP/1.1 200 OK\r\nContent-Length: 100000\r\nETag: "a"\r\nLast-Modified: \
+Sun, 01 Mar 2026 12:00:00 GMT\r\n\r\n'
+    + bytes(1000)
+)
+
+
+@pytest.fixture
+def hanging(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[Blobs]:
+    """A store in S3 that takes connections and never answers, or stalls within the answer."""
+    server = SilentServer(getattr(request, "param", b""))
+    for name, value in server.as_s3().items():
+        monkeypatch.setenv(name, value)
+    yield Blobs("s3://bucket/prefix", patience=HASTY)
+    server.close()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "ask",
+    [
+        lambda blobs: blobs.ping(),
+        lambda blobs: blobs.get_bytes("a/b"),
+        lambda blobs: blobs.size("a/b"),
+        lambda blobs: blobs.put_bytes("a/b", b"x"),
+        lambda blobs: list(blobs.stream("a/b")),
+        lambda blobs: blobs.under("a/"),
+        lambda blobs: blobs.delete_prefix("a/"),
+    ],
+)
+def test_a_store_that_never_answers_is_given_up(hanging: Blobs, ask: Any) -> None:
+    started = time.monotonic()
+    with pytest.raises(BlobsUnavailable, match="no answer in time"):
+        ask(hanging)
+    assert time.monotonic() - started < 10
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("hanging", [HALF_AN_ANSWER], indirect=True)
+def test_a_stream_that_stalls_is_given_up_and_its_copy_goes(
+    hanging: Blobs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    with pytest.raises(BlobsUnavailable), hanging.local("a/b"):
+        pass
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_store_that_is_not_there_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, value in s3_environment(free_port()).items():
+        monkeypatch.setenv(name, value)
+    with pytest.raises(BlobsUnavailable, match="connection refused"):
+        Blobs("s3://bucket/prefix", patience=HASTY).ping()

@@ -13,8 +13,13 @@ from pathlib import Path
 import pytest
 from redis import Redis
 
+from service.catalog.steps import STEPS
+from service.errors import QueueUnavailable, is_disk_full
+from service.queue import JobQueue
 from service.up import embedded_redis
 from service.up.embedded_redis import DataFolderInUse, EmbeddedRedis, LaunchFailed, find_server
+from tests.support.processes import until
+from tests.support.small_disk import small_disk
 
 ROOT = Path(__file__).parents[3]
 HOLDER = """
@@ -98,3 +103,40 @@ def test_a_server_that_does_not_start_is_named_with_its_log(
     monkeypatch.setattr(embedded_redis, "find_server", lambda: Path("/bin/false"))
     with pytest.raises(LaunchFailed, match=r"redis\.log"):
         EmbeddedRedis(tmp_path / "redis").start()
+
+
+REGISTER = STEPS["survey"][0]
+
+
+def test_on_a_full_disk_the_queue_takes_no_job_says_why_and_recovers(tmp_path: Path) -> None:
+    with small_disk(tmp_path / "disk", 48) as disk, EmbeddedRedis(disk.folder / "redis") as redis:
+        queue = JobQueue(redis.url)
+        queue.arrange("geometry", [("job-before", REGISTER)])
+        disk.fill()
+
+        def refused() -> bool:
+            """Whether a job is refused; Redis notices when it writes its file, once a second."""
+            try:
+                queue.arrange(
+                    "geometry", [("job-before", REGISTER), (f"job-{time.monotonic_ns()}", REGISTER)]
+                )
+            except QueueUnavailable as error:
+                assert is_disk_full(error)
+                return True
+            return False
+
+        until(refused)
+        assert "job-before-register" in queue.snapshot().held  # who reads is answered
+        disk.clear()
+        until(lambda: not refused())
+        queue.ping()
+        queue.close()
+
+
+def test_on_a_full_disk_it_starts(tmp_path: Path) -> None:
+    with small_disk(tmp_path / "disk", 48) as disk:
+        with EmbeddedRedis(disk.folder / "redis") as redis:
+            JobQueue(redis.url).arrange("geometry", [("job-before", REGISTER)])
+        disk.fill(leave=4 << 20)
+        with EmbeddedRedis(disk.folder / "redis") as redis:
+            assert "job-before-register" in JobQueue(redis.url).snapshot().held

@@ -14,7 +14,15 @@ from fastapi.testclient import TestClient
 from service.api.http.problems import MEDIA_TYPE, PROBLEMS
 from service.catalog.catalog import Catalog
 from service.catalog.maps import Maps
-from service.errors import ServiceError
+from service.errors import (
+    BlobsUnavailable,
+    DatabaseUnavailable,
+    DiskFull,
+    NotFound,
+    QueueFull,
+    QueueUnavailable,
+    ServiceError,
+)
 from tests.support.samples import (
     MODEL,
     RememberingQueue,
@@ -233,3 +241,42 @@ def test_a_problem_of_a_survey_that_ran_is_no_problem_of_the_request(
     answer = client.get(f"/surveys/{survey_id}")
     assert (answer.status_code, answer.json()["problem"]["type"]) == (200, "urn:spicd:problem:dismissed")
     assert answer.json()["model"] == MODEL
+
+
+@pytest.mark.parametrize(
+    ("error", "status", "wait"),
+    [
+        (QueueUnavailable("x"), 503, "5"),
+        (DatabaseUnavailable("x"), 503, "5"),
+        (BlobsUnavailable("x"), 503, "5"),
+        (QueueFull("x"), 429, "30"),
+        (DiskFull("x"), 507, None),
+        (NotFound("x"), 404, None),
+    ],
+)
+def test_who_may_come_again_is_told_when(
+    client: TestClient,
+    catalog: Catalog,
+    monkeypatch: pytest.MonkeyPatch,
+    error: ServiceError,
+    status: int,
+    wait: str,
+) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise error
+
+    monkeypatch.setattr(Maps, "page", fail)
+    answer = client.get("/maps")
+    problem(answer, status, error.code)
+    assert answer.headers.get("Retry-After") == wait
+
+
+def test_a_queue_whose_disk_is_full_is_a_full_disk(
+    client: TestClient, catalog: Catalog, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object, **__: object) -> None:
+        cause = RuntimeError("MISCONF Errors writing to the AOF file: No space left on device")
+        raise QueueUnavailable("the job queue does not answer") from cause
+
+    monkeypatch.setattr(Maps, "page", fail)
+    problem(client.get("/maps"), 507, "disk_full")

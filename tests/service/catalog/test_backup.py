@@ -1,0 +1,193 @@
+"""A copy of everything, taken while things come and go, and a service made of it."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from sqlalchemy import select
+
+from service.catalog import blob_keys, tables
+from service.catalog.backup import BackupFailed, backup, restore
+from service.catalog.catalog import Catalog, open_catalog
+from service.catalog.tables import Base
+from service.cli import main
+from service.settings import Settings
+from tests.support.processes import until
+from tests.support.samples import NOON, add_map, add_scan, add_survey, place, thing, tile
+from tests.support.servers import shared_parts
+
+
+def fill(catalog: Catalog) -> None:
+    """A map, a survey that is done, and one that is not."""
+    job = add_map(catalog, "lobby")
+    for key in (blob_keys.map_cloud, blob_keys.map_reference, blob_keys.map_manifest):
+        catalog.blobs.put_bytes(key(job), b"built")
+    objects = [thing(1, now=place(1, 1))]
+    survey, _ = add_survey(
+        catalog, [tile(0, 0, observed_share=0.9), tile(1, 0, "unobserved")], objects=objects
+    )
+    catalog.blobs.put_bytes(blob_keys.survey_cloud(survey), b"compared")
+    _, running = add_survey(catalog, captured_at=NOON.replace(hour=13), ready=False)
+    run = catalog.jobs.begin(running, "register")
+    assert run is not None
+    catalog.jobs.report(run, message="scoring", progress=0.5)
+
+
+def content(catalog: Catalog) -> dict[str, list[tuple[object, ...]]]:
+    """Every row of every table, but those of jobs, which begin anew."""
+    with catalog.database.read() as session:
+        return {
+            table.name: sorted((tuple(row) for row in session.execute(select(table))), key=repr)
+            for table in Base.metadata.sorted_tables
+            if table.name != "jobs"
+        }
+
+
+def blobs(catalog: Catalog) -> dict[str, bytes]:
+    keys = [key for root in blob_keys.ROOTS for key in catalog.blobs.under(f"{root}/")]
+    return {key: catalog.blobs.get_bytes(key) for key in keys}
+
+
+@pytest.fixture(params=["folder", pytest.param("elsewhere", marks=pytest.mark.slow)])
+def other(
+    request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[Settings]:
+    """Where a copy goes: a data folder, or PostgreSQL and S3."""
+    if request.param == "folder":
+        yield Settings(data_dir=tmp_path / "other")
+        return
+    (tmp_path / "shared").mkdir()
+    with shared_parts(tmp_path / "shared") as parts:
+        for name, value in parts.items():
+            if name.startswith("AWS_"):
+                monkeypatch.setenv(name, value)
+        yield Settings(
+            data_dir=tmp_path / "other", database_url=parts["database_url"], blob_url=parts["blob_url"]
+        )
+
+
+def test_a_service_made_of_a_copy_has_what_the_first_one_had(
+    catalog: Catalog, settings: Settings, other: Settings, tmp_path: Path
+) -> None:
+    fill(catalog)
+    made = backup(settings, tmp_path / "copy")
+    assert (made.missing, made.rows["surveys"], made.blobs) == ((), 2, len(blobs(catalog)))
+    restore(other, tmp_path / "copy")
+    restored = open_catalog(other)
+    assert content(restored) == content(catalog)
+    assert blobs(restored) == blobs(catalog)
+    with pytest.raises(BackupFailed, match="not empty"):
+        restore(other, tmp_path / "copy")
+    backup(other, tmp_path / "again")  # and from there to a copy
+    assert (tmp_path / "again/tables/surveys.jsonl").read_text() == (
+        tmp_path / "copy/tables/surveys.jsonl"
+    ).read_text()
+    restored.close()
+
+
+def test_a_job_that_had_not_ended_begins_anew(catalog: Catalog, settings: Settings, tmp_path: Path) -> None:
+    fill(catalog)
+    (unfinished,) = catalog.jobs.unfinished()
+    backup(settings, tmp_path / "copy")
+    other = Settings(data_dir=tmp_path / "other")
+    restore(other, tmp_path / "copy")
+    restored = open_catalog(other)
+    (again,) = restored.jobs.unfinished()
+    assert (again.job_id, again.status, again.progress) == (unfinished.job_id, "accepted", 0)
+    with restored.database.read() as session:
+        row = session.get_one(tables.Job, again.job_id)
+        assert (row.step, row.attempts, row.begun, row.owner) == ("register", 0, None, None)
+    restored.close()
+
+
+@pytest.mark.slow
+def test_of_a_copy_taken_while_surveys_come_and_go_every_row_has_its_files(
+    catalog: Catalog, settings: Settings, tmp_path: Path
+) -> None:
+    fill(catalog)
+    ended = threading.Event()
+    rounds: list[str] = []
+
+    def come_and_go() -> None:
+        while not ended.is_set():
+            scan = add_scan(catalog, f"scan-{len(rounds)}")
+            survey, job = catalog.surveys.create("lobby", scan_ids=[scan.scan_id], model="spicd-net/1")
+            catalog.blobs.put_bytes(blob_keys.survey_cloud(survey.survey_id), bytes(200_000))
+            catalog.surveys.save_result(survey.survey_id, tiles=[tile(0, 0)], threshold=0.5)
+            catalog.jobs.succeed(job.job_id)
+            rounds.append(survey.survey_id)
+            if len(rounds) > 5:
+                catalog.surveys.delete(rounds[-5])
+
+    robots = threading.Thread(target=come_and_go)
+    robots.start()
+    try:
+        until(lambda: len(rounds) > 10)
+        copies = [tmp_path / f"copy-{number}" for number in range(3)]
+        made = [backup(settings, copy) for copy in copies]
+    finally:
+        ended.set()
+        robots.join()
+    for number, (copy, sealed) in enumerate(zip(copies, made, strict=True)):
+        assert sealed.missing == ()
+        other = Settings(data_dir=tmp_path / f"other-{number}")
+        restore(other, copy)
+        restored = open_catalog(other)
+        for survey in restored.surveys.page("lobby").items:
+            if survey.status == "ready":
+                assert restored.blobs.exists(blob_keys.survey_cloud(survey.survey_id))
+            for scan in survey.scans:
+                assert restored.blobs.exists(restored.scans.get(scan.scan_id).key)
+        restored.close()
+
+
+def test_what_is_no_whole_copy_is_not_restored(catalog: Catalog, settings: Settings, tmp_path: Path) -> None:
+    fill(catalog)
+    backup(settings, tmp_path / "copy")
+    with pytest.raises(BackupFailed, match="is not empty"):
+        backup(settings, tmp_path / "copy")
+    (tmp_path / "copy" / "backup.json").unlink()
+    with pytest.raises(BackupFailed, match="holds no whole backup"):
+        restore(Settings(data_dir=tmp_path / "other"), tmp_path / "copy")
+
+
+def test_files_that_are_nowhere_are_named(catalog: Catalog, settings: Settings, tmp_path: Path) -> None:
+    fill(catalog)
+    catalog.blobs.delete_prefix("surveys/")
+    (missing,) = backup(settings, tmp_path / "copy").missing
+    assert missing.endswith("/cloud.ply")
+
+
+def test_the_commands_copy_and_restore(
+    catalog: Catalog,
+    settings: Settings,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    fill(catalog)
+    if settings.database_url is not None:
+        monkeypatch.setenv("SPICD_DATABASE_URL", settings.database_url)
+    run("backup", str(tmp_path / "copy"), "--data-dir", str(settings.data_dir))
+    monkeypatch.delenv("SPICD_DATABASE_URL", raising=False)
+    run("restore", str(tmp_path / "copy"), "--data-dir", str(tmp_path / "other"))
+    restored = open_catalog(Settings(data_dir=tmp_path / "other"))
+    assert restored.maps.get("lobby").status == "ready"
+    restored.close()
+    assert "surveys" in capsys.readouterr().out
+    with pytest.raises(SystemExit) as ended:
+        run("backup", str(tmp_path / "copy"), "--data-dir", str(settings.data_dir))
+    assert ended.value.code == 1
+    assert "is not empty" in capsys.readouterr().err
+
+
+def run(*words: str) -> None:
+    """Run one command, which ends with status 0 or raises."""
+    try:
+        main(list(words))
+    except SystemExit as ended:
+        if ended.code not in (0, None):
+            raise
