@@ -34,7 +34,6 @@ T = TypeVar("T")
 
 FIRST_REVISION = "0005"  #: the tables of release 0.1, see migrations/versions
 _MIGRATION_LOCK = 0x53504943  #: any number that every process of ours agrees on ("SPIC")
-_MARGIN_S = 2.0  #: by which a client outwaits the limit that it gave the server
 #: sqlite.org, result codes: BUSY, LOCKED, IOERR, CANTOPEN, PROTOCOL. The others are faults of ours.
 _SQLITE_OUTAGES = (5, 6, 10, 14, 15)
 
@@ -216,9 +215,9 @@ def _engine(url: URL, patience: Patience) -> Engine:
         url,
         pool_pre_ping=True,
         pool_timeout=patience.lock_s,
-        connect_args=postgresql.limits(patience),
+        connect_args=postgresql.parameters(patience),
     )
-    event.listen(engine, "do_connect", postgresql.connecting(patience.statement_s + _MARGIN_S))
+    postgresql.limit(engine, patience)
     return engine
 
 

@@ -23,7 +23,9 @@ from tests.support.samples import (
 )
 from tests.support.servers import Locked, SilentServer, postgresql
 
-HASTY = Patience(connect_s=1, lock_s=1, statement_s=1, blob_s=0.5, blob_request_s=1, blob_retry_s=0.2)
+HASTY = Patience(
+    connect_s=1, lock_s=1, statement_s=1, write_s=3, blob_s=0.5, blob_request_s=1, blob_retry_s=0.2
+)
 
 
 @pytest.fixture

@@ -162,7 +162,9 @@ def test_a_description_belongs_to_one_model() -> None:
     assert key != blob_keys.map_embedding("lobby", "spicd-net/1", "fedcba9876543210")
 
 
-HASTY = Patience(connect_s=1, lock_s=1, statement_s=1, blob_s=0.5, blob_request_s=1, blob_retry_s=0.2)
+HASTY = Patience(
+    connect_s=1, lock_s=1, statement_s=1, write_s=3, blob_s=0.5, blob_request_s=1, blob_retry_s=0.2
+)
 HALF_AN_ANSWER = (
     b'HTTP/1.1 200 OK\r\nContent-Length: 100000\r\nETag: "a"\r\nLast-Modified: \
 Sun, 01 Mar 2026 12:00:00 GMT\r\n\r\n'

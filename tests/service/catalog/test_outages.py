@@ -16,7 +16,9 @@ from service.catalog.patience import Patience
 from service.errors import DatabaseUnavailable
 from tests.support.servers import PostgreSQL, postgresql
 
-HASTY = Patience(connect_s=2, lock_s=0.2, statement_s=1, blob_s=0.5, blob_request_s=1, blob_retry_s=0.1)
+HASTY = Patience(
+    connect_s=2, lock_s=0.2, statement_s=1, write_s=3, blob_s=0.5, blob_request_s=1, blob_retry_s=0.1
+)
 
 
 def hasty(url: str) -> Database:
@@ -102,6 +104,12 @@ def test_a_frozen_postgresql_is_given_up_and_found_again(server: PostgreSQL, pos
 def test_a_statement_that_takes_too_long_is_an_outage(postgres: Database) -> None:
     with pytest.raises(DatabaseUnavailable, match="QueryCanceled"), postgres.read() as session:
         session.execute(text("SELECT pg_sleep(20)"))
+    with postgres.write() as session:
+        session.execute(text("SELECT pg_sleep(2)"))  # who writes has longer
+    with pytest.raises(DatabaseUnavailable, match="QueryCanceled"), postgres.write() as session:
+        session.execute(text("SELECT pg_sleep(20)"))
+    with pytest.raises(DatabaseUnavailable, match="QueryCanceled"), postgres.read() as session:
+        session.execute(text("SELECT pg_sleep(2)"))  # over the connection that has written
     with pytest.raises(DatabaseUnavailable, match="LockNotAvailable"), postgres.write() as session:
         session.execute(text("LOCK TABLE jobs"))
         with postgres.write() as other:
