@@ -171,7 +171,8 @@ def slope(samples: Sequence[Sample], name: str) -> float:
     ]
     if len(points) < 2:
         return 0.0
-    return float(np.polyfit(*np.transpose(points), 1)[0])
+    hours, sizes = np.transpose(points)
+    return float(np.polyfit(hours, sizes, 1)[0])
 
 
 def report(soak: Soak, grown: list[str]) -> tuple[dict[str, object], dict[str, Any]]:
