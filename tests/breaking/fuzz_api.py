@@ -30,6 +30,7 @@ from fastapi import FastAPI
 
 from service.api.app import create_app
 from service.catalog.catalog import Catalog
+from service.catalog.objects import ObjectFilter
 from tests.breaking.requests import Request, Requests
 from tests.support.findings import Deadline, Findings, add_common, show
 from tests.support.samples import (
@@ -255,12 +256,13 @@ def things(catalog: Catalog) -> dict[str, list[str]]:
     """Return the ids of what is in a catalog, by the names of parameters and fields."""
     maps = [record.map_id for record in catalog.maps.page().items]
     surveys = [record.survey_id for map_id in maps for record in catalog.surveys.page(map_id).items]
+    objects = [each.object_id for each in catalog.objects.page(ObjectFilter(map_id="lobby")).items]
     return {
         "map_id": [*maps, "nowhere"],
         "survey_id": [*surveys, "none"],
         "scan_id": [record.scan_id for record in catalog.scans.page().items] + ["none"],
         "job_id": [record.job_id for record in catalog.jobs.page().items] + ["none"],
-        "object_id": ["1", "2", "obj_1", "none"],
+        "object_id": [*objects, "none"],
         "number": ["1", "2", "3", "99"],
         "name": ["spicd-net/1", "no-such/1"],
         "model": ["spicd-net/1", "no-such/1"],
