@@ -20,6 +20,7 @@ TESTS = Path(__file__).resolve().parent
 SLOW = (
     "acceptance",
     "integration",
+    "test_breaking.py",
     "service/api/http/test_uploads.py",
     "service/api/test_disk_full.py",
     "service/api/test_outages.py",
@@ -54,6 +55,7 @@ SLOW = (
     "worker/pipeline/test_flow.py",
     "worker/pipeline/test_map_update.py",
     "worker/simulation/test_training_set.py",
+    "worker/test_memory.py",
     "worker/training/test_head.py",
     "worker/training/test_publish.py",
     "worker/training/test_trainer.py",

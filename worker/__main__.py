@@ -1,4 +1,7 @@
-"""Starts one worker: `python -m worker geometry` or `python -m worker inference`."""
+"""Starts one worker: `python -m worker geometry` or `python -m worker inference`.
+
+`python -m worker alive geometry` tells whether one of this host answers, for health checks of containers.
+"""
 
 from __future__ import annotations
 
@@ -21,6 +24,7 @@ from service.catalog.jobs import Jobs
 from service.catalog.records import Problem
 from service.catalog.steps import ALLOWED_FUNCTIONS
 from service.dispatch import Dispatcher
+from service.errors import QueueUnavailable
 from service.logs import set_up_logging
 from service.permissions import PRIVATE_UMASK
 from service.queue import JobQueue
@@ -42,7 +46,10 @@ WARM_MODULES = {"geometry": ("open3d", "torch", "worker.jobs"), "inference": ("t
 
 def main(arguments: list[str] | None = None) -> int:
     """Work until told to stop; returns the exit status."""
-    options = _parse(arguments)
+    words = sys.argv[1:] if arguments is None else arguments
+    if words[:1] == ["alive"]:
+        return alive(words[1:])
+    options = _parse(words)
     if options.parent:
         end_with_parent(options.parent)
     os.umask(PRIVATE_UMASK)
@@ -59,7 +66,7 @@ def main(arguments: list[str] | None = None) -> int:
     log.info("%s worker is ready", options.queue)
     records = CatalogRecords(settings)
     kind = GeometryWorker if options.queue == "geometry" else InferenceWorker
-    name = options.name or f"{options.queue}-{socket.gethostname()}-{os.getpid()}-{uuid4().hex[:8]}"
+    name = options.name or f"{_host(options.queue)}{os.getpid()}-{uuid4().hex[:8]}"
 
     redis_url = settings.redis_url
 
@@ -75,6 +82,27 @@ def main(arguments: list[str] | None = None) -> int:
 
     work(make)
     return 0
+
+
+def alive(arguments: list[str]) -> int:
+    """Return 0 where a worker of this host gave a sign of life lately, 1 where none did, or the queue is away."""
+    parser = argparse.ArgumentParser(prog="python -m worker alive", description=alive.__doc__)
+    parser.add_argument("queue", choices=sorted(WARM_MODULES))
+    queue = parser.parse_args(arguments).queue
+    try:
+        answering = JobQueue(Settings().redis_url or "").snapshot()[queue].answering
+    except (QueueUnavailable, ValueError) as error:
+        print(error, file=sys.stderr)
+        return 1
+    if any(name.startswith(_host(queue)) for name in answering):
+        return 0
+    print(f"no {queue} worker of {socket.gethostname()} answers", file=sys.stderr)
+    return 1
+
+
+def _host(queue: str) -> str:
+    """Return what the name of each worker of this host begins with."""
+    return f"{queue}-{socket.gethostname()}-"
 
 
 def work(make: Callable[[], GeometryWorker | InferenceWorker]) -> None:

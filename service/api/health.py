@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Literal
 
 from fastapi import APIRouter, Request, Response
 from prometheus_client import CONTENT_TYPE_LATEST
+from pydantic import Field
 
-from service.api.http.dependencies import Provided, Services
+from service.api.http.dependencies import Provided, Queue, Services
 from service.api.http.documents import Document
 from service.api.http.metrics import Metrics
 from service.api.http.monitor import HealthMonitor, Part
 from service.api.http.problems import documented, response
+from service.errors import QueueUnavailable, Unavailable
+from service.queue import QUEUES
 
 router = APIRouter(tags=["health"])
 
@@ -27,20 +31,36 @@ class Live(Document):
 
 
 class Ready(Document):
-    """Every part answers."""
+    """Every part that a request needs answers."""
 
-    status: Literal["ok"] = "ok"
+    status: Literal["ok", "degraded"] = Field(
+        "ok", description="degraded: it takes work, and workers do not answer, so that jobs wait"
+    )
     checks: dict[str, Check]
+    reasons: dict[str, str] = Field(default_factory=dict, description="why a check failed")
 
 
 def parts(services: Services) -> dict[str, Part]:
     """Return what the service needs, and how each part is asked."""
     blobs = services.catalog.blobs
     return {
+        "workers": Part(ping=functools.partial(_ask_workers, services.queue)),
         "database": Part(ping=services.catalog.database.ping),
         "queue": Part(ping=services.queue.ping),
         "blobs": Part(ping=blobs.ping, every_s=2.0 if blobs.is_local else _ELSEWHERE_S),
     }
+
+
+def _ask_workers(queue: Queue) -> None:
+    """Return where each queue has a worker that answers and none that is silent. Raises Unavailable."""
+    try:
+        snapshot = queue.snapshot()
+    except QueueUnavailable:  # which the part `queue` tells; nothing is known of workers
+        return
+    wrong = [f"no {name} worker answers" for name in QUEUES if not snapshot[name].answering]
+    wrong += [f"{worker} is silent" for name in QUEUES for worker in snapshot[name].silent]
+    if wrong:
+        raise Unavailable("; ".join(wrong))
 
 
 @router.get("/health/live", summary="Is the process alive")
@@ -58,12 +78,15 @@ async def live() -> Live:
 async def ready(request: Request) -> Ready | Response:
     """What the database, the queue and the blob store said when they were asked last, some seconds ago at most.
 
-    `reasons` says of each part that failed why. Never waits for one of them.
+    `reasons` says of each part that failed why. Never waits for one of them. Workers that do not answer make it
+    `degraded` and not a 503: a proxy that took the service out would refuse uploads that it can keep.
     """
     monitor: HealthMonitor = request.app.state.monitor
     failures = monitor.failures()
     checks: dict[str, Check] = {name: "failed" if why else "ok" for name, why in failures.items()}
     reasons = {name: why for name, why in failures.items() if why}
+    if set(reasons) == {"workers"}:  # requests are answered, and what is accepted is not lost
+        return Ready(status="degraded", checks=checks, reasons=reasons)
     if reasons:
         detail = f"no answer from: {', '.join(reasons)}"
         return response("unhealthy", detail, checks=checks, reasons=reasons)

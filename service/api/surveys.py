@@ -92,7 +92,7 @@ async def create_survey(
     async with bodies.received(request, services) as body:
         wanted = checked(SurveyRequest, body.fields)
         record, job = await lane(services, body).run(
-            _create, services, reference, wanted, body, maps_of_key(request)
+            _create, services, reference, wanted, body, maps_of_key(request), request.state.key
         )
     return AcceptedSurvey(
         survey_id=record.survey_id,
@@ -197,8 +197,11 @@ def _create(
     wanted: SurveyRequest,
     body: Body,
     maps: Collection[str] | None,
+    key: str | None,
 ) -> tuple[SurveyRecord, JobRecord]:
-    admit(services, wanted.device_id or reference.map_id)
+    """Record and submit; who takes turns with others is the device, where none is named the key, else the map."""
+    owner = wanted.device_id or key or reference.map_id
+    admit(services, owner)
     catalog = services.catalog
     model = services.cards.check(wanted.model or reference.model, maps)
     with kept_scans(catalog, body, wanted) as scan_ids:
@@ -209,6 +212,7 @@ def _create(
             threshold=wanted.threshold,
             device_id=wanted.device_id,
             captured_at=wanted.captured_at,
+            owner=owner,
         )
         submit(services, job, forget=lambda: catalog.surveys.delete(record.survey_id))
     return record, job

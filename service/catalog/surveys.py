@@ -48,11 +48,12 @@ class Surveys:
         threshold: float | None = None,
         device_id: str | None = None,
         captured_at: datetime | None = None,
+        owner: str | None = None,
     ) -> tuple[SurveyRecord, JobRecord]:
-        """Record a survey and its job together. Raises NotFound, NotReady (the map), BadRequest (the scans)."""
+        """Record a survey and its job together; `owner` takes turns with others, left out it is the device. Raises NotFound, NotReady (the map), BadRequest (the scans)."""
         scan_ids = checked_scan_ids(scan_ids)
         survey_id = new_id("survey")
-        job = new_job("survey", map_id, survey_id, owner=device_id)
+        job = new_job("survey", map_id, survey_id, owner=owner or device_id)
         with self._database.write() as session:
             map_row(session, map_id, lock=True)  # nobody deletes the version meanwhile
             version = version_in_use(session, map_id)

@@ -65,8 +65,7 @@ def main(arguments: list[str] | None = None) -> int:
         if deadline.over():
             break
         found.merge(run_batch(fuzz, start, min(start + _BATCH, options.files)))
-        print(f"\r{found.cases:,} files, {sum(found.counts.values())} findings", end="", file=sys.stderr)
-    print(file=sys.stderr)
+        print(f"{found.cases:,} files, {sum(found.counts.values())} findings", file=sys.stderr)
     seconds = deadline.passed_s()
     rows: dict[str, object] = {
         "files": f"{found.cases:,} in {seconds:.0f} s ({found.cases / max(seconds, 1e-9):,.0f} a second)",
@@ -100,15 +99,14 @@ def _forked(fuzz: Fuzz, start: int, stop: int) -> tuple[Findings, int]:
         with os.fdopen(writing, "wb") as pipe:
             _end_with(fuzz, start, stop, at, pipe)
     os.close(writing)
-    status = _awaited(child, at)
+    status, stuck = _awaited(child, at)
     with os.fdopen(reading, "rb") as pipe:
         answer = pipe.read()
     if status == 0 and answer:
         return pickle.loads(answer), stop  # noqa: S301 - from our own fork, by a pipe
     case = int.from_bytes(at[:], "little")
     lost = Findings(cases=case + 1 - start)  # what it counted before went with it
-    kind = "hang" if status == signal.SIGKILL else "crash"
-    lost.add(kind, f"case {case}: wait status {status}")
+    lost.add("hang" if stuck else "crash", f"case {case}: wait status {status}")
     return lost, case + 1
 
 
@@ -123,18 +121,18 @@ def _end_with(fuzz: Fuzz, start: int, stop: int, at: mmap.mmap, pipe: BinaryIO) 
     os._exit(0)
 
 
-def _awaited(child: int, at: mmap.mmap) -> int:
-    """Wait for a process and return its wait status; one that stands still is killed."""
+def _awaited(child: int, at: mmap.mmap) -> tuple[int, bool]:
+    """Wait for a process; return its wait status, and whether it stood still and was killed."""
     last, since = b"", time.monotonic()
     while True:
         pid, status = os.waitpid(child, os.WNOHANG)
         if pid:
-            return status
+            return status, False
         if at[:] != last:
             last, since = at[:], time.monotonic()
         elif time.monotonic() - since > _STUCK_S:
             os.kill(child, signal.SIGKILL)
-            return os.waitpid(child, 0)[1]
+            return os.waitpid(child, 0)[1], True
         time.sleep(0.02)
 
 

@@ -282,8 +282,8 @@ def _form(fields: Any, rng: random.Random) -> tuple[bytes, bytes]:
         disposition = f'form-data; name="{name}"; filename="{file}"'
         parts.append(_part(disposition, scan(rng), rng))
     rng.shuffle(parts)
-    if rng.random() < 0.02 and sum(map(len, parts)) < 2000:
-        parts *= 700
+    if rng.random() < 0.02 and sum(map(len, parts)) < 2000:  # each file is a row and a blob: 2 ms, not a hang
+        parts *= 50 if any(b"filename" in part for part in parts) else 700
     body = (
         b"".join(b"--" + boundary + b"\r\n" + part + b"\r\n" for part in parts) + b"--" + boundary + b"--\r\n"
     )

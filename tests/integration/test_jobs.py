@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -11,7 +12,7 @@ import pytest
 
 from service.catalog import blob_keys
 from service.catalog.jobs import Jobs, Run
-from service.catalog.records import JobRecord, Placement, ScanRecord
+from service.catalog.records import JobRecord, Placement, Problem, ScanRecord
 from service.catalog.steps import STEPS, JobKind
 from service.errors import DatabaseUnavailable
 from service.settings import Settings
@@ -21,7 +22,7 @@ from worker.cloud.formats.pcd import write_pcd
 from worker.cloud.formats.scan import read_scan
 from worker.cloud.poses import difference
 from worker.detectors.store import open_card
-from worker.errors import DetectorUnavailable, MapFailed, ScanError
+from worker.errors import DetectorUnavailable, MapFailed, NoSpaceLeft, ScanError
 from worker.jobs.surveys import scoring
 from worker.pipeline.flow import NoScanAccepted
 from worker.pipeline.registration.diagnosis import REASONS
@@ -395,3 +396,37 @@ def test_a_step_that_the_database_leaves_waits_and_is_run_again(
     assert "does not answer" in job.message
     run(visited)
     assert house.catalog.jobs.get(visited.job_id).status == "successful"
+
+
+def test_a_step_goes_on_while_the_database_does_not_take_how_far_it_is(
+    house: House, visited: JobRecord, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def away(*_: object, **__: object) -> bool:
+        raise DatabaseUnavailable("the database does not answer")
+
+    monkeypatch.setattr(Jobs, "report", away)
+    run(visited)
+    job = house.catalog.jobs.get(visited.job_id)
+    assert (job.status, job.interruptions) == ("successful", 0)
+
+
+def test_on_a_full_disk_what_a_step_wrote_aside_is_gone_before_its_end_is_recorded(
+    house: House, visited: JobRecord, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real, left = Jobs.fail, []
+
+    def full(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    def fail(self: Jobs, job_id: str, problem: Problem, *, step: str | None = None) -> bool:
+        left.extend(Settings().scratch_dir().iterdir())
+        return real(self, job_id, problem, step=step)
+
+    monkeypatch.setattr("worker.jobs.surveys.locate_survey", full)
+    monkeypatch.setattr(Jobs, "fail", fail)
+    with pytest.raises(NoSpaceLeft):
+        run(visited, "register")
+    assert left == []
+    problem = house.catalog.jobs.get(visited.job_id).problem
+    assert problem is not None
+    assert problem.code == "disk_full"

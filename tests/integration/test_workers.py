@@ -19,6 +19,7 @@ from service.catalog import steps
 from service.up.launcher import environment_of
 from tests.support.bench import ROOT, STANDIN, Bench, add_map
 from tests.support.processes import running, until
+from worker.__main__ import main
 from worker.rq_workers import GeometryWorker
 
 
@@ -141,3 +142,20 @@ def test_a_working_inference_worker_keeps_its_claim_alive(bench: Bench) -> None:
     (claim,) = bench.claims("inference")
     bench.redis.expire(f"rq:execution:{claim}", 8)
     until(lambda: int(bench.redis.ttl(f"rq:execution:{claim}")) > 10)
+
+
+def test_a_health_check_tells_whether_a_worker_of_this_host_answers(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("SPICD_REDIS_URL", bench.redis_url)
+    monkeypatch.setattr("socket.gethostname", lambda: "host-1")
+    assert main(["alive", "geometry"]) == 1
+    assert "no geometry worker of host-1 answers" in capsys.readouterr().err
+    bench.worker("geometry", name="geometry-host-2-1")
+    until(lambda: bench.redis.scard("rq:workers:geometry") == 1)
+    assert main(["alive", "geometry"]) == 1
+    bench.worker("geometry", name="geometry-host-1-1")
+    until(lambda: main(["alive", "geometry"]) == 0)
+    assert main(["alive", "inference"]) == 1
+    monkeypatch.setenv("SPICD_REDIS_URL", "redis://127.0.0.1:1")
+    assert main(["alive", "geometry"]) == 1

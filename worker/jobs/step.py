@@ -15,7 +15,7 @@ from service.catalog.catalog import Catalog, open_catalog
 from service.catalog.jobs import Run
 from service.catalog.records import JobRecord, Problem
 from service.catalog.steps import STEPS, JobKind, step_of
-from service.errors import NotFound, Unavailable, is_disk_full
+from service.errors import DatabaseUnavailable, NotFound, Unavailable, is_disk_full
 from service.settings import Settings
 from worker.errors import Cancelled, GaveWay, NoSpaceLeft, PipelineError
 from worker.memory import as_out_of_memory
@@ -90,10 +90,11 @@ def step(run: Callable[[Context], None]) -> Callable[[str], None]:
             job = catalog.jobs.get(job_id)
             folder = settings.scratch_dir()  # on the blobs' own disk
             try:
-                scratch = stack.enter_context(scratch_folder(folder, f"{job_id}-{begun.step}"))
-                context = _context(settings, catalog, job, begun, scratch)
-                with as_out_of_memory(f"a step of job {job_id}"):
-                    run(context)
+                # what the step wrote aside is gone before its end is recorded: on a full disk that needs the space
+                with scratch_folder(folder, f"{job_id}-{begun.step}") as scratch:
+                    context = _context(settings, catalog, job, begun, scratch)
+                    with as_out_of_memory(f"a step of job {job_id}"):
+                        run(context)
                 catalog.jobs.advance(begun)
             except Exception as error:
                 _ended(catalog, begun, error)
@@ -126,8 +127,13 @@ def _context(settings: Settings, catalog: Catalog, job: JobRecord, run: Run, scr
 
 
 def _report(catalog: Catalog, run: Run, stage: str, share: float) -> bool:
+    """Say how far a step is. Where the database does not answer the step goes on; it has to at the step's end."""
     tracing.stage(stage)
-    return catalog.jobs.report(run, message=stage, progress=share)
+    try:
+        return catalog.jobs.report(run, message=stage, progress=share)
+    except DatabaseUnavailable as error:
+        log.warning("job %s: its progress was not recorded: %s", run.job_id, error)
+        return True
 
 
 def _ended(catalog: Catalog, run: Run, error: Exception) -> None:

@@ -13,6 +13,7 @@ from sqlalchemy import text
 from service.api.http.monitor import HealthMonitor, Part
 from service.api.http.problems import MEDIA_TYPE
 from service.catalog.catalog import Catalog
+from service.queue import QueueState
 from service.settings import Settings
 from tests.support.processes import until
 from tests.support.samples import RememberingQueue, add_map
@@ -44,8 +45,32 @@ def test_a_healthy_service_names_its_parts(client: TestClient) -> None:
     ready = client.get("/health/ready")
     assert (ready.status_code, ready.json()) == (
         200,
-        {"status": "ok", "checks": {"database": "ok", "queue": "ok", "blobs": "ok"}},
+        {
+            "status": "ok",
+            "checks": dict.fromkeys(("workers", "database", "queue", "blobs"), "ok"),
+            "reasons": {},
+        },
     )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("state", "reason"),
+    [
+        (QueueState(), "no geometry worker answers; no inference worker answers"),
+        (QueueState(answering=("w1",), silent=("w2",)), "w2 is silent; w2 is silent"),
+    ],
+    ids=["none", "one of two"],
+)
+def test_workers_that_do_not_answer_are_told_and_work_is_taken_all_the_same(
+    client: TestClient, queue: RememberingQueue, state: QueueState, reason: str
+) -> None:
+    queue.state = state
+    until(lambda: client.get("/health/ready").json()["status"] == "degraded")
+    answer = client.get("/health/ready")
+    assert answer.status_code == 200
+    assert answer.json()["checks"]["workers"] == "failed"
+    assert reason in answer.json()["reasons"]["workers"]
 
 
 @pytest.mark.slow
@@ -60,7 +85,7 @@ def test_a_part_that_fails_is_named_and_the_others_stay_ok(
     until(lambda: seen("queue", "failed"))
     answer = client.get("/health/ready")
     assert (answer.status_code, answer.headers["content-type"]) == (503, MEDIA_TYPE)
-    assert answer.json()["checks"] == {"database": "ok", "queue": "failed", "blobs": "ok"}
+    assert answer.json()["checks"] == {"workers": "ok", "database": "ok", "queue": "failed", "blobs": "ok"}
     assert answer.json()["reasons"] == {"queue": "the job queue does not answer"}
     queue.down = False
     shutil.rmtree(settings.data_dir / "blobs")

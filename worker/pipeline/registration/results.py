@@ -66,11 +66,16 @@ def with_carrier(
     def returns() -> Iterator[Floats]:
         for index in np.unique(np.linspace(0, len(files) - 1, min(len(files), _SAMPLED)).astype(int)):
             with suppress(ScanError):
-                scan = read_scan(files[index].path, name=files[index].name, max_points=max_points)
-                yield transformed(scan.points, inverse(scan.sensor_pose))
+                yield _returns(files[index], max_points=max_points)
 
     carrier = Carrier.of(returns(), settings)
     return tuple(replace(file, carrier=file.carrier or carrier) for file in files)
+
+
+def _returns(file: ScanFile, *, max_points: int) -> Floats:
+    """Return the points (N, 3) of a file, metres, sensor frame; nothing else of it is held. Raises ScanError."""
+    scan = read_scan(file.path, name=file.name, max_points=max_points)
+    return transformed(scan.points, inverse(scan.sensor_pose))
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
