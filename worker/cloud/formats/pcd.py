@@ -42,7 +42,7 @@ _TYPES = {f"{kind}{size}" for kind in "IU" for size in (1, 2, 4, 8)} | {"F4", "F
 _NO_POSE = ["0", "0", "0", "1", "0", "0", "0"]
 _LZF_GAIN = 88  #: the longest back reference of LZF makes 264 bytes out of 3
 _LZF_HONEST_GAIN = (
-    32  #: of a block that is not harmless; scans have gains of 1 to 3, and 10 if most returns are missing
+    32  #: of a block that is not harmless; measured coordinates hardly pack, fields of zeros do
 )
 _HARMLESS = 64 * 1024**2  #: bytes that may be unpacked whatever the gain and the limit of points
 _PLAIN_PER_POINT = 24  #: bytes a point of the limit: positions, colours, and twice as much that is not used
