@@ -160,6 +160,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
         "worker.progress",
     ),
     "worker.__main__": (
+        "service.errors",
         "service.catalog",
         "service.settings",
         "service.logs",

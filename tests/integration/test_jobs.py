@@ -413,7 +413,8 @@ def test_a_step_goes_on_while_the_database_does_not_take_how_far_it_is(
 def test_on_a_full_disk_what_a_step_wrote_aside_is_gone_before_its_end_is_recorded(
     house: House, visited: JobRecord, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    real, left = Jobs.fail, []
+    real = Jobs.fail
+    left: list[Path] = []
 
     def full(*_: object, **__: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
