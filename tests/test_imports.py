@@ -137,6 +137,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "worker.rq_jobs": ("service.queue",),
     "worker.rq_workers": (
         "service.logs",
+        "service.errors",
         "service.settings",
         "service.up.lifetime",
         "worker.rq_jobs",

@@ -21,6 +21,7 @@ from redis.exceptions import RedisError
 
 from service.catalog.database import Database
 from service.catalog.jobs import Jobs
+from service.catalog.patience import SUPERVISION
 from service.catalog.records import Problem
 from service.catalog.steps import ALLOWED_FUNCTIONS
 from service.dispatch import Dispatcher
@@ -125,7 +126,7 @@ class CatalogRecords:
     """
 
     def __init__(self, settings: Settings) -> None:
-        self._database = Database(settings.resolved_database_url())
+        self._database = Database(settings.resolved_database_url(), patience=SUPERVISION)
         self._jobs = Jobs(self._database)
         queue = JobQueue(settings.redis_url or "", timeout_s=settings.job_timeout_s)
         self._dispatcher = Dispatcher(self._jobs, queue)

@@ -32,6 +32,7 @@ from rq.timeouts import JobTimeoutException, UnixSignalDeathPenalty
 from rq.utils import now
 from rq.worker.base import BaseWorker, WorkerStatus
 
+from service.errors import Unavailable
 from service.logs import about
 from service.settings import Settings
 from service.up.lifetime import end_with_parent
@@ -73,6 +74,9 @@ class Records(Protocol):
 
 class WorkerStopped(BaseException):
     """The worker was told to end and its time is up. Not an `Exception`, so that no step swallows it."""
+
+
+_EXPECTED = (PipelineError, FunctionRefused, WorkerStopped, JobTimeoutException, Unavailable)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -200,9 +204,7 @@ class _StepWorker(BaseWorker):  # type: ignore[misc]  # rq is untyped here
             with UnixSignalDeathPenalty(job.timeout, JobTimeoutException):
                 job.run()
         except BaseException as error:
-            expected = isinstance(
-                error, PipelineError | FunctionRefused | WorkerStopped | JobTimeoutException
-            )
+            expected = isinstance(error, _EXPECTED)
             log.error("%s failed: %s", job.id, error, exc_info=None if expected else error)
             self._record(job, _ending_of(error, job))
 
@@ -362,6 +364,8 @@ def _ending_of(error: BaseException, job: StepJob) -> Ending:
             return Ending(how="failed", code=error.code, sentence=str(error))
         case FunctionRefused():
             return Ending(how="failed", code="function_refused", sentence=str(error))
+        case Unavailable():  # the step could not even say that it was interrupted
+            return Ending(how="interrupted", sentence=str(error))
         case JobTimeoutException():
             took = f"step {job.id} took longer than {job.timeout} s; send fewer or smaller scans"
             return Ending(how="failed", code="timed_out", sentence=took)

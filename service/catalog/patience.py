@@ -28,6 +28,10 @@ REQUESTS = Patience(
 JOBS = Patience(
     connect_s=10, lock_s=30, statement_s=300, write_s=300, blob_s=30, blob_request_s=300, blob_retry_s=60
 )
+#: Of those who watch over workers: while they wait for the database they watch over nobody.
+SUPERVISION = Patience(
+    connect_s=3, lock_s=4, statement_s=5, write_s=5, blob_s=8, blob_request_s=12, blob_retry_s=6
+)
 #: Of migrations, which may rewrite a large table, or wait for who does.
 MIGRATIONS = Patience(
     connect_s=10, lock_s=600, statement_s=3600, write_s=3600, blob_s=30, blob_request_s=300, blob_retry_s=60

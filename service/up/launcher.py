@@ -29,6 +29,7 @@ from service.catalog.catalog import disk_of
 from service.catalog.database import Database
 from service.catalog.jobs import Jobs
 from service.catalog.keys import open_keys
+from service.catalog.patience import SUPERVISION
 from service.dispatch import Dispatcher
 from service.permissions import make_private, private_files
 from service.queue import QUEUES, JobQueue
@@ -112,7 +113,7 @@ class Supervision:
     """What the pool of workers tells catalog and queue of its workers; a context manager."""
 
     def __init__(self, settings: Settings) -> None:
-        self._database = Database(settings.resolved_database_url())
+        self._database = Database(settings.resolved_database_url(), patience=SUPERVISION)
         self._queue = JobQueue(settings.redis_url or "", timeout_s=settings.job_timeout_s)
         self._dispatcher = Dispatcher(Jobs(self._database), self._queue)
 

@@ -29,7 +29,7 @@ def service(
 ) -> Iterator[Service]:
     """It writes its log as JSON and sends its spans."""
     folder = tmp_path_factory.mktemp("seen")
-    service = Service(folder, model_store, SPICD_LOG_FORMAT="json", **collector.environment)
+    service = Service(folder, model_store, log_format="json", **collector.environment)
     yield service
     if service.process.poll() is None:
         service.end()

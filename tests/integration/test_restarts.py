@@ -5,18 +5,22 @@ from __future__ import annotations
 import os
 import shutil
 import signal
+import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from service.catalog.steps import Queue
 from service.dispatch import Dispatcher
+from service.errors import DatabaseUnavailable
 from service.up.children import WorkerPool
 from service.up.embedded_redis import EmbeddedRedis
 from service.up.launcher import Supervision
-from tests.support.bench import Bench
+from tests.support.bench import STANDIN, Bench
 from tests.support.processes import running, until
+from worker.rq_workers import _ending_of, _ending_of_status
 
 KINDS: tuple[Queue, ...] = ("geometry", "inference")
 
@@ -177,7 +181,6 @@ def test_a_step_that_is_frozen_is_ended_and_runs_again(bench: Bench) -> None:
 def test_a_frozen_worker_is_ended_by_its_supervisor_and_its_step_runs_again(
     bench: Bench, kind: Queue
 ) -> None:
-    from tests.support.bench import STANDIN
 
     environment = {
         **os.environ,
@@ -190,7 +193,6 @@ def test_a_frozen_worker_is_ended_by_its_supervisor_and_its_step_runs_again(
         f'exec "$PYTHON" -m {STANDIN} "$1" "$SPICD_REDIS_URL" "{bench.folder}" 5 "$7"',
         "worker",
     )
-    import sys
 
     environment["PYTHON"] = sys.executable
     pool = WorkerPool(
@@ -366,3 +368,28 @@ def test_a_full_disk_fails_the_step_and_says_so(bench: Bench) -> None:
     problem = bench.job("m1").problem
     assert problem is not None
     assert problem.code == "disk_full"
+
+
+def test_a_step_that_cannot_say_that_the_database_left_it_is_interrupted_and_not_failed() -> None:
+    step = SimpleNamespace(id="m1-register", timeout=60)
+    ending = _ending_of(DatabaseUnavailable("the database does not answer"), step)  # type: ignore[arg-type]
+    assert ending.how == "interrupted"
+
+
+@pytest.mark.parametrize(
+    ("status", "out_of_memory", "how"),
+    [
+        (signal.SIGKILL, False, "interrupted"),
+        (signal.SIGTERM, False, "interrupted"),
+        (signal.SIGKILL, True, "lost"),
+        (signal.SIGSEGV, False, "lost"),
+        (signal.SIGABRT | 0x80, False, "lost"),
+        (3 << 8, False, "lost"),
+    ],
+    ids=["killed", "terminated", "out of memory", "fault", "abort with core", "exit status 3"],
+)
+def test_what_comes_from_outside_is_told_from_what_a_step_did_itself(
+    status: int, out_of_memory: bool, how: str
+) -> None:
+    step = SimpleNamespace(id="m1-register", timeout=60)
+    assert _ending_of_status(status, step, out_of_memory=out_of_memory).how == how  # type: ignore[arg-type]

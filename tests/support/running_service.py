@@ -27,15 +27,14 @@ class Service:
     least = 4
 
     def __init__(self, folder: Path, model_store: Path, **settings: str | int) -> None:
-        """Start it in `folder`; `settings` are those of SPICD_*, and what begins with AWS_ or is TMPDIR."""
+        """Start it in `folder`; `settings` are those of SPICD_*; a name in capitals is a variable as it is."""
         ready, self.log = folder / "ready.json", folder / "log"
         command = [sys.executable, "-m", "service", "up", "--port", "0", "--end-with-parent"]
         command += ["--data-dir", str(folder / "data"), "--ready-file", str(ready)]
         environment = {key: value for key, value in os.environ.items() if not key.startswith("SPICD_")}
         environment["SPICD_MODEL_STORE"] = str(model_store)
         for name, value in settings.items():
-            as_it_is = name.startswith("AWS_") or name == "TMPDIR"
-            environment[name if as_it_is else f"SPICD_{name.upper()}"] = str(value)
+            environment[name if name.isupper() else f"SPICD_{name.upper()}"] = str(value)
         with self.log.open("ab") as log:
             self.process = subprocess.Popen(command, cwd=ROOT, env=environment, stdout=log, stderr=log)
         until = time.monotonic() + STARTS_WITHIN_S

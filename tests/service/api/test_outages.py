@@ -81,7 +81,7 @@ def away(client: TestClient) -> None:
     assert int(answer.headers["Retry-After"]) > 0
     until(lambda: client.get("/health/ready").status_code == 503)
     health = client.get("/health/ready").json()
-    assert health["checks"] == {"database": "failed", "queue": "ok", "blobs": "ok"}
+    assert health["checks"] == {"workers": "ok", "database": "failed", "queue": "ok", "blobs": "ok"}
     assert health["reasons"]["database"]
     assert client.get("/health/live").status_code == 200
 

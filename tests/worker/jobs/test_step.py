@@ -22,11 +22,11 @@ def test_a_step_that_runs_out_of_memory_fails_its_job_with_what_to_do(
     job_id = add_map(catalog, ready=False)
 
     @step
-    def greedy(context: Context) -> None:
+    def register_map(context: Context) -> None:
         raise MemoryError
 
     with pytest.raises(OutOfMemory):
-        greedy(job_id)
+        register_map(job_id)
     job = catalog.jobs.get(job_id)
     catalog.close()
     assert job.status == "failed"
