@@ -90,8 +90,10 @@ class Dispatcher:
 
     def run(self) -> None:
         """Find what was lost, and hand over what is due; call every second, and whenever something changes."""
-        self.recover()
-        self.hand_over()
+        try:
+            self.recover()
+        finally:  # which reads the catalog alone, and goes on where nothing can be written
+            self.hand_over()
 
     def hand_over(self) -> None:
         """Give the workers of each queue as many steps as there are workers, in the fair order.

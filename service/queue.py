@@ -9,7 +9,8 @@ as long as the worker renews it, and its key in Redis ends by itself a few secon
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+import functools
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from typing import Any
@@ -31,6 +32,7 @@ PATIENCE_S = 2.0  #: a request waits no longer than this for Redis
 KEPT_S = 24 * 3600  #: how long rq remembers a step that nobody cleaned up after
 QUEUES: tuple[QueueName, ...] = ("geometry", "inference")
 
+_TRIES = 5  #: of a transaction that a change comes between
 _WORKER = "rq:worker:"  #: what the key of a worker begins with
 
 
@@ -146,15 +148,12 @@ class JobQueue:
         """Take claims away that no worker has any more; what is to be known of them is recorded before."""
         with _redis_errors():
             for claim in claims:
-                with self._unheld(claim.step, but=claim) as pipe:
-                    for queue in QUEUES:
-                        pipe.zrem(_claims(queue), claim.key)
-                    pipe.delete(f"rq:execution:{claim.key}")
+                self._remove(claim.step, functools.partial(_drop_claim, claim), but=claim)
 
     def drop_taken(self, queue: QueueName, name: str) -> None:
         """Forget that a worker has taken a step: it ended before it claimed it."""
-        with _redis_errors(), self._unheld(name, taken=True) as pipe:
-            pipe.lrem(_taken(queue), 0, name)
+        with _redis_errors():
+            self._remove(name, lambda pipe: pipe.lrem(_taken(queue), 0, name), taken=True)
 
     def forget_worker(self, name: str) -> None:
         """Strike a worker that has ended off rq's list."""
@@ -184,8 +183,7 @@ class JobQueue:
             steps = {step_id(job_id, step.name): step.queue for step in STEPS[kind]}
             for name, queue in steps.items():
                 if self._redis.lrem(_waiting(queue), 0, name):
-                    with self._unheld(name):
-                        pass
+                    self._remove(name, lambda _: None)
             for claim in self._state("geometry").claims:
                 if claim.step in steps and claim.worker is not None:
                     send_command(self._redis, claim.worker, "stop-job", job_id=claim.step)
@@ -219,14 +217,21 @@ class JobQueue:
             silent=tuple(name for name, there in zip(names, alive, strict=True) if not there),
         )
 
-    @contextmanager
-    def _unheld(self, name: str, *, but: Claim | None = None, taken: bool = False) -> Iterator[Any]:
-        """Open a transaction that also removes what rq keeps of a step, unless somebody holds the step.
+    def _remove(
+        self, name: str, change: Callable[[Any], object], *, but: Claim | None = None, taken: bool = False
+    ) -> None:
+        """Make a change in one transaction that also removes what rq keeps of a step, unless somebody holds the step.
 
         The claim `but`, and with `taken` a place among the steps that are taken, do not count. When the queue changes
-        meanwhile, nothing is done: who comes next does it.
+        meanwhile it is tried again, some times; then who comes next does it.
         """
-        with suppress(WatchError), self._redis.pipeline() as pipe:
+        for _ in range(_TRIES):
+            with suppress(WatchError):
+                self._removed(name, change, but=but, taken=taken)
+                return
+
+    def _removed(self, name: str, change: Callable[[Any], object], *, but: Claim | None, taken: bool) -> None:
+        with self._redis.pipeline() as pipe:
             pipe.watch(*(key(queue) for queue in QUEUES for key in (_waiting, _taken, _claims)))  # type: ignore[no-untyped-call]
             states = [self._state(queue) for queue in QUEUES]
             claimed = {
@@ -236,7 +241,7 @@ class JobQueue:
             pipe.multi()
             if name not in claimed | waits:
                 self._forget(name, pipe)
-            yield pipe
+            change(pipe)
             pipe.execute()
 
     def _write(self, job_id: str, step: Step, pipe: Any) -> None:
@@ -275,6 +280,12 @@ def _taken(queue: str) -> str:
 def _claims(queue: str) -> str:
     """Return the key of the registry of what runs (`rq.registry.StartedJobRegistry`)."""
     return f"rq:wip:{queue}"
+
+
+def _drop_claim(claim: Claim, pipe: Any) -> None:
+    for queue in QUEUES:
+        pipe.zrem(_claims(queue), claim.key)
+    pipe.delete(f"rq:execution:{claim.key}")
 
 
 def _claim(key: str, holder: bytes | None) -> Claim:

@@ -86,15 +86,15 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def alive(arguments: list[str]) -> int:
-    """Return 0 where a worker of this host gave a sign of life lately, 1 where none did, or the queue is away."""
+    """Return 0 where a worker of this host gave a sign of life lately, and where the queue is away; 1 where none did."""
     parser = argparse.ArgumentParser(prog="python -m worker alive", description=alive.__doc__)
     parser.add_argument("queue", choices=sorted(WARM_MODULES))
     queue = parser.parse_args(arguments).queue
     try:
         answering = JobQueue(Settings().redis_url or "").snapshot()[queue].answering
-    except (QueueUnavailable, ValueError) as error:
+    except QueueUnavailable as error:  # workers outlive it, and to start them again would end their steps
         print(error, file=sys.stderr)
-        return 1
+        return 0
     if any(name.startswith(_host(queue)) for name in answering):
         return 0
     print(f"no {queue} worker of {socket.gethostname()} answers", file=sys.stderr)
@@ -109,13 +109,14 @@ def _host(queue: str) -> str:
 def work(make: Callable[[], GeometryWorker | InferenceWorker]) -> None:
     """Work until told to stop, with a new worker each time that Redis went away."""
     while True:
+        worker = None
         try:
             worker = make()
             worker.work()
-            if worker.stopping:
-                return
         except RedisError as error:
             log.warning("the queue does not answer (%s); trying again", type(error).__name__)
+        if worker is not None and worker.stopping:
+            return
         time.sleep(AGAIN_S)
 
 

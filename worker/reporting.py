@@ -21,10 +21,12 @@ class Turn:
         self, others_wait: Callable[[], bool], *, clock: Callable[[], float] = time.monotonic
     ) -> None:
         self._others_wait, self._clock = others_wait, clock
-        self._due = clock() + _TURN_S
+        self._due: float | None = None  #: a turn lasts from its first result on
 
     def check(self) -> None:
         """Raise GaveWay when it is time; asks at most once a second. To be called where what was done is kept."""
+        if self._due is None:
+            self._due = self._clock() + _TURN_S
         if self._clock() < self._due:
             return
         self._due = self._clock() + 1.0

@@ -19,7 +19,6 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Literal, Protocol
 
 from redis import Redis
@@ -32,11 +31,11 @@ from rq.timeouts import JobTimeoutException, UnixSignalDeathPenalty
 from rq.utils import now
 from rq.worker.base import BaseWorker, WorkerStatus
 
-from service.errors import Unavailable
+from service.errors import Unavailable, is_disk_full
 from service.logs import about
 from service.settings import Settings
-from service.up.lifetime import end_with_parent
-from worker.errors import PipelineError
+from service.up.lifetime import end_with_parent, out_of_memory_kills
+from worker.errors import NoSpaceLeft, PipelineError
 from worker.memory import limit_memory
 from worker.rq_jobs import FunctionRefused, StepJob, step_job
 from worker.watch import Watch
@@ -47,6 +46,8 @@ HEARTBEAT_S = 4  #: between two signs of life
 ANSWERS_S = 20  #: a worker without a sign of life for so long is told as silent
 CLAIM_S = 15  #: a claim that was not renewed for so long has ended
 LATE_S = 3.0  #: a step that outlasts its time limit by this does not hear its own alarm, and is killed
+_TELL_TRIES = 3  #: to tell the catalog how a step ended; each takes some seconds where it does not answer
+_LAST_WORDS_S = 10.0  #: that a worker which ends itself has to tell the catalog
 _LOOK_S = 1.0  #: between two looks at the processes of a step
 _OUTSIDE = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGQUIT)
 
@@ -166,8 +167,9 @@ class _StepWorker(BaseWorker):  # type: ignore[misc]  # rq is untyped here
                     self.set_state(WorkerStatus.IDLE)
 
     def _shutdown(self) -> None:
-        self._stop_requested = True  # rq notes it of a busy worker only
-        super()._shutdown()
+        self._stop_requested = True  # rq notes it of a busy worker only, and tells Redis, which may be away
+        if self.get_state() != WorkerStatus.BUSY:
+            raise StopRequested
 
     def handle_warm_shutdown_request(self) -> None:
         """Answer the first SIGTERM: the running step has `grace_s` seconds to end by itself."""
@@ -175,6 +177,20 @@ class _StepWorker(BaseWorker):  # type: ignore[misc]  # rq is untyped here
         timer = threading.Timer(self._grace_s, self._end_grace)
         timer.daemon = True
         timer.start()
+
+    def teardown(self) -> None:
+        """End, and also what listens for the word to stop a step, where Redis is away."""
+        try:
+            super().teardown()
+        finally:
+            if self.pubsub_thread:
+                self.pubsub_thread.stop()
+
+    def _pubsub_exception_handler(self, exc: Exception, *_: object) -> None:
+        """Listen on, whatever is wrong with Redis; rq would end at an answer that takes too long."""
+        if not isinstance(exc, RedisError):
+            raise exc
+        time.sleep(self.max_connection_wait_time)
 
     def _work_on(self, job: StepJob) -> None:
         raise NotImplementedError
@@ -208,32 +224,70 @@ class _StepWorker(BaseWorker):  # type: ignore[misc]  # rq is untyped here
             log.error("%s failed: %s", job.id, error, exc_info=None if expected else error)
             self._record(job, _ending_of(error, job))
 
+    @contextmanager
+    def _alive(self, job: StepJob, *, limit_s: float | None = None) -> Iterator[None]:
+        """Give signs of life from a thread for the length of the block.
+
+        A block that takes longer than `limit_s` does not hear its own alarm: the step is recorded as timed out, and this
+        process ends.
+        """
+        over, begun = threading.Event(), time.monotonic()
+
+        def beat() -> None:
+            while not over.wait(HEARTBEAT_S):
+                if limit_s and time.monotonic() - begun > limit_s:
+                    self._end_with(job)
+                with suppress(RedisError):
+                    self.maintain_heartbeats(job)
+
+        thread = threading.Thread(target=beat, daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            over.set()
+            thread.join(ANSWERS_S)  # no sign of life may come after the claim was given back
+
+    def _end_with(self, job: StepJob) -> None:
+        """Record that a step took too long, and end this process, which it holds."""
+        last = threading.Timer(_LAST_WORDS_S, os._exit, (1,))
+        last.daemon = True
+        last.start()
+        log.error("%s: does not hear that its time is up; this worker ends", job.id)
+        self._record(job, _ending_of(JobTimeoutException(), job))
+        os._exit(1)
+
     def _record(self, job: StepJob, ending: Ending) -> None:
         """Tell the catalog how a step ended."""
         if job.catalog_id is None or ending.how == "dismissed":
             return
         of = (job.catalog_id, job.step)
-        match ending.how:
-            case "failed":
-                self._tell(self._records.failed, *of, ending.code, ending.sentence)
-            case "lost":
-                self._tell(self._records.lost, *of, ending.sentence)
-            case "interrupted":
-                self._tell(self._records.interrupted, *of, ending.sentence)
-            case "stopped":
-                self._tell(self._records.stopped, *of)
+        for _ in range(_TELL_TRIES):
+            match ending.how:
+                case "failed":
+                    told = self._tell(self._records.failed, *of, ending.code, ending.sentence)
+                case "lost":
+                    told = self._tell(self._records.lost, *of, ending.sentence)
+                case "interrupted":
+                    told = self._tell(self._records.interrupted, *of, ending.sentence)
+                case _:
+                    told = self._tell(self._records.stopped, *of)
+            if told:
+                return
 
-    def _tell(self, record: Any, *words: str) -> None:
-        """Call the catalog; one that does not answer must not take the worker down.
+    def _tell(self, record: Any, *words: str) -> bool:
+        """Call the catalog, and tell whether it listened; one that does not answer must not take the worker down.
 
         What it did not hear, a dispatcher finds: a step that has begun, and on which nobody has a claim.
         """
         try:
             record(*words)
+            return True
         except StopRequested:
             raise
         except Exception as error:
             log.warning("%s: the catalog was not told (%s): %s", self.queues[0].name, " ".join(words), error)
+            return False
 
 
 class GeometryWorker(_StepWorker, Worker):  # type: ignore[misc]
@@ -265,10 +319,17 @@ class GeometryWorker(_StepWorker, Worker):  # type: ignore[misc]
                 os.kill(pid, sig)
 
     def _work_on(self, job: StepJob) -> None:
-        killed_before = _out_of_memory_kills()
+        killed_before = out_of_memory_kills()
         self.fork_work_horse(job, None)
-        ending, status = self._wait(job)
-        self._end_group()
+        try:
+            ending, status = self._wait(job)
+        except BaseException:  # nobody would watch the step any more
+            self.kill_horse()
+            with suppress(ChildProcessError):
+                os.waitpid(self.horse_pid, 0)
+            raise
+        finally:
+            self._end_group()
         if ending is None and status == 0:
             return  # it has told the catalog itself
         if self._stop_requested:
@@ -276,10 +337,11 @@ class GeometryWorker(_StepWorker, Worker):  # type: ignore[misc]
         elif self._stopped_job_id == job.id:
             self._stopped_job_id, ending = None, Ending(how="dismissed")
         if ending is None:
-            ending = _ending_of_status(status, job, out_of_memory=_out_of_memory_kills() > killed_before)
+            ending = _ending_of_status(status, job, out_of_memory=out_of_memory_kills() > killed_before)
         if ending.sentence:
             log.warning("%s: %s", job.id, ending.sentence)
-        self._record(job, ending)
+        with self._alive(job):
+            self._record(job, ending)
 
     def _wait(self, job: StepJob) -> tuple[Ending | None, int]:
         """Wait for the step's process, and kill it when its time is up or when it hangs; return its wait status."""
@@ -329,26 +391,8 @@ class InferenceWorker(_StepWorker, SimpleWorker):  # type: ignore[misc]
         raise WorkerStopped
 
     def _work_on(self, job: StepJob) -> None:
-        with self._alive(job):
+        with self._alive(job, limit_s=job.timeout and job.timeout + LATE_S):
             self._run(job)
-
-    @contextmanager
-    def _alive(self, job: StepJob) -> Iterator[None]:
-        """Give signs of life from a thread for the length of the block."""
-        over = threading.Event()
-
-        def beat() -> None:
-            while not over.wait(HEARTBEAT_S):
-                with suppress(RedisError):
-                    self.maintain_heartbeats(job)
-
-        thread = threading.Thread(target=beat, daemon=True)
-        thread.start()
-        try:
-            yield
-        finally:
-            over.set()
-            thread.join(ANSWERS_S)  # no sign of life may come after the claim was given back
 
     def _end_grace(self) -> None:
         """Signal the main thread, which runs the step; the handler is `request_force_stop` by now."""
@@ -357,21 +401,28 @@ class InferenceWorker(_StepWorker, SimpleWorker):  # type: ignore[misc]
 
 def _ending_of(error: BaseException, job: StepJob) -> Ending:
     """Return how a step ended that an error left."""
+    if isinstance(error, WorkerStopped):
+        return Ending(how="stopped")
+    if isinstance(error, Unavailable):  # the step could not even say that it was interrupted
+        return Ending(how="interrupted", sentence=str(error))
+    code, sentence = _problem(error, job)
+    return Ending(how="failed", code=code, sentence=sentence)
+
+
+def _problem(error: BaseException, job: StepJob) -> tuple[str, str]:
+    """Return code and sentence for an error that fails a job."""
     match error:
-        case WorkerStopped():
-            return Ending(how="stopped")
         case PipelineError():
-            return Ending(how="failed", code=error.code, sentence=str(error))
+            return error.code, str(error)
         case FunctionRefused():
-            return Ending(how="failed", code="function_refused", sentence=str(error))
-        case Unavailable():  # the step could not even say that it was interrupted
-            return Ending(how="interrupted", sentence=str(error))
+            return "function_refused", str(error)
         case JobTimeoutException():
-            took = f"step {job.id} took longer than {job.timeout} s; send fewer or smaller scans"
-            return Ending(how="failed", code="timed_out", sentence=took)
+            return "timed_out", f"step {job.id} took longer than {job.timeout} s; send fewer or smaller scans"
+        case _ if is_disk_full(error):
+            return NoSpaceLeft.code, "the disk is full; make room, then submit it again"
         case _:
-            what = f"step {job.id} stopped on an unexpected {type(error).__name__}; see the worker's log"
-            return Ending(how="failed", code="internal", sentence=what)
+            what = f"an unexpected {type(error).__name__}"
+            return "internal", f"step {job.id} stopped on {what}; see the worker's log"
 
 
 def _ending_of_status(status: int, job: StepJob, *, out_of_memory: bool) -> Ending:
@@ -388,12 +439,3 @@ def _ending_of_status(status: int, job: StepJob, *, out_of_memory: bool) -> Endi
         return Ending(how="lost", sentence=f"{of} by signal {number.name}: out of memory")
     how: How = "interrupted" if number in _OUTSIDE else "lost"
     return Ending(how=how, sentence=f"{of} by signal {number.name}")
-
-
-def _out_of_memory_kills() -> int:
-    """Return how many processes the kernel has killed for want of memory, of this control group or the machine."""
-    for path in (Path("/sys/fs/cgroup/memory.events"), Path("/proc/vmstat")):
-        with suppress(OSError, ValueError):
-            counts = dict(line.split() for line in path.read_text().splitlines())
-            return int(counts.get("oom_kill", 0))
-    return 0

@@ -23,13 +23,9 @@ _UNLOCKED_S = 60.0  #: a folder without a lock may be just in the making; after 
 def scratch_folder(parent: Path, name: str) -> Iterator[Path]:
     """Make a folder under `parent` for the length of the block; temporary files of any library go there too."""
     parent.mkdir(parents=True, exist_ok=True)
-    folder = Path(tempfile.mkdtemp(prefix=f"{name}.", dir=parent))
-    lock = os.open(
-        folder / _LOCK, os.O_RDWR | os.O_CREAT, 0o600
-    )  # not inherited by programs that are started
+    folder, lock = _locked_folder(parent, name)
     before = tempfile.tempdir, os.environ.get("TMPDIR")
     try:
-        fcntl.flock(lock, fcntl.LOCK_EX)
         tempfile.tempdir = str(folder)
         os.environ["TMPDIR"] = str(folder)  # of the processes that the step starts
         yield folder
@@ -40,6 +36,19 @@ def scratch_folder(parent: Path, name: str) -> Iterator[Path]:
         else:
             os.environ["TMPDIR"] = before[1]
         shutil.rmtree(folder, ignore_errors=True)
+        os.close(lock)
+
+
+def _locked_folder(parent: Path, name: str) -> tuple[Path, int]:
+    """Make a folder and lock it; another one where a sweep had it between the two."""
+    while True:
+        folder = Path(tempfile.mkdtemp(prefix=f"{name}.", dir=parent))
+        lock = os.open(
+            folder / _LOCK, os.O_RDWR | os.O_CREAT, 0o600
+        )  # no program that is started inherits it
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if os.fstat(lock).st_nlink:
+            return folder, lock
         os.close(lock)
 
 

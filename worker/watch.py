@@ -12,7 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 STOPPED_S = 2.0  #: a process that is stopped (SIGSTOP) for so long is taken for frozen
-IDLE_S = 120.0  #: a step that used no processor time for so long hangs; it waits for nothing so long
+IDLE_S = 400.0  #: a step that used no processor time for so long hangs; no wait of its own may take so long
+_PAUSED_S = 30.0  #: between two looks, which are a second apart where all is well
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -48,7 +49,7 @@ class Watch:
     ) -> None:
         self._group, self._idle_s, self._clock = group, idle_s, clock
         self._ticks = -1
-        self._worked = self._ran = clock()
+        self._worked = self._ran = self._looked = clock()
 
     def trouble(self) -> tuple[str, bool] | None:
         """Return what is wrong, as the end of a sentence, and whether it came from outside; None while all is well."""
@@ -56,6 +57,9 @@ class Watch:
         if not states:
             return None
         now, ticks = self._clock(), sum(state.ticks for state in states)
+        if now - self._looked > _PAUSED_S:  # nobody looked: the machine, or the container, stood still
+            self._worked = self._ran = now
+        self._looked = now
         if ticks != self._ticks:
             self._ticks, self._worked = ticks, now
         if not any(state.state in "Tt" for state in states):

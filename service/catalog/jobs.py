@@ -30,6 +30,7 @@ from service.errors import Conflict, NotFound
 
 MAX_ATTEMPTS = 3  #: of one step
 MAX_INTERRUPTIONS = 20  #: of one step
+_BEGINS = timedelta(seconds=2)  #: that a worker which is free may take to begin
 _LONGEST_DELAY_S = 30.0  #: before a step that was interrupted again and again
 WORKER_DIED = "worker_died"  #: code of the problem of a job that is given up
 
@@ -136,9 +137,9 @@ class Jobs:
         """Return all that has not ended, in the order they were asked for."""
         job = tables.Job
         columns = (job.job_id, job.kind, job.step, job.status, job.owner, job.map_id)
-        query = (
-            select(*columns, job.created, job.due, job.begun).where(_OPEN).order_by(job.created, job.job_id)
-        )
+        known = job.kind.in_(list(STEPS))  # a newer release, at work beside this one, may have others
+        query = select(*columns, job.created, job.due, job.begun).where(_OPEN, known)
+        query = query.order_by(job.created, job.job_id)
         with self._database.read() as session:
             return tuple(
                 OpenJob(
@@ -167,7 +168,7 @@ class Jobs:
         names = {step.name for step in STEPS["survey"] if step.queue == queue}
         job = tables.Job
         query = select(job.job_id).where(
-            _OPEN, job.kind == "survey", job.begun.is_(None), job.step.in_(names), job.due <= now()
+            _OPEN, job.kind == "survey", job.begun.is_(None), job.step.in_(names), job.due <= now() - _BEGINS
         )
         with self._database.read() as session:
             return session.scalar(query.limit(1)) is not None
@@ -201,16 +202,23 @@ class Jobs:
             values = {"step": following.name, **fresh, **_due()}
             return _changed(session, run.job_id, values, *_of_run(run), ran=ran, outcome="successful")
 
-    def succeed(self, job_id: str) -> bool:
-        """Mark the job as done and its map's version, survey or model as ready; False when it had ended or gone."""
-        return self._end(job_id, "successful", message="done", progress=100)
+    def succeed(self, job_id: str, *, run: Run | None = None) -> bool:
+        """Mark the job as done and its map's version, survey or model as ready; False when it had ended or gone.
 
-    def fail(self, job_id: str, problem: Problem, *, step: str | None = None) -> bool:
+        With `run` also where another run has the step by now.
+        """
+        where = () if run is None else _of_run(run)
+        return self._end(job_id, "successful", *where, message="done", progress=100)
+
+    def fail(
+        self, job_id: str, problem: Problem, *, step: str | None = None, begun: datetime | None = None
+    ) -> bool:
         """Mark the job and its map's version, survey or model as failed; False when it had ended or gone.
 
-        `step` names the step that failed; where the job is at another one by now, nothing is changed.
+        `step` names the step that failed, and `begun` its run; where the job is at another by now, nothing is changed.
         """
-        return self._end(job_id, "failed", step=step, message=problem.detail, problem=problem.model_dump())
+        where = _at(step, begun)
+        return self._end(job_id, "failed", *where, message=problem.detail, problem=problem.model_dump())
 
     def dismiss(self, job_id: str) -> JobRecord:
         """Stop the job for good; once more changes nothing. Raises NotFound, and Conflict when it ended by itself."""
@@ -221,7 +229,7 @@ class Jobs:
             raise Conflict(f"job {job_id!r} is already {job.status}; delete its map or survey instead")
         return job
 
-    def lose_attempt(self, job_id: str, step: str, reason: str) -> bool:
+    def lose_attempt(self, job_id: str, step: str, reason: str, *, begun: datetime | None = None) -> bool:
         """Count an attempt that ended without a result, by its own fault; `reason` is the first half of a sentence.
 
         True when the step waits again. False when this was the last attempt, and the job failed with `WORKER_DIED`; and
@@ -230,7 +238,7 @@ class Jobs:
         count = tables.Job.attempts
         with self._database.write() as session:
             ran = _ran(session, job_id)
-            attempts = _counted(session, job_id, step, count)
+            attempts = _counted(session, job_id, step, count, *_at(step, begun))
             if attempts is None or ran is None:
                 return False
             tallies.tally_attempt(session, kind=ran.kind, step=step)
@@ -243,9 +251,10 @@ class Jobs:
     def interrupt(self, job_id: str, step: str, reason: str, *, begun: datetime | None = None) -> bool:
         """Put back a step that ended through no fault of its own, as `lose_attempt` does, at no attempt's cost.
 
-        With `begun` only that very run: for who looked at the job before it looked at the queue.
+        With `begun` only that very run: for who looked at the job before it looked at the queue. A step that nobody has
+        begun is left as it is.
         """
-        same = () if begun is None else (tables.Job.begun == begun,)
+        same = (*_at(step, begun), tables.Job.begun.is_not(None))
         with self._database.write() as session:
             ran = _ran(session, job_id)
             times = _counted(session, job_id, step, tables.Job.interruptions, *same)
@@ -260,11 +269,12 @@ class Jobs:
         self._give_up(job_id, step, f"{reason}; given up after {times} interruptions")
         return False
 
-    def put_back(self, job_id: str, step: str, message: str) -> bool:
-        """Have a step wait again that gave way; False when the job had ended, gone, or gone on."""
+    def put_back(self, job_id: str, step: str, message: str, *, begun: datetime | None = None) -> bool:
+        """Have a step wait again that gave way; False when nobody has begun it, or the job had ended, gone, or gone on."""
+        where = (*_at(step, begun), tables.Job.begun.is_not(None))
         with self._database.write() as session:
             ran, values = _ran(session, job_id), {**_started(message), **_due()}
-            return _changed(session, job_id, values, tables.Job.step == step, ran=ran, outcome="put_back")
+            return _changed(session, job_id, values, *where, ran=ran, outcome="put_back")
 
     def _give_up(self, job_id: str, step: str, detail: str) -> None:
         problem = Problem(code=WORKER_DIED, detail=f"{detail}, look at the worker's log and memory")
@@ -274,9 +284,8 @@ class Jobs:
         with self._database.write() as session:
             return _changed(session, job_id, values, *where)
 
-    def _end(self, job_id: str, status: JobStatus, *, step: str | None = None, **values: Any) -> bool:
+    def _end(self, job_id: str, status: JobStatus, *where: ColumnElement[bool], **values: Any) -> bool:
         instant = now()
-        where = () if step is None else (tables.Job.step == step,)
         with self._database.write() as session:
             job = session.get(tables.Job, job_id)
             if job is None:
@@ -340,6 +349,12 @@ def _started(message: str | None = None) -> dict[str, object]:
 def _due(delay_s: float = 0.0) -> dict[str, object]:
     """Return the columns of a step that waits, from now on or from later on."""
     return {"due": now() + timedelta(seconds=delay_s), "begun": None}
+
+
+def _at(step: str | None, begun: datetime | None) -> tuple[ColumnElement[bool], ...]:
+    """Return what holds while the job is at a step, and in one run of it; of what is None nothing is asked."""
+    at = () if step is None else (tables.Job.step == step,)
+    return at if begun is None else (*at, tables.Job.begun == begun)
 
 
 def _of_run(run: Run) -> tuple[ColumnElement[bool], ...]:

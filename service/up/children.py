@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from itertools import count
 from typing import Literal, Protocol, Self
 
-from service.up.lifetime import is_stopped
+from service.up.lifetime import is_stopped, out_of_memory_kills
 
 log = logging.getLogger("spicd")
 
@@ -23,6 +23,8 @@ _LONGEST_WAIT_S = 30.0  #: between two starts of a worker that keeps dying
 _HEALTHY_S = 60.0  #: a worker that lived this long starts again at once
 _FROZEN_S = 3.0  #: a worker that was stopped (SIGSTOP) for so long is ended
 _SILENT_S = 30.0  #: so is one of which the queue has heard nothing for so long, though it had before
+_STARTS_S = 180.0  #: a worker that starts is waited for so long, and that longer
+_BACK_S = 60.0  #: workers have so long to come back after the queue was away
 _LISTEN_S = 2.0  #: between two questions to the queue
 _OUTSIDE = (
     -signal.SIGKILL,
@@ -52,7 +54,8 @@ class WorkerProcess:
     deaths: int = 0  #: in a row, each after less than `_HEALTHY_S`
     due: float = 0.0  #: monotonic seconds; not started again before
     name: str = ""  #: of the worker in the queue, another at each start
-    heard: float | None = None  #: monotonic seconds of its last sign of life; None before the first
+    heard: float = 0.0  #: monotonic seconds of its last sign of life, or by when the first is waited for
+    memory_kills: int = 0  #: of the kernel, when it was started
     ran: float = 0.0  #: monotonic seconds; when it was last seen not stopped
 
     @property
@@ -80,6 +83,7 @@ class WorkerPool:
         self._watcher = watcher
         self._numbers = count()
         self._listen = 0.0
+        self._ended: list[tuple[str, str, bool]] = []  #: name, how, and whether by itself
 
     def __enter__(self) -> Self:
         for worker in self.workers:
@@ -96,6 +100,7 @@ class WorkerPool:
                 self._reap(worker, status)
             if worker.process is None and time.monotonic() >= worker.due:
                 self._start(worker)
+        self._tell_of_ended()
         self._end_who_hangs()
 
     def stop(self) -> None:
@@ -126,10 +131,9 @@ class WorkerPool:
                 continue
             if not is_stopped(worker.process.pid):
                 worker.ran = instant
-            silent = worker.heard is not None and instant - worker.heard > _SILENT_S
+            silent = self._watcher is not None and instant - worker.heard > _SILENT_S
             if silent or instant - worker.ran > _FROZEN_S:
                 log.warning("the %s worker %d does not answer and is ended", worker.queue, worker.pid)
-                worker.heard = None
                 worker.process.kill()
 
     def _listen_to_all(self, instant: float) -> None:
@@ -140,7 +144,7 @@ class WorkerPool:
             answering = self._watcher.answering()
         except Exception:  # the queue is away: nobody can be heard
             for worker in self.workers:
-                worker.heard = None
+                worker.heard = instant + _BACK_S
             return
         for worker in self.workers:
             if worker.name in answering:
@@ -158,11 +162,14 @@ class WorkerPool:
             start_new_session=True,  # Ctrl-C is for the launcher, which ends its workers in order
         )
         worker.started = worker.ran = time.monotonic()
-        worker.heard = None
+        worker.memory_kills = out_of_memory_kills()
+        worker.heard = worker.started + _STARTS_S
 
     def _reap(self, worker: WorkerProcess, status: int) -> None:
         lived = time.monotonic() - worker.started
-        by_itself = status not in _OUTSIDE
+        by_itself = status not in _OUTSIDE or (
+            status == -signal.SIGKILL and out_of_memory_kills() > worker.memory_kills
+        )
         worker.deaths = worker.deaths + 1 if by_itself and lived <= _HEALTHY_S else 0
         wait = min(2.0**worker.deaths - 1, _LONGEST_WAIT_S)
         log.warning(
@@ -175,13 +182,18 @@ class WorkerPool:
         )
         worker.process = None
         worker.due = time.monotonic() + wait
-        if self._watcher is not None:
+        self._ended.append((worker.name, _ending(worker.queue, status), by_itself))
+
+    def _tell_of_ended(self) -> None:
+        """Tell the watcher of workers that have ended; others are started before, for this may take seconds."""
+        ended, self._ended = self._ended, []
+        for name, how, by_itself in ended:
             try:
-                self._watcher.ended(worker.name, _ending(worker.queue, status), by_itself=by_itself)
-            except (
-                Exception
-            ) as error:  # catalog or queue are away; what it had begun is found without a claim
-                log.warning("that the %s worker ended was not recorded: %s", worker.queue, error)
+                if self._watcher is not None:
+                    self._watcher.ended(name, how, by_itself=by_itself)
+            except Exception as error:
+                # catalog or queue are away; what it had begun is found without a claim
+                log.warning("%s: %s, which was not recorded: %s", name, how, error)
 
 
 def _ending(queue: str, status: int) -> str:

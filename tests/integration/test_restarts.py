@@ -11,7 +11,9 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from sqlalchemy import update
 
+from service.catalog import tables
 from service.catalog.steps import Queue
 from service.dispatch import Dispatcher
 from service.errors import DatabaseUnavailable
@@ -87,10 +89,9 @@ def test_a_step_killed_again_and_again_from_outside_is_given_up_at_last(bench: B
     bench.worker("geometry")
     bench.submit("m1", ("hold", "geometry"), ("finish", "geometry"))
     bench.wait_for("hold m1")
-    for _ in range(19):
-        bench.jobs.interrupt("m1", "hold", "killed")
-    for line in bench.lines("hold m1"):
-        os.kill(int(line.split()[2]), signal.SIGKILL)
+    with bench.catalog.database.write() as session:
+        session.execute(update(tables.Job).values(interruptions=19))
+    os.kill(int(bench.wait_for("hold m1")[2]), signal.SIGKILL)
     ended(bench, "m1", "failed")
     problem = bench.job("m1").problem
     assert problem is not None
@@ -220,6 +221,23 @@ def test_a_frozen_worker_is_ended_by_its_supervisor_and_its_step_runs_again(
     assert bench.job("m1").attempts == 0
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_step_that_does_not_hear_that_its_time_is_up_is_ended_all_the_same(
+    bench: Bench, kind: Queue
+) -> None:
+    worker = bench.worker(kind)
+    bench.submit("m1", ("deaf", kind), timeout_s=1)
+    until(lambda: bench.job("m1").status == "failed")
+    problem = bench.job("m1").problem
+    assert problem is not None
+    assert problem.code == "timed_out"
+    if kind == "inference":  # the step is the worker
+        assert worker.wait(15) == 1
+    else:
+        pid = int(bench.wait_for("deaf m1")[2])
+        until(lambda: not running(pid))
+
+
 def test_a_step_that_a_frozen_worker_takes_up_again_gives_way_to_the_run_that_took_its_place(
     bench: Bench,
 ) -> None:
@@ -309,6 +327,27 @@ def test_workers_outlive_redis_and_go_on_with_what_it_lost(tmp_path: Path) -> No
         ended(bench, "m1")
         assert [worker.poll() for worker in workers] == [None, None]
     server.stop()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("what", ["idle", "in a step"])
+def test_a_worker_that_is_told_to_stop_while_redis_is_away_stops(
+    tmp_path: Path, kind: Queue, what: str
+) -> None:
+    server = EmbeddedRedis(tmp_path / "redis")
+    server.start()
+    with Bench(tmp_path, server.url) as bench:
+        worker = bench.worker(kind, grace=0.5)
+        until(lambda: bench.redis.scard(f"rq:workers:{kind}"))
+        if what == "in a step":
+            bench.submit("m1", ("hold", kind), ("finish", kind))
+            bench.wait_for("hold m1")
+        server.stop()
+        worker.send_signal(signal.SIGTERM)
+        worker.wait(30)
+        if what == "in a step":
+            job = bench.job("m1")
+            assert (job.status, job.attempts) == ("running", 0)
 
 
 @pytest.mark.parametrize("redis", ["kept its data", "lost its data"])

@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 
 from service.catalog import blob_keys
+from service.catalog.jobs import Run
 from service.catalog.records import JobRecord, ModelRecord
+from service.catalog.tables import now
 from tests.support.house import MAP, MODEL, OTHER_CUT, House, run
 from worker.detectors.card import Card
 from worker.detectors.spicd_net.detector import SpicdNet
@@ -215,6 +217,7 @@ def context(house: House, job: JobRecord) -> Context:
         settings=house.settings,
         catalog=house.catalog,
         job=job,
+        run=Run(job_id=job.job_id, step="train", begun=now()),
         give_way=lambda: None,
         report=Reporter({}, lambda *_: True),
         scratch=house.folder,

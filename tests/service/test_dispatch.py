@@ -11,6 +11,7 @@ from service.catalog.catalog import Catalog
 from service.catalog.jobs import OpenJob
 from service.catalog.steps import JobKind
 from service.dispatch import TAKEN_S, Dispatcher, fair_order, queue_positions
+from service.errors import DiskFull
 from service.queue import Claim, QueueState, Snapshot
 from tests.support.samples import NOON, RememberingQueue, add_map, add_scan
 
@@ -189,7 +190,24 @@ def test_a_worker_that_stays_silent_is_forgotten_at_last(catalog: Catalog) -> No
 
 def test_a_step_that_was_put_off_is_not_handed_over_before_its_time(catalog: Catalog, survey: str) -> None:
     for _ in range(6):
+        catalog.jobs.begin(survey, "register")
         catalog.jobs.interrupt(survey, "register", "killed")
     queue = OneQueue()
     Dispatcher(catalog.jobs, queue).run()
     assert queue.submitted == []
+
+
+def test_what_is_due_is_handed_over_also_where_what_was_lost_cannot_be_recorded(
+    catalog: Catalog, survey: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lost = add_map(catalog, "hall", ready=False)
+    catalog.jobs.begin(lost, "register")
+
+    def full(*_: object, **__: object) -> bool:
+        raise DiskFull("no space")
+
+    monkeypatch.setattr(type(catalog.jobs), "interrupt", full)
+    queue = OneQueue()
+    with pytest.raises(DiskFull):
+        Dispatcher(catalog.jobs, queue).run()
+    assert queue.submitted == [(survey, "register")]

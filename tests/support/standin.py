@@ -31,7 +31,7 @@ from worker.rq_workers import GeometryWorker, InferenceWorker
 
 FUNCTIONS = (
     "first", "second", "third", "refuse", "crash", "crash_once", "sleep", "busy", "hold", "finish", "stray", "full",
-    "early",
+    "early", "deaf",
 )  # fmt: skip
 
 
@@ -136,6 +136,17 @@ def sleep(context: Context) -> None:
 
 
 @stage
+def deaf(context: Context) -> None:
+    """Go on whatever is raised, as code does that catches too much."""
+    record("deaf", context.job.job_id, str(os.getpid()))
+    while True:
+        try:
+            time.sleep(60)
+        except Exception:  # noqa: S112 - that is the fault
+            continue
+
+
+@stage
 def busy(context: Context) -> None:
     """Work in small pieces, as batches of the network do."""
     record("busy", context.job.job_id, str(os.getpid()))
@@ -157,7 +168,7 @@ def hold(context: Context) -> None:
 def finish(context: Context) -> None:
     """The last step of a job."""
     record("finish", context.job.job_id)
-    context.catalog.jobs.succeed(context.job.job_id)
+    context.catalog.jobs.succeed(context.job.job_id, run=context.run)
 
 
 @stage

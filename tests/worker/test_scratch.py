@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import signal
 import subprocess
@@ -65,3 +66,19 @@ def test_a_folder_without_a_lock_is_left_alone_while_it_may_be_in_the_making(tmp
 
 def test_a_folder_that_is_not_there_holds_nothing(tmp_path: Path) -> None:
     assert sweep(tmp_path / "nowhere") == 0
+
+
+def test_a_folder_that_a_sweep_took_in_the_making_is_made_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real, sweeps = fcntl.flock, iter([True, False])
+
+    def flock(lock: int, how: int) -> None:
+        if how == fcntl.LOCK_EX and next(sweeps):
+            sweep(tmp_path)
+        real(lock, how)
+
+    monkeypatch.setattr("worker.scratch.fcntl.flock", flock)
+    with scratch_folder(tmp_path, "job-1-register") as folder:
+        assert folder.is_dir()
+        (folder / "half").write_text("half")

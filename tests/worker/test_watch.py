@@ -74,8 +74,8 @@ def test_a_step_that_uses_no_processor_for_long_is_told_so(clock: Clock) -> None
         until(lambda: state(process.pid) == "S")
         watch = Watch(process.pid, idle_s=100, clock=clock)
         assert watch.trouble() is None
-        clock.now = 99.0
-        assert watch.trouble() is None
+        for clock.now in (25.0, 50.0, 75.0, 99.0):
+            assert watch.trouble() is None
         clock.now = 100.0
         assert watch.trouble() == ("did nothing for 100 s", False)
         process.kill()
@@ -86,3 +86,13 @@ def test_of_a_process_that_is_gone_nothing_is_said(clock: Clock) -> None:
     process.wait()
     assert process_state(process.pid) is None
     assert Watch(process.pid, clock=clock).trouble() is None
+
+
+def test_a_step_is_not_blamed_for_a_machine_that_stood_still(clock: Clock) -> None:
+    with subprocess.Popen(["/bin/sleep", "60"], start_new_session=True) as process:
+        until(lambda: state(process.pid) == "S")
+        watch = Watch(process.pid, idle_s=100, clock=clock)
+        assert watch.trouble() is None
+        clock.now = 5000.0
+        assert watch.trouble() is None
+        process.kill()

@@ -50,7 +50,7 @@ def encode_map(context: Context) -> None:
     if detector.card.preprocessing.tiles == "touched":
         settings = pipeline_settings(context, version, detector.card)
         kept_alarms(context, version, detector, version.model, settings)
-    context.catalog.jobs.succeed(context.job.job_id)
+    context.catalog.jobs.succeed(context.job.job_id, run=context.run)
 
 
 def encode_reference(context: Context, version: VersionRecord, detector: Detector, model: str) -> None:

@@ -66,6 +66,7 @@ class Context:
     settings: Settings
     catalog: Catalog
     job: JobRecord
+    run: Run  #: this one, for the end of the job
     report: Reporter
     give_way: Callable[[], None]  #: called where what was done is kept; may raise GaveWay
     scratch: Path
@@ -122,7 +123,13 @@ def _context(settings: Settings, catalog: Catalog, job: JobRecord, run: Run, scr
         give_way={"registering": turn.check} if job.kind == "map" else {},
     )
     return Context(
-        settings=settings, catalog=catalog, job=job, report=report, give_way=turn.check, scratch=scratch
+        settings=settings,
+        catalog=catalog,
+        job=job,
+        run=run,
+        report=report,
+        give_way=turn.check,
+        scratch=scratch,
     )
 
 
@@ -142,18 +149,18 @@ def _ended(catalog: Catalog, run: Run, error: Exception) -> None:
     match error:
         case GaveWay():
             log.info("job %s gives way to a survey", run.job_id)
-            catalog.jobs.put_back(*of, "gave way to a survey; goes on after it")
+            catalog.jobs.put_back(*of, "gave way to a survey; goes on after it", begun=run.begun)
         case Cancelled():
             log.info("job %s was dismissed, or another worker has it", run.job_id)
         case Unavailable():
             log.warning("step %s of job %s is interrupted: %s", run.step, run.job_id, error)
             catalog.jobs.interrupt(*of, str(error), begun=run.begun)
         case PipelineError():
-            catalog.jobs.fail(run.job_id, Problem.of(error), step=run.step)
+            catalog.jobs.fail(run.job_id, Problem.of(error), step=run.step, begun=run.begun)
             raise error
         case _ if is_disk_full(error):
             full = NoSpaceLeft("the disk is full; make room, then submit it again")
-            catalog.jobs.fail(run.job_id, Problem.of(full), step=run.step)
+            catalog.jobs.fail(run.job_id, Problem.of(full), step=run.step, begun=run.begun)
             raise full from error
         case _:
             raise error

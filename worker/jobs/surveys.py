@@ -129,7 +129,7 @@ def export_survey(context: Context) -> None:
         objects=None if changes.objects is None else map(_object_record, changes.objects.objects),
         moving=None if changes.objects is None else changes.objects.moving,
     )
-    context.catalog.jobs.succeed(context.job.job_id)
+    context.catalog.jobs.succeed(context.job.job_id, run=context.run)
 
 
 def _refuse(

@@ -6,11 +6,13 @@ import functools
 import json
 import shutil
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from service.catalog import blob_keys
 from service.catalog.records import ModelRecord, VersionRecord
+from service.errors import NotFound
 from worker.detectors.card import Card
 from worker.detectors.registry import trainable_detectors
 from worker.detectors.store import make_detector, read_card, resolve_device, settings_of, weights_of
@@ -74,8 +76,16 @@ def train_model(context: Context) -> None:
     except GaveWay:
         raise
     except Cancelled:
-        context.catalog.blobs.delete_prefix(work)
+        if _is_over(context):  # and does not go on in another run, which needs what this one kept
+            context.catalog.blobs.delete_prefix(work)
         raise
+
+
+def _is_over(context: Context) -> bool:
+    """Tell whether the job was dismissed, or deleted."""
+    with suppress(NotFound):
+        return context.catalog.jobs.get(context.job.job_id).status == "dismissed"
+    return True
 
 
 def _train_pairs(context: Context, asked: _Asked, folder: Path, keep: Callable[[Path], None]) -> None:
@@ -111,7 +121,7 @@ def finish_model(context: Context) -> None:
     blobs.put_file(blob_keys.model_log(context.job.job_id), log)
     encode_reference(context, asked.version, detector, asked.model.model)
     context.catalog.models.save_card(context.job.job_id, card.model_dump(mode="json"))
-    context.catalog.jobs.succeed(context.job.job_id)
+    context.catalog.jobs.succeed(context.job.job_id, run=context.run)
     blobs.delete_prefix(blob_keys.model_work(context.job.job_id))
 
 

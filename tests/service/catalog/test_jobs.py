@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from datetime import timedelta
 from threading import Barrier
 
 import pytest
+from sqlalchemy import update
 
+from service.catalog import tables
 from service.catalog.catalog import Catalog
 from service.catalog.jobs import Run
 from service.catalog.records import JobStatus, Problem
@@ -184,6 +187,7 @@ def test_a_step_has_one_run_at_a_time(catalog: Catalog, job_id: str) -> None:
 def test_a_job_goes_on_to_the_next_step_with_its_attempts_anew(catalog: Catalog, job_id: str) -> None:
     begin(catalog, job_id)
     assert catalog.jobs.lose_attempt(job_id, "register", HOW)
+    begin(catalog, job_id)
     assert catalog.jobs.interrupt(job_id, "register", HOW)
     run = begin(catalog, job_id)
     assert catalog.jobs.advance(run)
@@ -221,6 +225,27 @@ def test_who_looked_before_a_step_began_again_does_not_interrupt_it(catalog: Cat
     assert catalog.jobs.report(second, message="registering", progress=0.5)
 
 
+@pytest.mark.parametrize("ends", ["lose_attempt", "interrupt", "put_back"])
+def test_the_late_word_of_a_run_changes_nothing_of_the_one_that_took_its_place(
+    catalog: Catalog, job_id: str, ends: str
+) -> None:
+    first = begin(catalog, job_id)
+    catalog.jobs.interrupt(job_id, "register", HOW, begun=first.begun)
+    second = begin(catalog, job_id)
+    assert not getattr(catalog.jobs, ends)(job_id, "register", HOW, begun=first.begun)
+    assert not catalog.jobs.fail(job_id, PROBLEM, step="register", begun=first.begun)
+    assert not catalog.jobs.succeed(job_id, run=first)
+    assert catalog.jobs.report(second, message="registering", progress=0.5)
+    assert catalog.jobs.get(job_id).attempts == 0
+
+
+@pytest.mark.parametrize("ends", ["interrupt", "put_back"])
+def test_a_step_that_nobody_has_begun_waits_on_as_it_was(catalog: Catalog, job_id: str, ends: str) -> None:
+    before = catalog.jobs.get(job_id)
+    assert not getattr(catalog.jobs, ends)(job_id, "register", HOW)
+    assert catalog.jobs.get(job_id) == before
+
+
 # attempts: a step is started again twice after a fault of its own, and twenty times after one from outside
 
 
@@ -246,9 +271,11 @@ def test_an_interruption_costs_no_attempt_and_the_twentieth_fails_the_job(
     catalog: Catalog, job_id: str
 ) -> None:
     for _ in range(19):
+        begin(catalog, job_id)
         assert catalog.jobs.interrupt(job_id, "register", HOW)
     job = catalog.jobs.get(job_id)
     assert (job.status, job.attempts, job.interruptions) == ("running", 0, 19)
+    begin(catalog, job_id)
     assert not catalog.jobs.interrupt(job_id, "register", HOW)
     problem = catalog.jobs.get(job_id).problem
     assert problem is not None
@@ -260,6 +287,7 @@ def test_a_step_that_is_interrupted_again_and_again_waits_longer_each_time(
 ) -> None:
     waits = []
     for _ in range(10):
+        begin(catalog, job_id)
         before = now()
         catalog.jobs.interrupt(job_id, "register", HOW)
         (job,) = catalog.jobs.open_jobs()
@@ -330,9 +358,17 @@ def test_jobs_that_wait_are_counted_by_owner_and_surveys_that_wait_by_queue(cata
         1,
         0,
     )
+    assert not catalog.jobs.surveys_wait("geometry")  # a worker that is free is about to begin it
+    _wait_for_2_s(catalog)
     assert catalog.jobs.surveys_wait("geometry")
     assert not catalog.jobs.surveys_wait("inference")
     run = begin(catalog, job.job_id)
     assert (catalog.jobs.waiting(), catalog.jobs.surveys_wait("geometry")) == (0, False)
     catalog.jobs.advance(run)
+    _wait_for_2_s(catalog)
     assert catalog.jobs.surveys_wait("inference")
+
+
+def _wait_for_2_s(catalog: Catalog) -> None:
+    with catalog.database.write() as session:
+        session.execute(update(tables.Job).values(due=now() - timedelta(seconds=2)))
