@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 from contextlib import AbstractContextManager
+from datetime import timedelta
 from pathlib import Path
 
 import numpy as np
@@ -39,7 +40,7 @@ def visited(house: House) -> JobRecord:
 def run_until_killed(job: JobRecord, name: str) -> None:
     """The step in a process that is killed when all is written and the job is not yet marked as done."""
 
-    def killed(self: Jobs, job_id: str) -> bool:
+    def killed(self: Jobs, job_id: str, *, run: Run) -> bool:
         raise KeyboardInterrupt
 
     with pytest.MonkeyPatch.context() as patch:
@@ -371,6 +372,7 @@ def test_a_build_gives_way_to_a_survey_and_goes_on_with_the_pairs_it_had(
     scans = [house.add(f"hall-{number}.pcd", scan) for number, scan in enumerate(house.material.before)]
     build = house.map_of(*scans, house.add("hall-2.pcd", house.material.after), map_id="hall")
     monkeypatch.setattr("worker.reporting._TURN_S", 0.0)
+    monkeypatch.setattr("service.catalog.jobs._BEGINS", timedelta(0))
     run(build, "register")
     job = house.catalog.jobs.get(build.job_id)
     assert (job.status, job.step, job.attempts, job.interruptions) == ("running", "register", 0, 0)
@@ -419,9 +421,9 @@ def test_on_a_full_disk_what_a_step_wrote_aside_is_gone_before_its_end_is_record
     def full(*_: object, **__: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    def fail(self: Jobs, job_id: str, problem: Problem, *, step: str | None = None) -> bool:
+    def fail(self: Jobs, job_id: str, problem: Problem, **at: Any) -> bool:
         left.extend(Settings().scratch_dir().iterdir())
-        return real(self, job_id, problem, step=step)
+        return real(self, job_id, problem, **at)
 
     monkeypatch.setattr("worker.jobs.surveys.locate_survey", full)
     monkeypatch.setattr(Jobs, "fail", fail)
