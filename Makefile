@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 SERVERS := build/servers
 
-.PHONY: help demo up test test-fast acceptance-shared check format bench chaos fuzz load soak openapi clean
+.PHONY: help servers demo up test test-fast acceptance-shared check format bench chaos fuzz load soak openapi clean
 help: ## this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
 
@@ -20,6 +20,8 @@ test: $(INSTALLED) ## every test, on all cores
 
 test-fast: $(INSTALLED) ## the tests that take no longer than a second or so: under a minute on two cores
 	$(BIN)/pytest -m fast -n auto --dist loadscope
+
+servers: $(SERVERS)/bin/moto_server ## an S3 server for tests, in an environment of its own; PostgreSQL has to be there
 
 acceptance-shared: $(INSTALLED) $(SERVERS)/bin/moto_server ## tests of the catalog on PostgreSQL; acceptance with S3 too, one host and two
 	SPICD_TEST_DATABASE_URL=postgresql $(BIN)/pytest tests/service/catalog tests/service/api -m fast -n auto --dist loadscope

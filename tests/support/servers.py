@@ -30,7 +30,7 @@ from service.up.embedded_redis import EmbeddedRedis
 from tests.support.processes import until
 
 SERVERS = Path(__file__).parents[2] / "build" / "servers"  #: where `make acceptance-shared` installs one
-NO_S3 = "no S3 server on this machine: `make acceptance-shared` installs one"
+NO_S3 = "no S3 server on this machine: `make servers` installs one"
 NO_POSTGRESQL = "no PostgreSQL on this machine: initdb and postgres are not on the PATH"
 _STARTS_S = 30
 _SIGNED = {"Authorization": "AWS4-HMAC-SHA256 Credential=key/20260301/us-east-1/s3/aws4_request"}
