@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import os
 import tempfile
 import time
 from collections.abc import Iterator
@@ -70,6 +71,41 @@ def test_a_moved_file_is_gone_where_it_was(either: Blobs, tmp_path: Path) -> Non
     either.put_file("scans/s/scan.bin", source, move=True)
     assert either.get_bytes("scans/s/scan.bin") == b"scan"
     assert not source.exists()
+
+
+@pytest.fixture
+def synced(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[str]:
+    """What was brought to the disk so far, as paths under `tmp_path`, with the names of the time."""
+    paths: list[str] = []
+
+    def fsync(descriptor: int) -> None:
+        paths.append(os.path.relpath(Path(f"/proc/self/fd/{descriptor}").readlink(), tmp_path))
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    return paths
+
+
+FOLDERS = ["blobs/scans/s", "blobs/scans", "blobs"]
+
+
+def test_a_file_is_on_the_disk_before_it_has_its_name_and_then_the_name_is(
+    blobs: Blobs, tmp_path: Path, synced: list[str]
+) -> None:
+    (tmp_path / "hall.part").write_bytes(b"scan")
+    blobs.put_file("scans/s/hall.ply", tmp_path / "hall.part", move=True)
+    assert synced == ["hall.part", *FOLDERS]
+
+
+def test_whatever_is_put_is_on_the_disk(blobs: Blobs, tmp_path: Path, synced: list[str]) -> None:
+    blobs.put_bytes("scans/s/bytes", b"scan")
+    assert synced == ["blobs/scans/s/bytes", *FOLDERS]
+    synced.clear()
+    (tmp_path / "kept").write_bytes(b"scan")
+    blobs.put_file("scans/s/file", tmp_path / "kept")
+    assert synced == ["blobs/scans/s/file", *FOLDERS]
+    synced.clear()
+    blobs.copy("scans/s/file", "scans/s/copy")
+    assert synced == FOLDERS
 
 
 def test_a_local_blob_is_read_where_it_lies(blobs: Blobs, tmp_path: Path) -> None:
