@@ -240,6 +240,21 @@ def test_a_crowd_of_silent_clients_does_not_keep_others_out(server: Server) -> N
             connection.close()
 
 
+def test_a_crowd_that_goes_on_sending_behind_refusals_does_not_keep_others_out(server: Server) -> None:
+    server.server.config.http_protocol_class = limited_protocol(Limits(connections=6, linger_s=30))
+    crowd = [server.connect() for _ in range(6)]
+    try:
+        for connection in crowd:
+            connection.sendall(UPLOAD % 90_000_000)  # more than is taken
+            assert connection.recv(65536).startswith(b"HTTP/1.1 413")
+            connection.sendall(b"x")
+        time.sleep(0.2)
+        assert all(server.answers() for _ in range(5))
+    finally:
+        for connection in crowd:
+            connection.close()
+
+
 def test_where_every_connection_is_at_work_one_more_is_told_to_come_again(server: Server) -> None:
     server.server.config.http_protocol_class = limited_protocol(Limits(connections=3))
     busy = [server.connect() for _ in range(3)]
