@@ -43,7 +43,7 @@ class Limits:
     """How long each state may last, in seconds, and how many connections there may be."""
 
     connections: int = 400
-    header_s: float = 10.0
+    header_s: float = 45.0  #: bad Wi-Fi pauses for half a minute; at the cap a silent one goes at once
     header_bytes: int = 16 * 1024
     body_window_s: float = 60.0
     body_bytes: int = (

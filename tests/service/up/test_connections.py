@@ -120,6 +120,10 @@ def test_a_header_that_comes_byte_by_byte_is_cut_off(server: Server, sent: bytes
         assert time.monotonic() - started < LIMITS.header_s + 0.5
 
 
+def test_a_header_that_bad_wi_fi_holds_up_for_half_a_minute_is_waited_for() -> None:
+    assert Limits().header_s > 30
+
+
 def test_a_header_behind_an_answered_request_has_the_same_limit(server: Server) -> None:
     with server.connect() as connection:
         connection.sendall(b"GET /health/live HTTP/1.1\r\nHost: localhost\r\n\r\n")
