@@ -25,6 +25,7 @@ from fastapi.testclient import TestClient
 
 from service.catalog.tallies import FAULTS
 from service.settings import Settings
+from service.up.launcher import KEEP_ALIVE_S
 from tests.support.samples import RememberingQueue, running, settings_in
 from tests.test_imports import ROOT
 from worker.__main__ import _parse
@@ -323,6 +324,10 @@ def test_the_proxy_takes_what_the_service_takes_and_hides_its_metrics() -> None:
     text = (DOCKER / "Caddyfile").read_text()
     (size,) = re.findall(r"max_size (\d+)GiB", text)
     assert int(size) * 1024**3 == Settings.model_fields["max_upload_bytes"].default
+    (body, answer) = (int(re.findall(rf"{word} (\d+)h", text)[0]) * 3600 for word in ("read_body", "write"))
+    assert answer > body >= Settings.model_fields["upload_timeout_s"].default
+    (idle,) = re.findall(r"keepalive (\d+)s", text)
+    assert int(idle) < KEEP_ALIVE_S
     assert "reverse_proxy service:8000" in text
     assert re.search(r"handle /metrics \{\s*respond 404", text)
     assert text.count("{") == text.count("}")

@@ -42,6 +42,9 @@ log = logging.getLogger("spicd")
 
 _LOOK_S = 0.2  #: between two looks at the children
 _API_STARTS_S = 30.0
+KEEP_ALIVE_S = (
+    75  #: longer than proxies keep a connection (nginx 60 s), or they would send into one that just closes
+)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -215,6 +218,7 @@ def _serve(app: FastAPI, listening: socket.socket, limits: Limits) -> Iterator[t
         log_config=None,
         access_log=False,
         server_header=False,
+        timeout_keep_alive=KEEP_ALIVE_S,
         timeout_graceful_shutdown=2,
     )
     server = uvicorn.Server(config)

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import os
 import stat
+import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import httpx
 import pytest
 
 from service.catalog.keys import open_keys
@@ -19,10 +22,11 @@ class Started(Exception):
     """It got as far as being ready."""
 
 
-def launch(folder: Path, **given: Any) -> None:
-    """Start the API alone, without a queue, and end once it is ready."""
+def launch(folder: Path, then: Callable[[int], None] = lambda _: None, **given: Any) -> None:
+    """Start the API alone, without a queue, and end once it is ready and `then` was called with its port."""
 
-    def ready(_: Running) -> None:
+    def ready(running: Running) -> None:
+        then(int(running.url.rpartition(":")[2]))
         raise Started
 
     settings = Settings(
@@ -92,3 +96,19 @@ def test_a_folder_that_cannot_be_made_is_told_in_a_sentence(tmp_path: Path) -> N
     (tmp_path / "file").touch()
     with pytest.raises(LaunchFailed, match="SPICD_DATA_DIR"):
         launch(tmp_path / "file" / "data")
+
+
+def test_a_connection_of_a_proxy_is_kept_longer_than_uvicorn_does(tmp_path: Path) -> None:
+    addresses: list[object] = []
+
+    def ask_twice(port: int) -> None:
+        limits = httpx.Limits(keepalive_expiry=60)
+        with httpx.Client(base_url=f"http://127.0.0.1:{port}", limits=limits) as client:
+            for pause_s in (0.0, 6.0):
+                time.sleep(pause_s)
+                answer = client.get("/health/live")
+                addresses.append(answer.extensions["network_stream"].get_extra_info("client_addr"))
+
+    with pytest.raises(Started):
+        launch(tmp_path, ask_twice)
+    assert addresses[0] == addresses[1]
