@@ -320,6 +320,17 @@ def test_the_service_container_serves_alone_needs_keys_and_says_how_it_is() -> N
     assert any(name == "HEALTHCHECK" and probe in rest for name, rest in STAGES["service"].lines)
 
 
+def test_uploads_may_end_before_the_service_is_killed() -> None:
+    part = SERVICES["service"]
+    grace = int(environment_of("service")["SPICD_SHUTDOWN_GRACE_S"])
+    assert 300 <= grace < int(part["stop_grace_period"].removesuffix("s")) - 5
+    pod = DEPLOYMENTS["Deployment service"]["template"]["spec"]
+    (sleep, seconds) = pod["containers"][0]["lifecycle"]["preStop"]["exec"]["command"]
+    grace = int(OBJECTS["ConfigMap spicd-service"]["data"]["SPICD_SHUTDOWN_GRACE_S"])
+    assert sleep == "sleep"
+    assert 300 <= grace < pod["terminationGracePeriodSeconds"] - int(seconds) - 5
+
+
 def test_the_proxy_takes_what_the_service_takes_and_hides_its_metrics() -> None:
     text = (DOCKER / "Caddyfile").read_text()
     (size,) = re.findall(r"max_size (\d+)GiB", text)

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import os
+import signal
+import socket
 import stat
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -29,7 +32,11 @@ def launch(folder: Path, then: Callable[[int], None] = lambda _: None, **given: 
         then(int(running.url.rpartition(":")[2]))
         raise Started
 
-    settings = Settings(
+    up(api_alone(folder, **given), on_ready=ready)
+
+
+def api_alone(folder: Path, **given: Any) -> Settings:
+    return Settings(
         data_dir=folder,
         port=0,
         redis_url="redis://127.0.0.1:1/0",
@@ -37,7 +44,6 @@ def launch(folder: Path, then: Callable[[int], None] = lambda _: None, **given: 
         inference_workers=0,
         **given,
     )
-    up(settings, on_ready=ready)
 
 
 def test_beyond_loopback_it_does_not_start_without_a_key_and_says_how_one_is_made(tmp_path: Path) -> None:
@@ -112,3 +118,49 @@ def test_a_connection_of_a_proxy_is_kept_longer_than_uvicorn_does(tmp_path: Path
     with pytest.raises(Started):
         launch(tmp_path, ask_twice)
     assert addresses[0] == addresses[1]
+
+
+HEAD = b"ply\nformat ascii 1.0\n"
+UPLOAD = b"POST /scans HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/octet-stream\r\nContent-Length: %d\r\n\r\n"
+
+
+def test_an_upload_that_runs_when_the_end_is_asked_for_may_end(tmp_path: Path) -> None:
+    robots: list[threading.Thread] = []
+    said: list[bytes] = []
+
+    def upload(connection: socket.socket) -> None:
+        with connection:
+            time.sleep(3)  # longer than anything is waited for by default
+            connection.sendall(b"x" * 1000)
+            said.append(connection.recv(65536))
+
+    def begin(port: int) -> None:
+        connection = socket.create_connection(("127.0.0.1", port))
+        connection.sendall(UPLOAD % (len(HEAD) + 1000) + HEAD)
+        time.sleep(0.5)
+        robots.append(threading.Thread(target=upload, args=(connection,)))
+        robots[0].start()
+
+    with pytest.raises(Started):
+        launch(tmp_path, begin, shutdown_grace_s=20)
+    robots[0].join(10)
+    assert said[0].startswith(b"HTTP/1.1 201")
+
+
+def test_asked_twice_it_waits_for_no_upload(tmp_path: Path) -> None:
+    connections: list[socket.socket] = []
+
+    def ask_twice() -> None:
+        for _ in range(2):
+            time.sleep(0.7)
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    def begin(running: Running) -> None:
+        connections.append(socket.create_connection(("127.0.0.1", int(running.url.rpartition(":")[2]))))
+        connections[0].sendall(UPLOAD % 1_000_000 + HEAD)
+        threading.Thread(target=ask_twice).start()
+
+    started = time.monotonic()
+    up(api_alone(tmp_path, shutdown_grace_s=60), on_ready=begin)
+    assert time.monotonic() - started < 15
+    connections[0].close()
