@@ -67,7 +67,7 @@ def test_with_a_key_it_starts(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("given", [{}, {"host": "0.0.0.0", "auth": "none"}])
 def test_on_loopback_or_behind_something_that_asks_it_needs_none(
-    tmp_path: Path, given: dict[str, str]
+    tmp_path: Path, given: dict[str, Any]
 ) -> None:
     with pytest.raises(Started):
         launch(tmp_path, **given)
