@@ -110,6 +110,7 @@ def create_app(settings: Settings, *, queue: Queue | None = None) -> FastAPI:
         lifespan=_lifespan(settings, queue),
         docs_url=None,
         redoc_url=None,
+        redirect_slashes=False,  # it would be asked before any key and host, and name a host of the client's choice
         dependencies=[Depends(authorize)],
     )
     app.state.metrics = Metrics()
