@@ -12,6 +12,7 @@ tables are copied once more, and do not have these rows.
 
 from __future__ import annotations
 
+import contextlib
 import json
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass
@@ -110,6 +111,10 @@ def _make(folder: Path) -> None:
         raise BackupFailed(f"the folder {folder} cannot be used ({error.strerror})") from error
     if taken:
         raise BackupFailed(f"the folder {folder} is not empty; name a new one")
+    with contextlib.suppress(
+        PermissionError
+    ):  # that of somebody else; what is written into it is still ours alone
+        folder.chmod(0o700)
 
 
 def _blobs_of(folder: Path) -> Blobs:

@@ -10,6 +10,7 @@ from rich.table import Table
 
 from service.cli.terminal import Terminal
 from service.client import ClientError
+from service.permissions import make_private, private_files
 from service.settings import Settings
 
 if TYPE_CHECKING:
@@ -45,7 +46,10 @@ def _run(what: str, ctx: typer.Context, folder: Path, data_dir: Path | None) -> 
     settings = Settings() if data_dir is None else Settings(data_dir=data_dir)
     call = backups.backup if what == "backup" else backups.restore
     try:
-        done = call(settings, folder)
+        with private_files():
+            done = call(settings, folder)
+            if what == "restore" and None in (settings.database_url, settings.blob_url):
+                make_private(settings.data_dir)
     except (backups.BackupFailed, ServiceError) as error:
         raise ClientError(str(error)) from error
     terminal.show(_document(done), _table)

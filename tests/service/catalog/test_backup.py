@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -191,3 +192,24 @@ def run(*words: str) -> None:
     except SystemExit as ended:
         if ended.code not in (0, None):
             raise
+
+
+def test_nobody_else_on_the_machine_reads_a_copy_or_what_was_restored(
+    catalog: Catalog, settings: Settings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fill(catalog)
+    if settings.database_url is not None:
+        monkeypatch.setenv("SPICD_DATABASE_URL", settings.database_url)
+    copy, other = tmp_path / "copy", tmp_path / "other"
+    before = os.umask(0o022)
+    try:
+        for folder in (copy, other / "blobs"):
+            folder.mkdir(parents=True)  # empty, and open to all
+        run("backup", str(copy), "--data-dir", str(settings.data_dir))
+        monkeypatch.delenv("SPICD_DATABASE_URL", raising=False)
+        run("restore", str(copy), "--data-dir", str(other))
+    finally:
+        os.umask(before)
+    paths = [path for folder in (copy, other) for path in (folder, *folder.rglob("*"))]
+    assert len(paths) > 20
+    assert [path for path in paths if path.stat().st_mode & 0o077] == []
