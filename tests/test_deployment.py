@@ -437,6 +437,35 @@ def test_what_names_a_deployment_names_one_that_is_there() -> None:
     assert OBJECTS["Service service"]["spec"]["selector"] in labels
 
 
+# Copies
+
+BACKUP = (ROOT / "docs/backup.md").read_text()
+
+
+def test_the_job_that_takes_a_copy_is_one_and_has_what_the_service_has() -> None:
+    (text,) = re.findall(r"```yaml\n(.*?)```", BACKUP, re.DOTALL)
+    job = yaml.safe_load(text)
+    kubernetes_validate.validate(job, KUBERNETES, strict=True)
+    pod, service = job["spec"]["template"]["spec"], DEPLOYMENTS["Deployment service"]["template"]["spec"]
+    (container,), (of_service,) = pod["containers"], service["containers"]
+    assert pod["securityContext"] == service["securityContext"]
+    assert [container[name] for name in ("image", "securityContext")] == [
+        of_service[name] for name in ("image", "securityContext")
+    ]
+    assert container["envFrom"][0] in of_service["envFrom"]
+    assert all(mount in container["volumeMounts"] for mount in of_service["volumeMounts"])
+    labels = job["spec"]["template"]["metadata"]["labels"]
+    assert labels.items() >= OBJECTS["NetworkPolicy stores"]["spec"]["podSelector"]["matchLabels"].items()
+
+
+def test_the_commands_that_copy_in_containers_name_services_and_folders_that_are_there() -> None:
+    ran = re.findall(r"run --rm --no-deps --volume \S+:(\S+) (\S+) \\\n +spicd (\w+) (\S+)", BACKUP)
+    assert [command for _, _, command, _ in ran] == ["backup", "restore"]
+    for mounted, service, _, folder in ran:
+        assert service in OURS
+        assert folder.startswith(f"{mounted}/")
+
+
 # What is watched
 
 RULES = [
