@@ -437,6 +437,13 @@ def test_what_names_a_deployment_names_one_that_is_there() -> None:
     assert OBJECTS["Service service"]["spec"]["selector"] in labels
 
 
+def test_prometheus_brings_the_key_that_metrics_take() -> None:
+    (job,) = yaml.safe_load((DOCKER / "monitoring/prometheus.yaml").read_text())["scrape_configs"]
+    assert job["authorization"]["credentials_file"]
+    for spec in DEPLOYMENTS.values():  # they would have it asked without one: 401
+        assert "prometheus.io/scrape" not in spec["template"]["metadata"].get("annotations", {})
+
+
 # Copies
 
 BACKUP = (ROOT / "docs/backup.md").read_text()
