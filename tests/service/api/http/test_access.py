@@ -182,7 +182,10 @@ def test_a_bound_key_sees_its_maps_alone_whichever_way_it_asks(guarded: TestClie
     assert {one["map_id"] for one in guarded.get("/maps", headers=bound).json()["maps"]} == {"lobby"}
     assert {one["map_id"] for one in guarded.get("/jobs", headers=bound).json()["jobs"]} == {"lobby"}
     assert guarded.get("/jobs?map_id=vault", headers=bound).json()["jobs"] == []
-    assert guarded.get(f"/maps/lobby/changes?survey={theirs}", headers=bound).status_code == 404
+    running_there, _ = add_survey(catalog, map_id="vault", ready=False)
+    for survey in (theirs, running_there, "survey-none"):
+        answer = guarded.get(f"/maps/lobby/changes?survey={survey}", headers=bound)
+        assert (answer.status_code, answer.json()["detail"]) == (404, f"no survey '{survey}' of map 'lobby'")
     taken = guarded.post("/maps/lobby/versions", json={"survey_id": theirs}, headers=bound)
     assert taken.status_code in (404, 409, 422)
 
