@@ -214,6 +214,21 @@ def test_a_model_of_another_map_is_not_there_for_a_bound_key(guarded: TestClient
     assert base.status_code == 422
 
 
+def test_a_bound_key_is_shown_the_newest_version_of_its_own(guarded: TestClient) -> None:
+    catalog = catalog_of(guarded)
+    for map_id in ("lobby", "vault"):
+        model, job = catalog.models.create(map_id, name="site-net", minutes=1)
+        catalog.models.save_card(job.job_id, {"name": "site-net", "version": model.model.partition("/")[2]})
+        catalog.jobs.succeed(job.job_id)
+    for key, version in (
+        (key_for(guarded, "changes:read", maps=["lobby"]), "1"),
+        (key_for(guarded, "admin"), "2"),
+    ):
+        assert guarded.get("/models/site-net", headers=key).json()["version"] == version
+    bound = key_for(guarded, "changes:read", maps=["lobby"])
+    assert guarded.get("/models/site-net?version=2", headers=bound).status_code == 404
+
+
 def test_a_job_is_dismissed_by_who_may_ask_for_its_kind(guarded: TestClient) -> None:
     catalog = catalog_of(guarded)
     _, survey_job = add_survey(catalog, map_id="lobby", ready=False)
