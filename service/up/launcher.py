@@ -265,7 +265,9 @@ def _app(settings: Settings) -> FastAPI:
     """Return the service's own API; imported here, for tests of the launcher bring another."""
     from service.api.app import create_app  # noqa: PLC0415
 
-    return create_app(settings)
+    app = create_app(settings)
+    app.openapi()  # derived now: it takes a third of a second, in which no other request would be answered
+    return app
 
 
 def _require_worker_packages(settings: Settings) -> None:

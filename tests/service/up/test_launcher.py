@@ -18,7 +18,7 @@ import pytest
 from service.catalog.keys import open_keys
 from service.settings import Settings
 from service.up.embedded_redis import LaunchFailed
-from service.up.launcher import Running, environment_of, up
+from service.up.launcher import Running, _app, environment_of, up
 
 
 class Started(Exception):
@@ -164,3 +164,7 @@ def test_asked_twice_it_waits_for_no_upload(tmp_path: Path) -> None:
     up(api_alone(tmp_path, shutdown_grace_s=60), on_ready=begin)
     assert time.monotonic() - started < 15
     connections[0].close()
+
+
+def test_the_api_knows_its_own_description_before_anybody_asks(tmp_path: Path) -> None:
+    assert _app(api_alone(tmp_path)).openapi_schema is not None
