@@ -38,6 +38,7 @@ _NO_LINKS = (
     errno.EMLINK,
     errno.EXDEV,
 )  #: by file system, or no more
+_NO_SYNC = (errno.EINVAL, errno.ENOTSUP, errno.EBADF)  #: of folders, by file system
 _PARTS_AT_ONCE = 2  #: obstore holds 12 parts of 5 MB by default, more than an upload may cost
 _RETRIES = 3
 _LONGEST_STREAM_S = 24 * 3600  #: a large blob to a slow client; that it stalls is noticed piece by piece
@@ -214,14 +215,14 @@ class Blobs:
     def _sync(self, key: str) -> None:
         """Have a blob in a local folder on the disk; another store has it there when it says so."""
         if self._root is not None:
-            fsync(self._root / key)
+            _fsync(self._root / key)
             self._sync_folders(key)
 
     def _sync_folders(self, key: str) -> None:
         """Have the name of a blob on the disk, with those of the folders that it may have been the first in."""
         if self._root is not None:
             for number in range(key.count("/") + 1):
-                fsync((self._root / key).parents[number])
+                _fsync((self._root / key).parents[number])
 
 
 def _limited(url: str, patience: Patience, request_s: float) -> ObjectStore:
@@ -300,19 +301,26 @@ def _linked(source: Path, target: Path) -> bool:
     return True
 
 
-def fsync(path: Path) -> None:
-    """Return when what was written to a file, or which names a folder has, is on the disk (fsync(2))."""
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+def _fsync(path: Path) -> None:
+    """Return when what was written to a file, or which names a folder has, is on the disk (fsync(2)).
+
+    Something that was deleted meanwhile needs it no more, and some file systems know no sync of folders.
+    """
+    with contextlib.suppress(FileNotFoundError):
+        descriptor = os.open(path, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        except OSError as error:
+            if error.errno not in _NO_SYNC:
+                raise
+        finally:
+            os.close(descriptor)
 
 
 def _renamed(source: Path, target: Path) -> bool:
     """Move a file that is on the disk before its name says that it is whole; False where that is another file system."""
     target.parent.mkdir(parents=True, exist_ok=True)
-    fsync(source)
+    _fsync(source)
     try:
         source.replace(target)
     except OSError as error:

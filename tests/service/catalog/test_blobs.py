@@ -16,7 +16,7 @@ import pytest
 from service.catalog import blob_keys
 from service.catalog.blobs import Blobs
 from service.catalog.patience import Patience
-from service.errors import BlobsUnavailable
+from service.errors import BlobsUnavailable, DiskFull
 from tests.support.servers import SilentServer, free_port, s3_environment
 
 
@@ -106,6 +106,25 @@ def test_whatever_is_put_is_on_the_disk(blobs: Blobs, tmp_path: Path, synced: li
     synced.clear()
     blobs.copy("scans/s/file", "scans/s/copy")
     assert synced == FOLDERS
+
+
+def test_a_disk_that_fails_to_sync_is_told_and_one_that_knows_none_is_taken_as_it_is(
+    blobs: Blobs, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def failing(number: int) -> None:
+        def fsync(_: int) -> None:
+            raise OSError(number, os.strerror(number))
+
+        monkeypatch.setattr(os, "fsync", fsync)
+
+    failing(errno.EINVAL)
+    blobs.put_bytes("a/b", b"x")
+    failing(errno.ENOSPC)
+    with pytest.raises(DiskFull):
+        blobs.put_bytes("a/b", b"x")
+    failing(errno.EIO)
+    with pytest.raises(BlobsUnavailable, match="Input/output error"):
+        blobs.put_bytes("a/b", b"x")
 
 
 def test_a_local_blob_is_read_where_it_lies(blobs: Blobs, tmp_path: Path) -> None:
