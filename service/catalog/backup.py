@@ -14,12 +14,13 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from datetime import datetime
 from itertools import islice
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, TextIO, get_args
 
 import sqlalchemy as sa
 from sqlalchemy.orm import Session
@@ -167,6 +168,7 @@ def _copy_tables(database: Database, folder: Path) -> tuple[dict[str, int], set[
                     file.write(json.dumps(dict(row), default=datetime.isoformat) + "\n")
                     counts[table.name] += 1
                     needed.update(_named(table.name, row))
+                _sync(file)
     return counts, needed
 
 
@@ -203,9 +205,17 @@ def _sealed(folder: Path, revision: str, rows: dict[str, int], blobs: int, missi
         missing=tuple(missing),
     )
     aside = folder / f"{_MANIFEST}.part"
-    aside.write_text(json.dumps(asdict(sealed), indent=2) + "\n", encoding="utf-8")
+    with aside.open("w", encoding="utf-8") as file:
+        file.write(json.dumps(asdict(sealed), indent=2) + "\n")
+        _sync(file)
     aside.replace(folder / _MANIFEST)
     return sealed
+
+
+def _sync(file: TextIO) -> None:
+    """Have what was written on the disk: a manifest that outlives a power cut says that all the rest did."""
+    file.flush()
+    os.fsync(file.fileno())
 
 
 def _opened(folder: Path) -> Backup:

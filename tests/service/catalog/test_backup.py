@@ -256,3 +256,18 @@ def test_a_database_of_another_revision_that_has_keys_is_not_mixed_with_the_copy
         keys.add("first", scopes=["admin"])
     with pytest.raises(BackupFailed, match="at revision 0008 and those of the copy at 0007"):
         restore(other, tmp_path / "copy")
+
+
+def test_the_manifest_gets_its_name_when_all_the_rest_is_on_the_disk(
+    catalog: Catalog, settings: Settings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    synced: list[str] = []
+    monkeypatch.setattr(
+        os, "fsync", lambda number: synced.append(str(Path(f"/proc/self/fd/{number}").readlink()))
+    )
+    fill(catalog)
+    backup(settings, tmp_path / "copy")
+    lines = [str(path) for path in (tmp_path / "copy/tables").iterdir()]
+    assert len(lines) == len(Base.metadata.sorted_tables)
+    assert set(lines) <= set(synced)
+    assert synced[-1] == str(tmp_path / "copy/backup.json.part")
