@@ -25,6 +25,7 @@ from fastapi.testclient import TestClient
 
 from service.catalog.tallies import FAULTS
 from service.settings import Settings
+from service.up.launcher import KEEP_ALIVE_S
 from tests.support.samples import RememberingQueue, running, settings_in
 from tests.test_imports import ROOT
 from worker.__main__ import _parse
@@ -319,10 +320,25 @@ def test_the_service_container_serves_alone_needs_keys_and_says_how_it_is() -> N
     assert any(name == "HEALTHCHECK" and probe in rest for name, rest in STAGES["service"].lines)
 
 
+def test_uploads_may_end_before_the_service_is_killed() -> None:
+    part = SERVICES["service"]
+    grace = int(environment_of("service")["SPICD_SHUTDOWN_GRACE_S"])
+    assert 300 <= grace < int(part["stop_grace_period"].removesuffix("s")) - 5
+    pod = DEPLOYMENTS["Deployment service"]["template"]["spec"]
+    (sleep, seconds) = pod["containers"][0]["lifecycle"]["preStop"]["exec"]["command"]
+    grace = int(OBJECTS["ConfigMap spicd-service"]["data"]["SPICD_SHUTDOWN_GRACE_S"])
+    assert sleep == "sleep"
+    assert 300 <= grace < pod["terminationGracePeriodSeconds"] - int(seconds) - 5
+
+
 def test_the_proxy_takes_what_the_service_takes_and_hides_its_metrics() -> None:
     text = (DOCKER / "Caddyfile").read_text()
     (size,) = re.findall(r"max_size (\d+)GiB", text)
     assert int(size) * 1024**3 == Settings.model_fields["max_upload_bytes"].default
+    (body, answer) = (int(re.findall(rf"{word} (\d+)h", text)[0]) * 3600 for word in ("read_body", "write"))
+    assert answer > body >= Settings.model_fields["upload_timeout_s"].default
+    (idle,) = re.findall(r"keepalive (\d+)s", text)
+    assert int(idle) < KEEP_ALIVE_S
     assert "reverse_proxy service:8000" in text
     assert re.search(r"handle /metrics \{\s*respond 404", text)
     assert text.count("{") == text.count("}")
@@ -419,6 +435,42 @@ def test_what_names_a_deployment_names_one_that_is_there() -> None:
             wanted = one["spec"]["podSelector"].get("matchLabels", {})
             assert any(wanted.items() <= of.items() for of in labels)
     assert OBJECTS["Service service"]["spec"]["selector"] in labels
+
+
+def test_prometheus_brings_the_key_that_metrics_take() -> None:
+    (job,) = yaml.safe_load((DOCKER / "monitoring/prometheus.yaml").read_text())["scrape_configs"]
+    assert job["authorization"]["credentials_file"]
+    for spec in DEPLOYMENTS.values():  # they would have it asked without one: 401
+        assert "prometheus.io/scrape" not in spec["template"]["metadata"].get("annotations", {})
+
+
+# Copies
+
+BACKUP = (ROOT / "docs/backup.md").read_text()
+
+
+def test_the_job_that_takes_a_copy_is_one_and_has_what_the_service_has() -> None:
+    (text,) = re.findall(r"```yaml\n(.*?)```", BACKUP, re.DOTALL)
+    job = yaml.safe_load(text)
+    kubernetes_validate.validate(job, KUBERNETES, strict=True)
+    pod, service = job["spec"]["template"]["spec"], DEPLOYMENTS["Deployment service"]["template"]["spec"]
+    (container,), (of_service,) = pod["containers"], service["containers"]
+    assert pod["securityContext"] == service["securityContext"]
+    assert [container[name] for name in ("image", "securityContext")] == [
+        of_service[name] for name in ("image", "securityContext")
+    ]
+    assert container["envFrom"][0] in of_service["envFrom"]
+    assert all(mount in container["volumeMounts"] for mount in of_service["volumeMounts"])
+    labels = job["spec"]["template"]["metadata"]["labels"]
+    assert labels.items() >= OBJECTS["NetworkPolicy stores"]["spec"]["podSelector"]["matchLabels"].items()
+
+
+def test_the_commands_that_copy_in_containers_name_services_and_folders_that_are_there() -> None:
+    ran = re.findall(r"run --rm --no-deps --volume \S+:(\S+) (\S+) \\\n +spicd (\w+) (\S+)", BACKUP)
+    assert [command for _, _, command, _ in ran] == ["backup", "restore"]
+    for mounted, service, _, folder in ran:
+        assert service in OURS
+        assert folder.startswith(f"{mounted}/")
 
 
 # What is watched

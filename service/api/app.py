@@ -6,7 +6,6 @@ import asyncio
 import contextlib
 from collections.abc import AsyncIterator
 from importlib.metadata import PackageNotFoundError, version
-from pathlib import Path
 from typing import Any
 
 from fastapi import Depends, FastAPI
@@ -111,6 +110,7 @@ def create_app(settings: Settings, *, queue: Queue | None = None) -> FastAPI:
         lifespan=_lifespan(settings, queue),
         docs_url=None,
         redoc_url=None,
+        redirect_slashes=False,  # it would be asked before any key and host, and name a host of the client's choice
         dependencies=[Depends(authorize)],
     )
     app.state.metrics = Metrics()
@@ -131,8 +131,8 @@ def _lifespan(settings: Settings, queue: Queue | None) -> Any:
         used = queue or JobQueue(settings.redis_url or "", timeout_s=settings.job_timeout_s)
         catalog = await run_in_threadpool(open_catalog, settings, patience=REQUESTS)
         dispatcher = Dispatcher(catalog.jobs, used)
-        await run_in_threadpool(sweep, settings.data_dir / INCOMING)
-        sweeping = asyncio.create_task(_sweep(settings.data_dir / INCOMING))
+        await run_in_threadpool(_sweep, settings)
+        sweeping = asyncio.create_task(_go_on_sweeping(settings))
         await run_in_threadpool(catalog.disk.load_ballast)
         app.state.services = Services(
             settings=settings,
@@ -159,12 +159,16 @@ def _lifespan(settings: Settings, queue: Queue | None) -> Any:
     return lifespan
 
 
-async def _sweep(incoming: Path) -> None:
-    """Remove what uploads of killed processes left, from time to time."""
+async def _go_on_sweeping(settings: Settings) -> None:
     while True:
         await asyncio.sleep(_SWEEP_EVERY_S)
         with contextlib.suppress(OSError):  # the disk is away; next time
-            await run_in_threadpool(sweep, incoming)
+            await run_in_threadpool(_sweep, settings)
+
+
+def _sweep(settings: Settings) -> None:
+    """Remove what uploads of killed processes left."""
+    sweep(settings.data_dir / INCOMING, upload_timeout_s=settings.upload_timeout_s)
 
 
 def _version() -> str:

@@ -19,6 +19,7 @@ from service.api.http.documents import Link, Request, link
 from service.api.http.fields import Id, instant
 from service.api.http.paging import Cursor, decoded, encoded, finite, next_link
 from service.api.http.problems import documented
+from service.catalog.catalog import Catalog
 from service.catalog.changes import ChangeFilter, ChangePosition
 from service.catalog.records import Bounds, rfc3339
 from service.errors import NotFound
@@ -129,8 +130,8 @@ def get_changes(
     """
     catalog = services.catalog
     anchor = catalog.maps.ready(map_id).anchor
-    if asked.survey is not None and catalog.surveys.ready(asked.survey).map_id != map_id:
-        raise NotFound(f"survey {asked.survey!r} is not of map {map_id!r}")
+    if asked.survey is not None:
+        _require_survey(catalog, asked.survey, map_id)
     since, until = (None, None) if asked.datetime is None else span_of(asked.datetime)
     page = catalog.changes.page(
         ChangeFilter(
@@ -152,6 +153,17 @@ def get_changes(
     if page.following is not None:
         links.append(next_link(request, cursor_of(page.following), features.MEDIA_TYPE))
     return feature_response(page.items, matched=page.matched, links=links, anchor=anchor)
+
+
+def _require_survey(catalog: Catalog, survey_id: str, map_id: str) -> None:
+    """Raise NotFound for a survey of another map, before anything is told of it, and NotReady."""
+    try:
+        is_of_map = catalog.surveys.get(survey_id).map_id == map_id
+    except NotFound:
+        is_of_map = False
+    if not is_of_map:
+        raise NotFound(f"no survey {survey_id!r} of map {map_id!r}")
+    catalog.surveys.ready(survey_id)
 
 
 def cursor_of(position: ChangePosition) -> str:

@@ -52,13 +52,17 @@ def parts(services: Services) -> dict[str, Part]:
 
 
 def _ask_workers(queue: Queue) -> None:
-    """Return where each queue has a worker that answers and none that is silent. Raises Unavailable."""
+    """Return where each queue has a worker that answers and none that is silent. Raises Unavailable.
+
+    Its sentence is open to everybody, so it counts workers: their names are those of hosts and processes.
+    """
     try:
         snapshot = queue.snapshot()
     except QueueUnavailable:  # which the part `queue` tells; nothing is known of workers
         return
     wrong = [f"no {name} worker answers" for name in QUEUES if not snapshot[name].answering]
-    wrong += [f"{worker} is silent" for name in QUEUES for worker in snapshot[name].silent]
+    silent = {name: len(snapshot[name].silent) for name in QUEUES}
+    wrong += [f"{number} {name} workers are silent" for name, number in silent.items() if number]
     if wrong:
         raise Unavailable("; ".join(wrong))
 

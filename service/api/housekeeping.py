@@ -42,7 +42,7 @@ async def _repeat(services: Services) -> None:
 
 
 def sweep(services: Services) -> None:
-    """Remove what retention lets go; files without a row only while they are the exception."""
+    """Remove what retention lets go; nothing where more files have no row than kills leave."""
     policy = retention.policy_of(services.settings, now())
     found = retention.find(services.catalog, policy)
     if found.doubtful:

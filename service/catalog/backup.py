@@ -12,13 +12,15 @@ tables are copied once more, and do not have these rows.
 
 from __future__ import annotations
 
+import contextlib
 import json
+import os
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from datetime import datetime
 from itertools import islice
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, TextIO, get_args
 
 import sqlalchemy as sa
 from sqlalchemy.orm import Session
@@ -78,28 +80,41 @@ def backup(settings: Settings, folder: Path) -> Backup:
         database.close()
 
 
-def restore(settings: Settings, folder: Path) -> Backup:
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Restored:
+    """What a restore did."""
+
+    copy: Backup
+    keys: int  #: of the copy that were not here, and that are taken from now on
+
+
+def restore(settings: Settings, folder: Path) -> Restored:
     """Fill the empty database and the blob store of these settings from a copy. Raises BackupFailed.
 
+    API keys that are there already stay, for without one a container does not start; those of the copy come beside them.
     Rows come last and all at once, so that a restore that was interrupted can be started again. Jobs that had not ended
     begin anew with the next start of the service.
     """
     copy = _opened(folder)
     database = Database(settings.resolved_database_url(), patience=MIGRATIONS)
+    keys = 0
     try:
-        _require_empty(database)
+        _require_empty(database, copy)
         database.upgrade(copy.revision)
         _put_back(folder, copy, Blobs(settings.resolved_blob_url()))
         with database.write() as session:
             for table, kinds in copy.tables.items():
                 for rows in _batches(_rows_of(folder, table, kinds)):
-                    session.execute(_table(table, kinds).insert(), rows)
+                    if table == "keys":
+                        keys += _add_keys(session, _table(table, kinds), rows)
+                    else:
+                        session.execute(_table(table, kinds).insert(), rows)
         database.upgrade()
         with database.write() as session:
             _begin_anew(session)
     finally:
         database.close()
-    return copy
+    return Restored(copy=copy, keys=keys)
 
 
 def _make(folder: Path) -> None:
@@ -110,6 +125,10 @@ def _make(folder: Path) -> None:
         raise BackupFailed(f"the folder {folder} cannot be used ({error.strerror})") from error
     if taken:
         raise BackupFailed(f"the folder {folder} is not empty; name a new one")
+    with contextlib.suppress(
+        PermissionError
+    ):  # that of somebody else; what is written into it is still ours alone
+        folder.chmod(0o700)
 
 
 def _blobs_of(folder: Path) -> Blobs:
@@ -149,6 +168,7 @@ def _copy_tables(database: Database, folder: Path) -> tuple[dict[str, int], set[
                     file.write(json.dumps(dict(row), default=datetime.isoformat) + "\n")
                     counts[table.name] += 1
                     needed.update(_named(table.name, row))
+                _sync(file)
     return counts, needed
 
 
@@ -185,9 +205,17 @@ def _sealed(folder: Path, revision: str, rows: dict[str, int], blobs: int, missi
         missing=tuple(missing),
     )
     aside = folder / f"{_MANIFEST}.part"
-    aside.write_text(json.dumps(asdict(sealed), indent=2) + "\n", encoding="utf-8")
+    with aside.open("w", encoding="utf-8") as file:
+        file.write(json.dumps(asdict(sealed), indent=2) + "\n")
+        _sync(file)
     aside.replace(folder / _MANIFEST)
     return sealed
+
+
+def _sync(file: TextIO) -> None:
+    """Have what was written on the disk: a manifest that outlives a power cut says that all the rest did."""
+    file.flush()
+    os.fsync(file.fileno())
 
 
 def _opened(folder: Path) -> Backup:
@@ -204,19 +232,40 @@ def _opened(folder: Path) -> Backup:
     return Backup(**{**fields, "missing": tuple(fields["missing"])})
 
 
-def _require_empty(database: Database) -> None:
-    if database.revision() is None:
+def _require_empty(database: Database, copy: Backup) -> None:
+    """Raise BackupFailed where the database holds more than API keys, or tables of another revision than the copy's."""
+    revision = database.revision()
+    if revision is None:
         return
     with database.read() as session:
         filled = [
             table.name
             for table in Base.metadata.sorted_tables
-            if session.scalar(sa.select(sa.literal(1)).select_from(table).limit(1))
+            if table.name != "keys" and session.scalar(sa.select(sa.literal(1)).select_from(table).limit(1))
         ]
     if filled:
         raise BackupFailed(
             f"the database is not empty ({', '.join(filled)}); name a new data folder, or a new database"
         )
+    if revision != copy.revision:
+        raise BackupFailed(
+            f"the tables of the database are at revision {revision} and those of the copy at {copy.revision}; name a new "
+            "data folder, or a database without tables, and make keys in it afterwards"
+        )
+
+
+def _add_keys(session: Session, table: sa.TableClause, rows: list[Row]) -> int:
+    """Add the API keys that are not here; returns how many of them are valid. What was revoked here or there stays so."""
+    here = set(session.scalars(sa.select(table.c.digest)))
+    new = [row for row in rows if row["digest"] not in here]
+    if new:
+        session.execute(table.insert(), new)
+    for row in rows:
+        if row["digest"] in here and row["revoked"] is not None:
+            same = sa.and_(table.c.digest == row["digest"], table.c.revoked.is_(None))
+            session.execute(table.update().where(same).values(revoked=row["revoked"]))
+    instant = now()
+    return sum(row["revoked"] is None and (row["expires"] is None or row["expires"] > instant) for row in new)
 
 
 def _put_back(folder: Path, copy: Backup, target: Blobs) -> None:

@@ -1,6 +1,7 @@
 """Blobs: files by key, in a local folder or in S3, through obstore.
 
-A key is seen only when its bytes are complete: obstore writes aside and renames (or completes a multipart upload).
+A key is seen only when its bytes are complete: obstore writes aside and renames (or completes a multipart upload). What
+was put is on the disk, not only in the memory of the system: an upload that was acknowledged outlives a power cut.
 A store that hangs is given up after the limits of `patience.py`.
 """
 
@@ -37,6 +38,7 @@ _NO_LINKS = (
     errno.EMLINK,
     errno.EXDEV,
 )  #: by file system, or no more
+_NO_SYNC = (errno.EINVAL, errno.ENOTSUP, errno.EBADF)  #: of folders, by file system
 _PARTS_AT_ONCE = 2  #: obstore holds 12 parts of 5 MB by default, more than an upload may cost
 _RETRIES = 3
 _LONGEST_STREAM_S = 24 * 3600  #: a large blob to a slow client; that it stalls is noticed piece by piece
@@ -75,13 +77,16 @@ class Blobs:
         """Write `data` under `key`, replacing what was there."""
         with _errors():
             obstore.put(self._store, key, data, max_concurrency=_PARTS_AT_ONCE)
+            self._sync(key)
 
     def put_file(self, key: str, path: Path, *, move: bool = False) -> None:
         """Write the file at `path` under `key`; with `move` it is renamed there if it lies on the same disk."""
         with _errors():
             if move and self._root is not None and _renamed(path, self._root / key):
+                self._sync_folders(key)
                 return
             obstore.put(self._store, key, path, max_concurrency=_PARTS_AT_ONCE)
+            self._sync(key)
         if move:
             path.unlink(missing_ok=True)
 
@@ -95,6 +100,8 @@ class Blobs:
                 obstore.copy(self._store, key, to)
             elif (source := self.path(key)) and not _linked(source, self._root / to):
                 self.put_file(to, source)
+            else:
+                self._sync_folders(to)
 
     def under(self, prefix: str) -> list[str]:
         """Return the keys under the folder `prefix`, in order; what is still being written is not among them."""
@@ -200,9 +207,22 @@ class Blobs:
     def ping(self) -> None:
         """Write and remove a small blob, as an upload would."""
         key = blob_keys.probe(uuid4().hex)
-        self.put_bytes(key, b"ping")
+        with _errors():
+            obstore.put(self._store, key, b"ping")
         with contextlib.suppress(FileNotFoundError), _errors():
             obstore.delete(self._store, key)
+
+    def _sync(self, key: str) -> None:
+        """Have a blob in a local folder on the disk; another store has it there when it says so."""
+        if self._root is not None:
+            _fsync(self._root / key)
+            self._sync_folders(key)
+
+    def _sync_folders(self, key: str) -> None:
+        """Have the name of a blob on the disk, with those of the folders that it may have been the first in."""
+        if self._root is not None:
+            for number in range(key.count("/") + 1):
+                _fsync((self._root / key).parents[number])
 
 
 def _limited(url: str, patience: Patience, request_s: float) -> ObjectStore:
@@ -281,8 +301,26 @@ def _linked(source: Path, target: Path) -> bool:
     return True
 
 
+def _fsync(path: Path) -> None:
+    """Return when what was written to a file, or which names a folder has, is on the disk (fsync(2)).
+
+    Something that was deleted meanwhile needs it no more, and some file systems know no sync of folders.
+    """
+    with contextlib.suppress(FileNotFoundError):
+        descriptor = os.open(path, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        except OSError as error:
+            if error.errno not in _NO_SYNC:
+                raise
+        finally:
+            os.close(descriptor)
+
+
 def _renamed(source: Path, target: Path) -> bool:
+    """Move a file that is on the disk before its name says that it is whole; False where that is another file system."""
     target.parent.mkdir(parents=True, exist_ok=True)
+    _fsync(source)
     try:
         source.replace(target)
     except OSError as error:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any
 
 from sqlalchemy import delete, func, select
@@ -64,9 +64,16 @@ class Models:
         except IntegrityError as error:
             raise Conflict(f"another training took the name {name!r} just now; try again") from error
 
-    def find(self, name: str, version: int | None = None) -> ModelRecord | None:
-        """Find one model in whatever state, by default the newest that is ready, else the newest; None without one."""
+    def find(
+        self, name: str, version: int | None = None, maps: Collection[str] | None = None
+    ) -> ModelRecord | None:
+        """Find one model in whatever state, by default the newest that is ready, else the newest; None without one.
+
+        With `maps` those alone that were trained on one of them.
+        """
         query = select(Model).where(Model.name == name)
+        if maps is not None:
+            query = query.where(Model.map_id.in_(maps))
         if version is not None:
             query = query.where(Model.version == version)
         query = query.order_by(Model.status != "ready", Model.version.desc()).limit(1)

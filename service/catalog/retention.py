@@ -24,7 +24,7 @@ from service.settings import Settings
 log = logging.getLogger(__name__)
 
 ABANDONED = timedelta(days=1)  #: a file without a row is on its way in for less than this
-_FEW = 20  #: folders without a row that may go whatever else there is
+_FEW = 3  #: folders without a row that may go beside few that have one
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -38,8 +38,8 @@ class Leftovers:
 
     @property
     def doubtful(self) -> bool:
-        """Whether most files have no row: rather a wrong database, or one of an old back-up, than what kills left."""
-        return len(self.folders) > max(_FEW, self.folders_known)
+        """Whether more files have no row than kills leave: rather a wrong database, an empty one, or an old copy."""
+        return len(self.folders) > (max(_FEW, self.folders_known // 10) if self.folders_known else 0)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

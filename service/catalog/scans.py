@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import logging
 from collections.abc import Iterable, Sequence
 from datetime import datetime
 from pathlib import Path
@@ -19,6 +20,8 @@ from service.catalog.blobs import Blobs
 from service.catalog.database import Database
 from service.catalog.records import Matrix, Page, Position, ScanFormat, ScanOutcome, ScanRecord
 from service.errors import BadRequest, Conflict, DiskFull, NotFound
+
+log = logging.getLogger(__name__)
 
 Row = TypeVar("Row", tables.VersionScan, tables.SurveyScan)
 
@@ -50,10 +53,12 @@ class Scans:
     ) -> tuple[ScanRecord, bool]:
         """Keep the file at `path` (moved when it can be) and say whether it is new.
 
-        A scan that is known stays as it was recorded, but notes that it was sent again; `correct` changes it.
+        A scan that is known stays as it was recorded, but notes that it was sent again; `correct` changes it. Where its
+        file was lost the new one takes its place.
         """
         scan_id = scan_id_of(sha256, device_id)
         if known := self._sent_again(scan_id):
+            self._mend(known, path)
             return known, False
         key = blob_keys.scan_file(scan_id, uuid4().hex, filename)
         self._blobs.put_file(key, path, move=True)
@@ -162,6 +167,14 @@ class Scans:
         with self._database.write() as session:
             row = session.scalar(statement.returning(tables.Scan))
             return None if row is None else ScanRecord.of_row(row)
+
+    def _mend(self, known: ScanRecord, path: Path) -> None:
+        """Put the same bytes, sent again, where those of a scan are gone or cut short."""
+        with contextlib.suppress(FileNotFoundError):
+            if self._blobs.size(known.key) == known.size:
+                return
+        log.warning("the file of scan %s was lost; it was sent again and is kept now", known.scan_id)
+        self._blobs.put_file(known.key, path, move=True)
 
 
 def checked_scan_ids(scan_ids: Sequence[str]) -> tuple[str, ...]:

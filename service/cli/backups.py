@@ -10,6 +10,7 @@ from rich.table import Table
 
 from service.cli.terminal import Terminal
 from service.client import ClientError
+from service.permissions import make_private, private_files
 from service.settings import Settings
 
 if TYPE_CHECKING:
@@ -43,12 +44,23 @@ def _run(what: str, ctx: typer.Context, folder: Path, data_dir: Path | None) -> 
 
     terminal: Terminal = ctx.obj
     settings = Settings() if data_dir is None else Settings(data_dir=data_dir)
-    call = backups.backup if what == "backup" else backups.restore
     try:
-        done = call(settings, folder)
+        with private_files():
+            if what == "backup":
+                done, keys = backups.backup(settings, folder), None
+            else:
+                restored = backups.restore(settings, folder)
+                done, keys = restored.copy, restored.keys
+                if None in (settings.database_url, settings.blob_url):
+                    make_private(settings.data_dir)
     except (backups.BackupFailed, ServiceError) as error:
         raise ClientError(str(error)) from error
-    terminal.show(_document(done), _table)
+    terminal.show(_document(done) | ({} if keys is None else {"keys": keys}), _table)
+    if keys:
+        terminal.err.print(
+            f"API keys of the copy that are valid again: {keys}; `spicd keys list` shows them, and `spicd keys revoke` ends those "
+            "that were revoked since it was taken"
+        )
     if done.missing:
         terminal.err.print(
             f"{len(done.missing)} files that the database names are not in the blob store: {', '.join(done.missing[:5])}"

@@ -23,7 +23,7 @@ def sweep(
         bool, typer.Option("--dry-run", help="List what would go, and change nothing.")
     ] = False,
     force: Annotated[
-        bool, typer.Option("--force", help="Also where most files have no row in the database.")
+        bool, typer.Option("--force", help="Also where more files than kills leave have no row.")
     ] = False,
     data_dir: Annotated[Path | None, typer.Option("--data-dir", help="Of the service.")] = None,
 ) -> None:

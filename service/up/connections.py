@@ -11,8 +11,9 @@ connection (as mod_reqtimeout has them for Apache, `client_header_timeout` and `
 | sending an answer that nobody reads | `write_s` until the buffer has room again |
 | closing | `close_s`, then what was not sent is dropped |
 
-There are `connections` of them at most. One more closes the one that has waited longest for a header; where none waits
-it is answered 503.
+There are `connections` of them at most. One more closes the one of which least is lost, and its clock would end first:
+one that waits for a header or for another request, or that was answered and still sends, as who has no key is. Where
+there is none it is answered 503.
 """
 
 from __future__ import annotations
@@ -42,13 +43,13 @@ class Limits:
     """How long each state may last, in seconds, and how many connections there may be."""
 
     connections: int = 400
-    header_s: float = 10.0
+    header_s: float = 45.0  #: bad Wi-Fi pauses for half a minute; at the cap a silent one goes at once
     header_bytes: int = 16 * 1024
     body_window_s: float = 60.0
     body_bytes: int = (
         32 * 1024
     )  #: in each window: half a kilobyte a second, and a minute of silence now and then
-    linger_s: float = 30.0
+    linger_s: float = 10.0
     write_s: float = 60.0
     close_s: float = 5.0
 
@@ -176,7 +177,7 @@ class LimitedProtocol(H11Protocol):
         self.transport.abort()
 
     def _make_room(self) -> None:
-        """Close the connection that has waited longest for a header; where none waits, this one."""
+        """Close the connection of which least is lost and that would end first; where there is none, this one."""
         _warn_of_crowd(self.limits.connections)
         others = [one for one in self.connections if isinstance(one, LimitedProtocol) and one is not self]
         waiting = [(due, one) for one in others if (due := one._waits_until()) is not None]
@@ -187,8 +188,8 @@ class LimitedProtocol(H11Protocol):
             self._refuse(b"503 Service Unavailable\r\nRetry-After: 10")
 
     def _waits_until(self) -> float | None:
-        """Return when the wait for a header or for another request ends; None where something is going on."""
-        clock = self._clock if self._state == "header" else self.timeout_keep_alive_task
+        """Return when a connection ends by its clock on which nothing is going on; None where something is."""
+        clock = self._clock if self._state in ("header", "linger") else self.timeout_keep_alive_task
         return None if clock is None or self.transport.is_closing() else clock.when()
 
 

@@ -35,13 +35,16 @@ from service.permissions import make_private, private_files
 from service.queue import QUEUES, JobQueue
 from service.settings import Settings
 from service.up.children import WorkerPool
-from service.up.connections import Limits, limited_protocol, limits_of
+from service.up.connections import limited_protocol, limits_of
 from service.up.embedded_redis import EmbeddedRedis, LaunchFailed
 
 log = logging.getLogger("spicd")
 
 _LOOK_S = 0.2  #: between two looks at the children
 _API_STARTS_S = 30.0
+KEEP_ALIVE_S = (
+    75  #: longer than proxies keep a connection (nginx 60 s), or they would send into one that just closes
+)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -97,8 +100,8 @@ def up(
             watcher=stack.enter_context(Supervision(settings)),
         )
         stack.enter_context(pool)
-        stop.then = pool.kill
-        api = stack.enter_context(_serve((create_app or _app)(settings), listening, limits_of(settings)))
+        api = stack.enter_context(_serve((create_app or _app)(settings), listening, settings))
+        stop.then = _each(pool.kill, api.stop_now)
         on_ready(_running(settings, redis, pool))
         while not stop.asked:
             pool.check()
@@ -205,17 +208,43 @@ def _listen(host: str, port: int) -> Iterator[socket.socket]:
         yield listening
 
 
+@dataclass(frozen=True, kw_only=True, slots=True)
+class _Api:
+    """The API in its thread."""
+
+    server: uvicorn.Server
+    thread: threading.Thread
+
+    def is_alive(self) -> bool:
+        return self.thread.is_alive()
+
+    def stop_now(self) -> None:
+        """Wait for no request any more."""
+        self.server.force_exit = True
+
+
+def _each(*calls: Callable[[], None]) -> Callable[[], None]:
+    """Return what makes each call."""
+
+    def call_all() -> None:
+        for call in calls:
+            call()
+
+    return call_all
+
+
 @contextmanager
-def _serve(app: FastAPI, listening: socket.socket, limits: Limits) -> Iterator[threading.Thread]:
-    """Serve the API in a thread, from its first answer on."""
+def _serve(app: FastAPI, listening: socket.socket, settings: Settings) -> Iterator[_Api]:
+    """Serve the API in a thread, from its first answer on; requests that run at the end have the grace to finish."""
     config = uvicorn.Config(
         app,
-        http=limited_protocol(limits),
+        http=limited_protocol(limits_of(settings)),
         ws="none",
         log_config=None,
         access_log=False,
         server_header=False,
-        timeout_graceful_shutdown=2,
+        timeout_keep_alive=KEEP_ALIVE_S,
+        timeout_graceful_shutdown=settings.shutdown_grace_s,
     )
     server = uvicorn.Server(config)
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listening]}, name="api", daemon=True)
@@ -226,17 +255,19 @@ def _serve(app: FastAPI, listening: socket.socket, limits: Limits) -> Iterator[t
             raise LaunchFailed("the API did not start; the log says why")
         time.sleep(0.02)
     try:
-        yield thread
+        yield _Api(server=server, thread=thread)
     finally:
         server.should_exit = True
-        thread.join(5)
+        thread.join(settings.shutdown_grace_s + 3)
 
 
 def _app(settings: Settings) -> FastAPI:
     """Return the service's own API; imported here, for tests of the launcher bring another."""
     from service.api.app import create_app  # noqa: PLC0415
 
-    return create_app(settings)
+    app = create_app(settings)
+    app.openapi()  # derived now: it takes a third of a second, in which no other request would be answered
+    return app
 
 
 def _require_worker_packages(settings: Settings) -> None:

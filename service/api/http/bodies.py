@@ -12,7 +12,7 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, ParamSpec, TypeVar
 
 from fastapi import Request
 from fastapi.concurrency import run_in_threadpool
@@ -25,6 +25,9 @@ from service.api.http.json_text import read_json
 from service.api.http.uploads import Incoming, Upload
 from service.catalog.disk import Disk
 from service.errors import BadRequest, DiskFull, TooLarge, TooSlow, WrongMediaType, is_disk_full
+
+P = ParamSpec("P")
+T = TypeVar("T")
 
 PIECE = 1 << 18  #: bytes handed to the disk at a time; each upload holds as many in memory
 MAX_JSON_BYTES = 1 << 20
@@ -74,7 +77,7 @@ async def received(
     folder = settings.data_dir / INCOMING
     limit = MAX_JSON_BYTES if media_type == JSON else settings.max_upload_bytes
     seconds = MAX_JSON_S if media_type == JSON else settings.upload_timeout_s
-    await run_in_threadpool(folder.mkdir, parents=True, exist_ok=True)
+    await run_in_threadpool(_on_disk, _make, folder)
     if disk is not None:
         await run_in_threadpool(disk.require, 0 if media_type == JSON else _declared(request, limit))
     kept = ExitStack()
@@ -95,9 +98,9 @@ async def received(
             form.finish()
             yield Body(fields=form.fields, uploads=tuple(form.uploads))
         else:
-            file = kept.enter_context(Incoming(folder, filename or ""))
+            file = await run_in_threadpool(_on_disk, _opened, kept, folder, filename or "")
             await _pour(request, file.write, limit=limit, seconds=seconds, disk=disk)
-            yield Body(uploads=(await run_in_threadpool(file.finish),))
+            yield Body(uploads=(await run_in_threadpool(_on_disk, file.finish),))
     finally:
         await run_in_threadpool(kept.close)
 
@@ -179,8 +182,22 @@ async def _stream(request: Request, take: Callable[[bytes], None], limit: int, d
 def _hand_on(take: Callable[[bytes], None], piece: bytes, disk: Disk | None) -> None:
     if disk is not None:
         disk.require(len(piece))
+    _on_disk(take, piece)
+
+
+def _make(folder: Path) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+
+
+def _opened(kept: ExitStack, folder: Path, filename: str) -> Incoming:
+    """Open a file that `kept` removes, also where the request is gone by the time that it is open."""
+    return kept.enter_context(Incoming(folder, filename))
+
+
+def _on_disk(call: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
+    """Call what writes to the data folder, in a thread: the last bytes go out when a file is closed. Raises DiskFull."""
     try:
-        take(piece)
+        return call(*args, **kwargs)
     except OSError as error:
         if not is_disk_full(error):
             raise

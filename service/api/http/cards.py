@@ -44,8 +44,8 @@ class Cards:
             if card.get("name") == name and version in (None, str(card.get("version"))):
                 return card
         number = None if version is None else _number(version)
-        model = None if number == 0 else self._models.find(name, number)
-        if model is None or (maps is not None and model.map_id not in maps):
+        model = None if number == 0 else self._models.find(name, number, maps)
+        if model is None:
             wanted = name if version is None else f"{name}/{version}"
             raise NotFound(f"no model {wanted!r}; GET /models lists those there are")
         if model.status == "ready" and model.card is not None:

@@ -17,7 +17,8 @@ from uuid import uuid4
 from service.catalog.records import ScanFormat
 from service.errors import ScanUnreadable
 
-ABANDONED_S = 3600  #: since the last write; a piece comes within ten minutes, or the server ends the upload
+AFTERWARDS_S = 3600.0  #: that a file may lie here when its body has ended, until the request has
+_written_here: set[Path] = set()  #: files of requests that this process is at, whole or not
 _HEAD = 256  #: bytes that are enough to tell the format
 _PLY = re.compile(rb"ply[ \t]*\r?\n")
 _PCD = re.compile(rb"\s*(#[^\n]*\.PCD|(VERSION|FIELDS|COLUMNS)\s)")
@@ -42,6 +43,7 @@ class Incoming:
         self.filename = _shown(filename)
         self._path = folder / f"{uuid4().hex}.part"
         self._file = self._path.open("wb")
+        _written_here.add(self._path)
         self._sha256 = hashlib.sha256()
         self._head = b""
         self._size = 0
@@ -80,15 +82,24 @@ class Incoming:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._file.close()
+        _written_here.discard(self._path)
+        with contextlib.suppress(
+            OSError
+        ):  # a full disk tells of the last bytes once more; nobody wants them now
+            self._file.close()
         self._path.unlink(missing_ok=True)
 
 
-def sweep(folder: Path, *, older_than_s: float = ABANDONED_S) -> None:
-    """Remove what uploads left that a killed process could not clean up; an upload that goes on writes more often."""
+def sweep(folder: Path, *, upload_timeout_s: float) -> None:
+    """Remove what uploads left that a killed process could not clean up; one that goes on in here keeps all its files.
+
+    Of other processes on this folder nobody knows: a file that was whole early in a long form is not written again
+    while the rest comes, so it stays for as long as any body may take.
+    """
     for path in folder.glob("*.part"):
         with contextlib.suppress(OSError):  # another process sweeps as well
-            if time.time() - path.stat().st_mtime >= older_than_s:
+            old = time.time() - path.stat().st_mtime >= upload_timeout_s + AFTERWARDS_S
+            if old and path not in _written_here:
                 path.unlink()
 
 

@@ -73,6 +73,26 @@ def test_a_body_that_would_not_fit_is_refused_by_its_length(client: TestClient, 
     assert upload(client, "small") == 201
 
 
+@pytest.mark.parametrize("size", [100, 5_000, 100_000])
+@pytest.mark.parametrize("takes", ["raw", "form"])
+def test_a_disk_that_fills_up_while_a_body_comes_is_told_however_small_the_body(
+    disk: SmallDisk, settings: Settings, tmp_path: Path, takes: str, size: int
+) -> None:
+    elsewhere = f"sqlite:///{tmp_path}/rows.sqlite"  # so that the file is what meets the full disk
+    blobs = (tmp_path / "blobs").as_uri()
+    settings = settings.model_copy(update={"min_free_bytes": 0, "database_url": elsewhere, "blob_url": blobs})
+    body = ply("small") + bytes(size)
+    with running(settings, RememberingQueue()) as client:
+        assert upload(client, "first") == 201  # the folder is there
+        disk.fill()
+        if takes == "raw":
+            answer = client.post("/scans", content=body, headers={"Content-Type": "application/octet-stream"})
+        else:
+            answer = client.post("/scans", files={"file": ("a.ply", body)})
+        assert (answer.status_code, answer.json()["type"]) == (507, "urn:spicd:problem:disk_full")
+        assert list((settings.data_dir / "incoming").iterdir()) == []
+
+
 def test_a_full_disk_can_be_emptied_and_then_takes_scans_again(
     client: TestClient, disk: SmallDisk, settings: Settings
 ) -> None:

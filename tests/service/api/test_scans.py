@@ -237,6 +237,19 @@ def test_an_upload_that_was_acknowledged_outlives_a_request_that_brought_the_sam
     assert catalog.blobs.get_bytes(catalog.scans.get(sent[0]).key) == ply()
 
 
+@pytest.mark.parametrize("left", [None, b"ply\nfor"])
+def test_the_same_bytes_sent_again_take_the_place_of_a_file_that_was_lost(
+    client: TestClient, catalog: Catalog, left: bytes | None
+) -> None:
+    scan = client.post("/scans", content=ply(), headers=RAW).json()["scan_id"]
+    key = catalog.scans.get(scan).key
+    catalog.blobs.delete_prefix(key.rsplit("/", 1)[0])
+    if left is not None:
+        catalog.blobs.put_bytes(key, left)
+    assert client.post("/scans", content=ply(), headers=RAW).json()["scan_id"] == scan
+    assert catalog.blobs.get_bytes(catalog.scans.get(scan).key) == ply()
+
+
 def test_a_start_sweeps_what_a_killed_process_left_and_no_upload_of_today(
     settings: Settings, queue: RememberingQueue
 ) -> None:

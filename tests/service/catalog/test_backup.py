@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,6 +13,7 @@ from sqlalchemy import select
 from service.catalog import blob_keys, tables
 from service.catalog.backup import BackupFailed, backup, restore
 from service.catalog.catalog import Catalog, open_catalog
+from service.catalog.keys import open_keys
 from service.catalog.tables import Base
 from service.cli import main
 from service.settings import Settings
@@ -191,3 +193,81 @@ def run(*words: str) -> None:
     except SystemExit as ended:
         if ended.code not in (0, None):
             raise
+
+
+def test_nobody_else_on_the_machine_reads_a_copy_or_what_was_restored(
+    catalog: Catalog, settings: Settings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fill(catalog)
+    if settings.database_url is not None:
+        monkeypatch.setenv("SPICD_DATABASE_URL", settings.database_url)
+    copy, other = tmp_path / "copy", tmp_path / "other"
+    before = os.umask(0o022)
+    try:
+        for folder in (copy, other / "blobs"):
+            folder.mkdir(parents=True)  # empty, and open to all
+        run("backup", str(copy), "--data-dir", str(settings.data_dir))
+        monkeypatch.delenv("SPICD_DATABASE_URL", raising=False)
+        run("restore", str(copy), "--data-dir", str(other))
+    finally:
+        os.umask(before)
+    paths = [path for folder in (copy, other) for path in (folder, *folder.rglob("*"))]
+    assert len(paths) > 20
+    assert [path for path in paths if path.stat().st_mode & 0o077] == []
+
+
+def test_keys_that_are_there_stay_and_those_of_the_copy_come_beside_them(
+    catalog: Catalog, settings: Settings, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fill(catalog)
+    first, robot, gone, late = (f"spicd_{letter * 64}" for letter in "abcd")
+    for secret in (robot, late):
+        catalog.keys.add("robot", scopes=["scans:write"], secret=secret)
+    for secret in (gone, first):
+        catalog.keys.revoke(catalog.keys.add("old", scopes=["admin"], secret=secret)[0].key_id)
+    backup(settings, tmp_path / "copy")
+    other = Settings(data_dir=tmp_path / "other")
+    with open_keys(other) as keys:  # as a container does before the service ever ran
+        keys.add("first", scopes=["admin"], secret=first)
+        mine, _ = keys.add("mine", scopes=["admin"], secret=f"spicd_{'e' * 64}")
+        keys.revoke(keys.add("robot", scopes=["scans:write"], secret=late)[0].key_id)
+    run("restore", str(tmp_path / "copy"), "--data-dir", str(tmp_path / "other"))
+    with open_keys(other) as keys:
+        valid = {key.name: key for key in keys.all() if key.revoked is None}
+        assert set(valid) == {"mine", "robot"}
+        assert valid["mine"] == mine
+        found = keys.find(robot)
+        assert found is not None
+        assert found.key_id == valid["robot"].key_id
+        assert len(keys.all()) == 5
+    said = capsys.readouterr()
+    assert "API keys of the copy that are valid again: 1;" in " ".join(said.err.split())
+
+
+def test_a_database_of_another_revision_that_has_keys_is_not_mixed_with_the_copy(
+    catalog: Catalog, settings: Settings, tmp_path: Path
+) -> None:
+    fill(catalog)
+    backup(settings, tmp_path / "copy")
+    manifest = tmp_path / "copy/backup.json"
+    manifest.write_text(manifest.read_text().replace('"0008"', '"0007"'))
+    other = Settings(data_dir=tmp_path / "other")
+    with open_keys(other) as keys:
+        keys.add("first", scopes=["admin"])
+    with pytest.raises(BackupFailed, match="at revision 0008 and those of the copy at 0007"):
+        restore(other, tmp_path / "copy")
+
+
+def test_the_manifest_gets_its_name_when_all_the_rest_is_on_the_disk(
+    catalog: Catalog, settings: Settings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    synced: list[str] = []
+    monkeypatch.setattr(
+        os, "fsync", lambda number: synced.append(str(Path(f"/proc/self/fd/{number}").readlink()))
+    )
+    fill(catalog)
+    backup(settings, tmp_path / "copy")
+    lines = [str(path) for path in (tmp_path / "copy/tables").iterdir()]
+    assert len(lines) == len(Base.metadata.sorted_tables)
+    assert set(lines) <= set(synced)
+    assert synced[-1] == str(tmp_path / "copy/backup.json.part")

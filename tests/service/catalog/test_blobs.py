@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import os
 import tempfile
 import time
 from collections.abc import Iterator
@@ -15,7 +16,7 @@ import pytest
 from service.catalog import blob_keys
 from service.catalog.blobs import Blobs
 from service.catalog.patience import Patience
-from service.errors import BlobsUnavailable
+from service.errors import BlobsUnavailable, DiskFull
 from tests.support.servers import SilentServer, free_port, s3_environment
 
 
@@ -70,6 +71,60 @@ def test_a_moved_file_is_gone_where_it_was(either: Blobs, tmp_path: Path) -> Non
     either.put_file("scans/s/scan.bin", source, move=True)
     assert either.get_bytes("scans/s/scan.bin") == b"scan"
     assert not source.exists()
+
+
+@pytest.fixture
+def synced(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[str]:
+    """What was brought to the disk so far, as paths under `tmp_path`, with the names of the time."""
+    paths: list[str] = []
+
+    def fsync(descriptor: int) -> None:
+        paths.append(os.path.relpath(Path(f"/proc/self/fd/{descriptor}").readlink(), tmp_path))
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    return paths
+
+
+FOLDERS = ["blobs/scans/s", "blobs/scans", "blobs"]
+
+
+def test_a_file_is_on_the_disk_before_it_has_its_name_and_then_the_name_is(
+    blobs: Blobs, tmp_path: Path, synced: list[str]
+) -> None:
+    (tmp_path / "hall.part").write_bytes(b"scan")
+    blobs.put_file("scans/s/hall.ply", tmp_path / "hall.part", move=True)
+    assert synced == ["hall.part", *FOLDERS]
+
+
+def test_whatever_is_put_is_on_the_disk(blobs: Blobs, tmp_path: Path, synced: list[str]) -> None:
+    blobs.put_bytes("scans/s/bytes", b"scan")
+    assert synced == ["blobs/scans/s/bytes", *FOLDERS]
+    synced.clear()
+    (tmp_path / "kept").write_bytes(b"scan")
+    blobs.put_file("scans/s/file", tmp_path / "kept")
+    assert synced == ["blobs/scans/s/file", *FOLDERS]
+    synced.clear()
+    blobs.copy("scans/s/file", "scans/s/copy")
+    assert synced == FOLDERS
+
+
+def test_a_disk_that_fails_to_sync_is_told_and_one_that_knows_none_is_taken_as_it_is(
+    blobs: Blobs, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def failing(number: int) -> None:
+        def fsync(_: int) -> None:
+            raise OSError(number, os.strerror(number))
+
+        monkeypatch.setattr(os, "fsync", fsync)
+
+    failing(errno.EINVAL)
+    blobs.put_bytes("a/b", b"x")
+    failing(errno.ENOSPC)
+    with pytest.raises(DiskFull):
+        blobs.put_bytes("a/b", b"x")
+    failing(errno.EIO)
+    with pytest.raises(BlobsUnavailable, match="Input/output error"):
+        blobs.put_bytes("a/b", b"x")
 
 
 def test_a_local_blob_is_read_where_it_lies(blobs: Blobs, tmp_path: Path) -> None:

@@ -43,11 +43,12 @@ def test_three_processes_may_upgrade_one_new_database_at_once(tmp_path: Path) ->
     assert [process.exitcode for process in processes] == [0] * 3
 
 
-def test_sqlite_runs_with_wal_and_foreign_keys(tmp_path: Path) -> None:
+def test_sqlite_runs_with_wal_and_foreign_keys_and_has_commits_on_the_disk(tmp_path: Path) -> None:
     database = Database(url(tmp_path))
     with database.read() as session:
         assert session.scalar(text("PRAGMA journal_mode")) == "wal"
         assert session.scalar(text("PRAGMA foreign_keys")) == 1
+        assert session.scalar(text("PRAGMA synchronous")) == 2  # FULL
 
 
 def test_a_row_without_its_parent_is_refused(tmp_path: Path) -> None:

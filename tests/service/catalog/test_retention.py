@@ -165,7 +165,12 @@ def test_files_without_a_row_go_when_they_are_a_day_old(catalog: Catalog, key: s
 
 
 def test_files_of_another_database_are_told_from_what_kills_leave() -> None:
-    few = tuple(f"scans/{number}/" for number in range(20))
-    assert not retention.Leftovers(folders=few).doubtful
-    assert retention.Leftovers(folders=(*few, "scans/one-more/")).doubtful
-    assert not retention.Leftovers(folders=(*few, "scans/one-more/"), folders_known=21).doubtful
+    def doubtful(unknown: int, *, known: int) -> bool:
+        folders = tuple(f"scans/{number}/" for number in range(unknown))
+        return retention.Leftovers(folders=folders, folders_known=known).doubtful
+
+    assert not doubtful(0, known=0)
+    assert doubtful(1, known=0)  # a fresh database beside files: none of them is known
+    assert [doubtful(unknown, known=5) for unknown in (3, 4)] == [False, True]
+    assert [doubtful(unknown, known=250) for unknown in (25, 26)] == [False, True]
+    assert doubtful(200, known=1000)  # a database of last week

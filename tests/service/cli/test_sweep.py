@@ -59,8 +59,10 @@ def test_a_sweep_removes_it_and_says_so(kept: Catalog, capsys: pytest.CaptureFix
     assert "nothing to sweep" in capsys.readouterr().out
 
 
-def test_most_files_without_a_row_need_a_word_more(kept: Catalog, capsys: pytest.CaptureFixture[str]) -> None:
-    folders = [Path(kept.blobs._root or "") / f"scans/scan-{number}-x" for number in range(25)]
+def test_more_files_without_a_row_than_kills_leave_need_a_word_more(
+    kept: Catalog, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folders = [Path(kept.blobs._root or "") / f"scans/scan-{number}-x" for number in range(4)]
     for folder in folders:
         folder.mkdir()
         os.utime(folder, (0, 0))

@@ -120,6 +120,10 @@ def test_a_header_that_comes_byte_by_byte_is_cut_off(server: Server, sent: bytes
         assert time.monotonic() - started < LIMITS.header_s + 0.5
 
 
+def test_a_header_that_bad_wi_fi_holds_up_for_half_a_minute_is_waited_for() -> None:
+    assert Limits().header_s > 30
+
+
 def test_a_header_behind_an_answered_request_has_the_same_limit(server: Server) -> None:
     with server.connect() as connection:
         connection.sendall(b"GET /health/live HTTP/1.1\r\nHost: localhost\r\n\r\n")
@@ -234,6 +238,21 @@ def test_a_crowd_of_silent_clients_does_not_keep_others_out(server: Server) -> N
             crowd.append(server.connect())
         assert {one.recv(1) for one in crowd[:40]} == {b""}  # the oldest were closed
         until(lambda: server.open_connections() <= patient.connections, seconds=5)
+        assert all(server.answers() for _ in range(5))
+    finally:
+        for connection in crowd:
+            connection.close()
+
+
+def test_a_crowd_that_goes_on_sending_behind_refusals_does_not_keep_others_out(server: Server) -> None:
+    server.server.config.http_protocol_class = limited_protocol(Limits(connections=6, linger_s=30))
+    crowd = [server.connect() for _ in range(6)]
+    try:
+        for connection in crowd:
+            connection.sendall(UPLOAD % 90_000_000)  # more than is taken
+            assert connection.recv(65536).startswith(b"HTTP/1.1 413")
+            connection.sendall(b"x")
+        time.sleep(0.2)
         assert all(server.answers() for _ in range(5))
     finally:
         for connection in crowd:

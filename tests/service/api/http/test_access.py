@@ -182,7 +182,10 @@ def test_a_bound_key_sees_its_maps_alone_whichever_way_it_asks(guarded: TestClie
     assert {one["map_id"] for one in guarded.get("/maps", headers=bound).json()["maps"]} == {"lobby"}
     assert {one["map_id"] for one in guarded.get("/jobs", headers=bound).json()["jobs"]} == {"lobby"}
     assert guarded.get("/jobs?map_id=vault", headers=bound).json()["jobs"] == []
-    assert guarded.get(f"/maps/lobby/changes?survey={theirs}", headers=bound).status_code == 404
+    running_there, _ = add_survey(catalog, map_id="vault", ready=False)
+    for survey in (theirs, running_there, "survey-none"):
+        answer = guarded.get(f"/maps/lobby/changes?survey={survey}", headers=bound)
+        assert (answer.status_code, answer.json()["detail"]) == (404, f"no survey '{survey}' of map 'lobby'")
     taken = guarded.post("/maps/lobby/versions", json={"survey_id": theirs}, headers=bound)
     assert taken.status_code in (404, 409, 422)
 
@@ -209,6 +212,21 @@ def test_a_model_of_another_map_is_not_there_for_a_bound_key(guarded: TestClient
     assert guarded.post("/maps/lobby/surveys", json=body, headers=bound).status_code == 422
     base = guarded.post("/maps/lobby/models", json={"base": model.model}, headers=bound)
     assert base.status_code == 422
+
+
+def test_a_bound_key_is_shown_the_newest_version_of_its_own(guarded: TestClient) -> None:
+    catalog = catalog_of(guarded)
+    for map_id in ("lobby", "vault"):
+        model, job = catalog.models.create(map_id, name="site-net", minutes=1)
+        catalog.models.save_card(job.job_id, {"name": "site-net", "version": model.model.partition("/")[2]})
+        catalog.jobs.succeed(job.job_id)
+    for key, version in (
+        (key_for(guarded, "changes:read", maps=["lobby"]), "1"),
+        (key_for(guarded, "admin"), "2"),
+    ):
+        assert guarded.get("/models/site-net", headers=key).json()["version"] == version
+    bound = key_for(guarded, "changes:read", maps=["lobby"])
+    assert guarded.get("/models/site-net?version=2", headers=bound).status_code == 404
 
 
 def test_a_job_is_dismissed_by_who_may_ask_for_its_kind(guarded: TestClient) -> None:

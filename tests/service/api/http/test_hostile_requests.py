@@ -98,6 +98,12 @@ def test_a_boundary_that_no_form_has_is_refused(asked: TestClient, letters: int)
     assert "boundary" in answer.json()["detail"]
 
 
+@pytest.mark.parametrize("header", ["X-A: " + "a" * 100_000, "A: b\r\n" * 5000], ids=["long", "many"])
+def test_headers_of_a_part_are_bounded(asked: TestClient, header: str) -> None:
+    answer = asked.post("/scans", content=f"--b\r\n{header}\r\n\r\n", headers=FORM)
+    assert (answer.status_code, "Maximum header" in answer.json()["detail"]) == (422, True)
+
+
 @pytest.mark.parametrize("text", DEEP, ids=lambda text: text[:6])
 def test_nesting_ends_in_a_sentence_wherever_json_is_read(asked: TestClient, text: str) -> None:
     for name in ("settings", "anchor", "scan_ids"):

@@ -280,3 +280,10 @@ def test_a_queue_whose_disk_is_full_is_a_full_disk(
 
     monkeypatch.setattr(Maps, "page", fail)
     problem(client.get("/maps"), 507, "disk_full")
+
+
+@pytest.mark.parametrize("method", ["GET", "POST"])
+def test_an_address_with_a_slash_too_many_is_none_and_leads_nowhere(client: TestClient, method: str) -> None:
+    answer = client.request(method, "/maps/", headers={"Host": "127.0.0.1"}, follow_redirects=False)
+    assert (answer.status_code, answer.json()["type"]) == (404, "urn:spicd:problem:not_found")
+    assert "location" not in answer.headers

@@ -15,7 +15,7 @@ from typing import Any
 import httpx
 import pytest
 
-from service.api.http.uploads import ABANDONED_S, sweep
+from service.api.http.uploads import AFTERWARDS_S, Incoming, sweep
 from tests.support.samples import settings_in
 
 PIECE = bytes(range(256)) * 4096  #: 1 MiB
@@ -126,10 +126,24 @@ def _until(true: Callable[[], bool]) -> None:
     raise AssertionError("it did not come about")
 
 
-def test_what_a_killed_process_left_goes_after_an_hour_and_what_is_written_stays(tmp_path: Path) -> None:
-    old, new = tmp_path / "old.part", tmp_path / "new.part"
-    old.touch()
-    new.touch()
-    os.utime(old, (time.time() - ABANDONED_S - 1,) * 2)
-    sweep(tmp_path)
-    assert [path.name for path in tmp_path.iterdir()] == ["new.part"]
+def test_what_a_killed_process_left_goes_when_no_upload_may_still_need_it(tmp_path: Path) -> None:
+    for name, age_s in (("gone", 7200 + AFTERWARDS_S + 1), ("slow", 7200), ("new", 0)):
+        path = tmp_path / f"{name}.part"
+        path.touch()
+        os.utime(path, (time.time() - age_s,) * 2)
+    sweep(tmp_path, upload_timeout_s=7200)
+    assert {path.stem for path in tmp_path.iterdir()} == {"slow", "new"}
+
+
+def test_the_first_file_of_a_form_that_goes_on_is_not_swept_however_old(tmp_path: Path) -> None:
+    with Incoming(tmp_path, "first.ply") as first:
+        first.write(HEAD)
+        path = first.finish().path
+        os.utime(path, (0, 0))
+        sweep(tmp_path, upload_timeout_s=1)
+        assert path.is_file()
+    assert not path.exists()
+    path.touch()
+    os.utime(path, (0, 0))
+    sweep(tmp_path, upload_timeout_s=1)
+    assert not path.exists()  # of an earlier process
