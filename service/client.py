@@ -226,6 +226,10 @@ class Client:
         """Return one job."""
         return self._json("GET", f"/jobs/{_quoted(job_id)}")
 
+    def retry(self, job_id: str) -> Document:
+        """Run a failed job again, from the step that it failed in."""
+        return self._json("POST", f"/jobs/{_quoted(job_id)}/retry")
+
     def dismiss(self, job_id: str) -> Document:
         """Stop a job for good."""
         return self._json("DELETE", f"/jobs/{_quoted(job_id)}")

@@ -419,7 +419,7 @@ def _problem(error: BaseException, job: StepJob) -> tuple[str, str]:
         case JobTimeoutException():
             return "timed_out", f"step {job.id} took longer than {job.timeout} s; send fewer or smaller scans"
         case _ if is_disk_full(error):
-            return NoSpaceLeft.code, "the disk is full; make room, then submit it again"
+            return NoSpaceLeft.code, "the disk is full; make room, then run it again"
         case _:
             what = f"an unexpected {type(error).__name__}"
             return "internal", f"step {job.id} stopped on {what}; see the worker's log"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Annotated, Literal
 
-from fastapi import APIRouter, Path, Query, Request
+from fastapi import APIRouter, Path, Query, Request, Response
 from pydantic import Field
 
 from service.api.http.access import maps_of_key
@@ -14,7 +14,7 @@ from service.api.http.documents import Document, Link, link
 from service.api.http.fields import Id
 from service.api.http.paging import PageRequest, list_links
 from service.api.http.problems import LISTED, NAMED, JobProblem, documented
-from service.api.http.submission import dismiss
+from service.api.http.submission import dismiss, run_again
 from service.api.models import model_path
 from service.catalog.records import JobRecord, JobStatus
 from service.catalog.steps import JobKind
@@ -93,6 +93,24 @@ async def dismiss_job(request: Request, services: Provided, job_id: JobId) -> Jo
     keeps its state, so it answers 409.
     """
     return job_document(await services.writes.run(dismiss, services, job_id), request)
+
+
+@router.post(
+    "/jobs/{job_id}/retry",
+    status_code=202,
+    summary="Run a failed job again",
+    responses=documented(
+        "not_found", "conflict", "invalid_request", "disk_full", "queue_unavailable", "queue_full"
+    ),
+)
+async def retry_job(request: Request, response: Response, services: Provided, job_id: JobId) -> JobDocument:
+    """Goes on with the step that it failed in, once what was wrong is mended: a full disk, a setting, a worker.
+
+    A job that waits or runs is left as it is, so that a retry may be sent twice.
+    """
+    job = await services.writes.run(run_again, services, job_id)
+    response.headers["Location"] = link(request, f"/jobs/{job_id}", "monitor").href
+    return job_document(job, request)
 
 
 Wait = tuple[int, float]  #: position in its queue, seconds waited

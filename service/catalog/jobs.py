@@ -229,6 +229,30 @@ class Jobs:
             raise Conflict(f"job {job_id!r} is already {job.status}; delete its map or survey instead")
         return job
 
+    def run_again(self, job_id: str) -> JobRecord:
+        """Have a failed job go on with the step that it failed in; one that has not ended is left as it is.
+
+        Raises NotFound, and Conflict for a job that ended otherwise, whose map, survey or model is gone, or beside which
+        another version of the map is being built.
+        """
+        with self._database.write() as session:
+            job = _row(session, job_id)
+            session.get(tables.Map, job.map_id, with_for_update=True)
+            if job.status in ("accepted", "running"):
+                return JobRecord.of_row(job)
+            subject = _subject(session, job)
+            if job.status != "failed" or subject is None:
+                raise Conflict(f"job {job_id!r} is {job.status}; only one that failed can be run again")
+            if job.kind == "map":
+                _check_no_other_builds(session, job)
+            instant = now()
+            job.status, job.problem, job.finished = "running" if job.started else "accepted", None, None
+            job.message, job.attempts, job.interruptions = "waiting, to be run again", 0, 0
+            job.due, job.begun, job.updated = instant, None, instant
+            subject.status, subject.updated = _UNDER_WAY[cast("JobKind", job.kind)], instant
+            session.flush()
+            return JobRecord.of_row(job)
+
     def lose_attempt(self, job_id: str, step: str, reason: str, *, begun: datetime | None = None) -> bool:
         """Count an attempt that ended without a result, by its own fault; `reason` is the first half of a sentence.
 
@@ -367,6 +391,18 @@ def _counted(session: Session, job_id: str, step: str, count: Any, *where: Colum
     at_it = (tables.Job.job_id == job_id, tables.Job.step == step, _OPEN, *where)
     statement = update(tables.Job).where(*at_it).values({count.key: count + 1}).returning(count)
     return cast("int | None", session.scalar(statement))
+
+
+#: What a version, a survey or a model is while its job has not ended.
+_UNDER_WAY: dict[JobKind, str] = {"map": "building", "survey": "running", "model": "training"}
+
+
+def _check_no_other_builds(session: Session, job: tables.Job) -> None:
+    """Raise Conflict where another version of the job's map is being built."""
+    version = tables.MapVersion
+    others = select(version.job_id).where(version.map_id == job.map_id, version.status == "building")
+    if (other := session.scalar(others)) is not None:
+        raise Conflict(f"another version of map {job.map_id!r} is being built (job {other}); wait for it")
 
 
 def _subject(session: Session, job: tables.Job) -> tables.MapVersion | tables.Survey | tables.Model | None:

@@ -20,16 +20,21 @@ def jobs(
     ctx: typer.Context,
     job_id: Annotated[str | None, typer.Argument(help="One job; left out: all.")] = None,
     cancel: Annotated[bool, typer.Option("--cancel", help="Stop it for good.")] = False,
+    retry: Annotated[bool, typer.Option("--retry", help="Run a failed one again.")] = False,
     wait: Annotated[bool, typer.Option("--wait", help="Follow it to its end.")] = False,
 ) -> None:
     """Jobs, newest first, or one of them."""
     terminal: Terminal = ctx.obj
-    if job_id is None and (cancel or wait):
+    if job_id is None and (cancel or retry or wait):
         raise ClientError("name the job; `spicd jobs` lists them")
     if job_id is None:
         terminal.ask(lambda client: client.jobs(), _table)
     elif cancel:
         terminal.ask(lambda client: client.dismiss(job_id), _whole)
+    elif retry and not wait:
+        terminal.ask(lambda client: client.retry(job_id), _whole)
+    elif retry:
+        terminal.ask(lambda client: terminal.wait(client, str(client.retry(job_id)["jobID"])), _whole)
     elif wait:
         terminal.ask(lambda client: terminal.wait(client, job_id), _whole)
     else:

@@ -159,7 +159,7 @@ def _ended(catalog: Catalog, run: Run, error: Exception) -> None:
             catalog.jobs.fail(run.job_id, Problem.of(error), step=run.step, begun=run.begun)
             raise error
         case _ if is_disk_full(error):
-            full = NoSpaceLeft("the disk is full; make room, then submit it again")
+            full = NoSpaceLeft("the disk is full; make room, then run it again")
             catalog.jobs.fail(run.job_id, Problem.of(full), step=run.step, begun=run.begun)
             raise full from error
         case _:

@@ -64,6 +64,7 @@ SCOPES: Mapping[tuple[str, str], Scopes] = {
     ("GET", "/jobs"): _READ,
     ("GET", "/jobs/{job_id}"): _READ | _SURVEYS | _MAPS,
     ("DELETE", "/jobs/{job_id}"): _SURVEYS | _MAPS,  # of which one, by the kind of the job
+    ("POST", "/jobs/{job_id}/retry"): _SURVEYS | _MAPS,  # the same
     ("GET", "/health/live"): OPEN,
     ("GET", "/health/ready"): OPEN,
     ("GET", "/metrics"): _READ,
@@ -148,7 +149,8 @@ def _admitted(
     ids = {
         name: value for name, value in path_params.items() if _ID.fullmatch(str(value))
     }  # others are a 422
-    if key.may(scopes) and route == ("DELETE", "/jobs/{job_id}") and "job_id" in ids:
+    changes_job = route in (("DELETE", "/jobs/{job_id}"), ("POST", "/jobs/{job_id}/retry"))
+    if key.may(scopes) and changes_job and "job_id" in ids:
         scopes = _SURVEYS if catalog.jobs.get(ids["job_id"]).kind == "survey" else _MAPS
     if not key.may(scopes):
         raise Forbidden(f"key {key.key_id!r} has not the scope {' or '.join(sorted(scopes))} that this needs")

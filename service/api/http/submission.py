@@ -125,6 +125,16 @@ class Ticker:
             self._over.wait(self._every_s)
 
 
+def run_again(services: Services, job_id: str) -> JobRecord:
+    """Have a failed job wait for its turn again. Raises NotFound, Conflict, QueueFull, QueueUnavailable, DiskFull."""
+    services.catalog.disk.require()
+    admit(services)
+    services.queue.ping()
+    job = services.catalog.jobs.run_again(job_id)
+    services.dispatcher.hand_over()
+    return job
+
+
 def dismiss(services: Services, job_id: str) -> JobRecord:
     """Dismiss a job for good, then tell the workers. Raises NotFound and Conflict.
 

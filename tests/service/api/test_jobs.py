@@ -171,3 +171,19 @@ def test_a_start_without_a_queue_serves_all_the_same(settings: Settings) -> None
         add_map(catalog_of(client), ready=False)
     with running(settings, RememberingQueue(down=True)) as client:
         assert client.get("/jobs").json()["jobs"][0]["status"] == "accepted"
+
+
+def test_a_failed_job_is_run_again_on_request(
+    client: TestClient, catalog: Catalog, queue: RememberingQueue
+) -> None:
+    add_map(catalog)
+    survey_id, job_id = add_survey(catalog, ready=False)
+    catalog.jobs.fail(job_id, Problem(code="disk_full", detail="the disk is full"))
+    queue.submitted.clear()
+    answer = client.post(f"/jobs/{job_id}/retry")
+    assert (answer.status_code, answer.json()["status"], answer.json()["problem"]) == (202, "accepted", None)
+    assert answer.headers["Location"] == f"/jobs/{job_id}"
+    assert queue.submitted == [(job_id, "register")]
+    assert client.get(f"/surveys/{survey_id}").json()["status"] == "running"
+    catalog.jobs.dismiss(job_id)
+    assert client.post(f"/jobs/{job_id}/retry").status_code == 409

@@ -76,6 +76,7 @@ def test_every_call_of_the_public_api_is_described(document: dict[str, Any]) -> 
         "GET /jobs",
         "GET /jobs/{job_id}",
         "DELETE /jobs/{job_id}",
+        "POST /jobs/{job_id}/retry",
         "GET /models",
         "GET /models/{name}",
         "GET /health/live",

@@ -246,6 +246,44 @@ def test_a_step_that_nobody_has_begun_waits_on_as_it_was(catalog: Catalog, job_i
     assert catalog.jobs.get(job_id) == before
 
 
+# a failed job can be run again
+
+
+def test_a_failed_job_goes_on_with_the_step_that_it_failed_in(catalog: Catalog) -> None:
+    add_map(catalog)
+    survey_id, job_id = add_survey(catalog, ready=False)
+    catalog.jobs.advance(begin(catalog, job_id))
+    begin(catalog, job_id, "score")
+    catalog.jobs.fail(job_id, Problem(code="disk_full", detail="the disk is full"))
+    job = catalog.jobs.run_again(job_id)
+    assert (job.status, job.step, job.problem, job.finished) == ("running", "score", None, None)
+    survey = catalog.surveys.get(survey_id)
+    assert (survey.status, survey.problem) == ("running", None)
+    assert catalog.jobs.run_again(job_id) == job  # sent twice
+    run = begin(catalog, job_id, "score")
+    assert catalog.jobs.advance(run)
+
+
+def test_a_job_that_ended_otherwise_is_not_run_again(catalog: Catalog, job_id: str) -> None:
+    catalog.jobs.dismiss(job_id)
+    with pytest.raises(Conflict, match="dismissed"):
+        catalog.jobs.run_again(job_id)
+    with pytest.raises(NotFound):
+        catalog.jobs.run_again("job-nowhere")
+
+
+def test_a_failed_build_is_not_run_again_beside_another_of_the_same_map(catalog: Catalog) -> None:
+    add_map(catalog)
+    scans = [add_scan(catalog, name).scan_id for name in ("more", "most")]
+    _, failed = catalog.versions.create("lobby", scan_ids=scans[:1])
+    catalog.jobs.fail(failed.job_id, PROBLEM)
+    _, building = catalog.versions.create("lobby", scan_ids=scans[1:])
+    with pytest.raises(Conflict, match=building.job_id):
+        catalog.jobs.run_again(failed.job_id)
+    catalog.jobs.dismiss(building.job_id)
+    assert catalog.jobs.run_again(failed.job_id).status == "accepted"
+
+
 # attempts: a step is started again twice after a fault of its own, and twenty times after one from outside
 
 

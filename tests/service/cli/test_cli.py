@@ -504,6 +504,12 @@ def test_jobs_cancel_dismisses(service: Service, capsys: pytest.CaptureFixture[s
     assert "dismissed" in capsys.readouterr().out
 
 
+def test_jobs_retry_runs_a_failed_one_again(service: Service, capsys: pytest.CaptureFixture[str]) -> None:
+    service.on("POST /jobs/job-1/retry", job("running", 30))
+    assert spicd("jobs", "job-1", "--retry") == 0
+    assert "running" in capsys.readouterr().out
+
+
 def test_jobs_lists_and_models_lists(service: Service, capsys: pytest.CaptureFixture[str]) -> None:
     service.on("GET /jobs", {"jobs": [job("running", 40)], "links": []})
     service.on("GET /models", {"models": [{"name": "spicd-net", "version": "1", "threshold": 0.5}]})
