@@ -319,11 +319,19 @@ def check(run: Run) -> None:
                 findings.add("lost", f"{survey}: {state}")
             elif state != "successful":
                 findings.add("failed", f"{survey}: {problem}")
-            elif said(http, survey) != run.expected[number]:
-                findings.add("wrong", survey)
+            elif (says := said(http, survey)) != run.expected[number]:
+                findings.add("wrong", f"{survey}: {_difference(run.expected[number], says)}")
     unheard = len(status) - len(run.submitted) - len(run.expected)
     findings.outcomes["of a request whose answer was lost"] += unheard
     _check_rests(run)
+
+
+def _difference(expected: Any, says: Any) -> str:
+    """Say in what a survey's answer is another than that of the same scan when nothing was broken."""
+    before, now = dict(expected[3]), dict(says[3])
+    tiles = [f"{tile} {before.get(tile)} -> {now.get(tile)}" for tile in before.keys() | now.keys()]
+    other = [tile for tile in tiles if len({*tile.split()[1::2]}) == 2]
+    return f"{expected[:3]} -> {says[:3]}; {', '.join(other[:5])}"
 
 
 def _check_rests(run: Run) -> None:
