@@ -13,16 +13,18 @@ import time
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from tests.breaking import fuzz_api, fuzz_readers, load, soak
 from tests.breaking.fuzz_readers import Fuzz, declared_points, run_batch, what_is_wrong
 from tests.breaking.requests import Request, Requests
 from tests.breaking.scan_mutations import N, samples
-from tests.support.footprints import Footprint, footprints
+from tests.support.footprints import Footprint, footprints, peak_resident
 from tests.support.traffic import throttled
 from worker.cloud.formats.scan import read_scan
 
+ROOT = Path(__file__).parents[1]
 FILES, CASES = 3000, 600
 
 
@@ -85,6 +87,13 @@ def test_requests_of_every_kind_get_an_answer_that_the_document_names(tmp_path: 
     figures = json.loads(file.read_text())
     assert figures["cases"] == CASES
     assert figures["outcomes"]["200"] > CASES / 10
+
+
+def test_the_peak_of_a_process_is_its_own_and_not_that_of_who_started_it() -> None:
+    code = "from tests.support.footprints import peak_resident; print(peak_resident())"
+    held = np.ones(400_000_000, np.uint8)
+    told = subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True, capture_output=True, text=True)
+    assert int(told.stdout) < held.nbytes / 2 < peak_resident()
 
 
 def test_an_answer_that_the_document_does_not_name_is_found() -> None:

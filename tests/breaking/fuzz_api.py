@@ -14,7 +14,6 @@ import json
 import logging
 import random
 import re
-import resource
 import sys
 import time
 from collections.abc import AsyncIterator
@@ -33,6 +32,7 @@ from service.catalog.catalog import Catalog
 from service.catalog.objects import ObjectFilter
 from tests.breaking.requests import Request, Requests
 from tests.support.findings import Deadline, Findings, add_common, show
+from tests.support.footprints import peak_resident
 from tests.support.samples import (
     NOON,
     RememberingQueue,
@@ -73,7 +73,7 @@ def main(arguments: list[str] | None = None) -> int:
         found.merge(asyncio.run(run_batch(options.seed, start, min(start + _BATCH, options.cases))))
         print(f"{found.cases:,} cases, {sum(found.counts.values())} findings", file=sys.stderr)
         gc.collect()
-    taken = 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    taken = peak_resident()
     if taken > MEMORY:
         found.add("memory", f"{taken / 1e6:.0f} MB at the peak")
     seconds = deadline.passed_s()

@@ -41,6 +41,14 @@ def footprints(pid: int) -> dict[str, Footprint]:
     return found
 
 
+def peak_resident() -> int:
+    """Return the most bytes that this process has held in memory.
+
+    `ru_maxrss` of getrusage(2) is not that: what Python starts with vfork carries the peak of its parent over exec.
+    """
+    return 1024 * _number("VmHWM", Path("/proc/self/status").read_text())
+
+
 def _footprint(pid: int) -> Footprint:
     status = Path(f"/proc/{pid}/status").read_text()
     return Footprint(
