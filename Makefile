@@ -4,8 +4,9 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 SERVERS := build/servers
+TOOLS := build/tools
 
-.PHONY: help servers demo up test test-fast acceptance-shared check format bench chaos fuzz load soak openapi clean
+.PHONY: help servers tools demo up test test-fast acceptance-shared check format bench chaos fuzz load soak openapi clean
 help: ## this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
 
@@ -22,6 +23,8 @@ test-fast: $(INSTALLED) ## the tests that take no longer than a second or so: un
 	$(BIN)/pytest -m fast -n auto --dist loadscope
 
 servers: $(SERVERS)/bin/moto_server ## an S3 server for tests, in an environment of its own; PostgreSQL has to be there
+
+tools: $(TOOLS)/.installed ## what tests drive the service with: GeoPandas, schemathesis, tus clients, Node and its compilers
 
 acceptance-shared: $(INSTALLED) $(SERVERS)/bin/moto_server ## tests of the catalog on PostgreSQL; acceptance with S3 too, one host and two
 	SPICD_TEST_DATABASE_URL=postgresql $(BIN)/pytest tests/service/catalog tests/service/api -m fast -n auto --dist loadscope
@@ -72,3 +75,12 @@ $(INSTALLED): pyproject.toml docker/constraints.txt docker/system-libraries.sh
 $(SERVERS)/bin/moto_server:
 	@$(PYTHON) -m venv $(SERVERS)
 	@$(SERVERS)/bin/python -m pip install --quiet --disable-pip-version-check 'moto[s3]==5.2.5' 'flask==3.1.3' 'flask-cors==6.0.5'
+
+# Of their own for the same reason; Node comes from PyPI, its packages by the lock file.
+$(TOOLS)/.installed: tests/tools/requirements.txt tests/tools/package.json tests/tools/package-lock.json
+	@echo "Making $(TOOLS) and installing (0.9 GB; a minute) ..."
+	@$(PYTHON) -m venv $(TOOLS)
+	@$(TOOLS)/bin/python -m pip install --quiet --disable-pip-version-check -r tests/tools/requirements.txt
+	@cp tests/tools/package.json tests/tools/package-lock.json $(TOOLS)/
+	@cd $(TOOLS) && PATH="$$PWD/bin:$$PATH" npm ci --silent --no-audit --no-fund
+	@touch $@
