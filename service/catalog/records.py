@@ -337,6 +337,7 @@ class SurveyRecord(Record):
     map_version: int = Field(description="of the map, that the survey is compared with", examples=[1])
     status: SurveyStatus
     model: str = Field(examples=["voxel-net/1"])
+    asked_threshold: float | None = Field(description="the client's own; null: the model's is taken")
     threshold: float | None = Field(description="asked for, then the one that was used")
     device_id: str | None
     captured_at: Utc  #: given, else the latest of its scans, else the time of the request

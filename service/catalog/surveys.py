@@ -65,6 +65,7 @@ class Surveys:
                 map_version=version.version,
                 status="running",
                 model=model,
+                asked_threshold=threshold,
                 threshold=threshold,
                 device_id=device_id,
                 captured_at=captured_at or max(taken, default=job.created),

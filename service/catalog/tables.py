@@ -197,6 +197,7 @@ class Survey(Base):
     map_version: Mapped[int] = mapped_column(server_default="1")
     status: Mapped[str]
     model: Mapped[str]
+    asked_threshold: Mapped[float | None]
     threshold: Mapped[float | None]
     device_id: Mapped[str | None]
     captured_at: Mapped[datetime]
