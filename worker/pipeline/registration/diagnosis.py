@@ -55,3 +55,10 @@ class Diagnosis:
         default_factory=dict
     )  #: e.g. {"scale": 1.012}; metres, degrees, 0..1
     poses: tuple[Matrix4, ...] = ()  #: map_from_scan of the poses that nothing tells apart, where ambiguous
+
+
+def length(metres: float) -> str:
+    """Write a distance as people would: in kilometres from one on."""
+    if metres >= 1e7:
+        return "over 10,000 km"
+    return f"{metres / 1000:.1f} km" if metres >= 1000 else f"{metres:.1f} m"
