@@ -36,7 +36,7 @@ from worker.pipeline.mapping.tasks import (
 )
 from worker.pipeline.placement.contradictions import Place
 from worker.pipeline.placement.scan_placement import turned_up
-from worker.pipeline.registration.diagnosis import Reason
+from worker.pipeline.registration.diagnosis import Reason, without_doubles
 from worker.pipeline.registration.results import RegistrationResult, ScanFile, ScanRejected, ScanResult
 from worker.pipeline.registration.scan_to_scan import PairResult
 from worker.processes import default_processes
@@ -348,19 +348,21 @@ class _Build:
         results = []
         for index, scan in prepared.items():
             name, late = self.files[index].name, relocalized.get(index)
+            odd = scan.oddities if isinstance(scan, ValidScan) else ()
             if index in refined.poses:
                 registration = self._registration(index, graph, refined, late, frame)
-                told = turned_up(name, registration.map_from_scan)
+                told = without_doubles((*turned_up(name, registration.map_from_scan), *odd))
                 results.append(ScanResult.accepted(name, registration, warnings=told))
             elif isinstance(scan, Exception):
                 results.append(ScanResult.rejected(name, scan))
             elif late is not None and late.pose is None:
-                results.append(late.result)
+                results.append(replace(late.result, warnings=odd))
             else:
                 detail = (
                     f"scan {name}: it contradicts what its neighbours saw as free space; scan there again"
                 )
-                results.append(ScanResult.rejected(name, ScanRejected.because("disagrees", detail)))
+                error = ScanRejected.because("disagrees", detail)
+                results.append(ScanResult.rejected(name, error, warnings=odd))
         return tuple(results)
 
     def _registration(

@@ -36,6 +36,7 @@ from worker.pipeline.placement.belief import confidence, log_odds
 from worker.pipeline.placement.contradictions import Held, Place
 from worker.pipeline.placement.placed_scan import PlacedScan, other_place
 from worker.pipeline.placement.scan_placement import CLEAR
+from worker.pipeline.registration.diagnosis import Diagnosis, without_doubles
 from worker.pipeline.registration.hypothesis import Hypothesis
 from worker.pipeline.registration.icp import normal_equations
 from worker.pipeline.registration.preprocessing import PreparedScan
@@ -110,6 +111,9 @@ class _Visit:
     progress: Progress
     growing: bool
     errors: dict[int, Exception] = field(default_factory=dict)  #: why a file is left out, by its index
+    oddities: dict[int, tuple[Diagnosis, ...]] = field(
+        default_factory=dict
+    )  #: what is odd about it by itself
 
     def run(self) -> SurveyRegistration:
         """Run the steps in order."""
@@ -124,7 +128,7 @@ class _Visit:
         outcomes = tuple(
             self._accepted(index, placed[index], refined)
             if index in refined.poses
-            else ScanResult.rejected(file.name, self.errors[index])
+            else ScanResult.rejected(file.name, self.errors[index], warnings=self.oddities.get(index, ()))
             for index, file in enumerate(self.files)
         )
         kept = [scan for index, scan in placed.items() if index in refined.poses]
@@ -147,7 +151,7 @@ class _Visit:
         for index, scan in self.workspace.processes.map_unordered(read_and_prepare, tasks):
             self.progress("registering", 0.0)
             if isinstance(scan, ValidScan):
-                priors[index] = scan.prior
+                priors[index], self.oddities[index] = scan.prior, scan.oddities
             else:
                 self.errors[index] = scan
         unreadable = [self.errors[index] for index in sorted(self.errors)]
@@ -364,7 +368,7 @@ class _Visit:
         return ScanResult.accepted(
             self.files[index].name,
             replace(result, uncertainty=refined.uncertainties[index]),
-            warnings=placed.warnings,
+            warnings=without_doubles((*placed.warnings, *self.oddities.get(index, ()))),
             confidence=placed.confidence,
         )
 
