@@ -43,6 +43,14 @@ ScanReason = Literal[
     "wrong_prior",
     "moved_while_scanning",
     "disagrees",
+    "wrong_units",
+    "far_from_origin",
+    "far_points",
+    "missing_returns",
+    "odd_density",
+    "odd_size",
+    "little_coverage",
+    "clock",
 ]
 ScanFormat = Literal["ply", "pcd"]
 #: What an API key may do; `admin` is everything.
@@ -103,6 +111,19 @@ class Problem(Record):
         )
 
 
+class ScanWarning(Record):
+    """What is odd about a scan or a survey that was taken."""
+
+    reason: ScanReason = Field(examples=["wrong_scale"])
+    detail: str = Field(description="a sentence for people; it may change")
+    numbers: dict[str, float] = Field(
+        default_factory=dict, description="metres, degrees, shares", examples=[{"scale": 1.012}]
+    )
+
+
+Warnings = Annotated[tuple[ScanWarning, ...], BeforeValidator(lambda given: given or ())]
+
+
 class ScanRecord(Record):
     """One uploaded file, unread."""
 
@@ -115,17 +136,10 @@ class ScanRecord(Record):
     captured_at: Utc | None
     pose: Matrix | None = Field(description="map_from_sensor as it was given, row-major")
     key: str = Field(exclude=True)  #: of the blob; clients do not see it
-    created: Utc
-
-
-class ScanWarning(Record):
-    """What is odd about a scan that was accepted."""
-
-    reason: ScanReason = Field(examples=["wrong_scale"])
-    detail: str = Field(description="a sentence for people; it may change")
-    numbers: dict[str, float] = Field(
-        default_factory=dict, description="metres, degrees, shares", examples=[{"scale": 1.012}]
+    warnings: Warnings = Field(
+        (), description="what is odd about it: of its clock at once, of its points once a job has read it"
     )
+    created: Utc
 
 
 class ScanOutcome(Record):
@@ -163,9 +177,7 @@ class ScanOutcome(Record):
     candidates: tuple[Matrix, ...] | None = Field(
         None, description="`ambiguous` alone: each map_from_scan that nothing tells from the others"
     )
-    warnings: Annotated[tuple[ScanWarning, ...], BeforeValidator(lambda given: given or ())] = Field(
-        (), description="what is odd about it though it was accepted"
-    )
+    warnings: Warnings = Field((), description="what is odd about it beside, also where it was left out")
 
 
 class Bounds(Record):
@@ -341,6 +353,7 @@ class SurveyRecord(Record):
     threshold: float | None = Field(description="asked for, then the one that was used")
     device_id: str | None
     captured_at: Utc  #: given, else the latest of its scans, else the time of the request
+    warnings: Warnings = Field((), description="what is odd about the survey itself: its clock")
     scans: tuple[ScanOutcome, ...]  #: in the order of the request
     placement: Placement | None = Field(
         description="null until its scans are registered, and in surveys of releases that did not judge it"

@@ -12,6 +12,7 @@ from sqlalchemy.orm import Session, selectinload
 
 from service.catalog import blob_keys, history, tables, tallies
 from service.catalog.blobs import Blobs
+from service.catalog.clock import clock_warnings
 from service.catalog.database import Database
 from service.catalog.jobs import new_job
 from service.catalog.records import (
@@ -26,7 +27,13 @@ from service.catalog.records import (
     TileRecord,
     TileState,
 )
-from service.catalog.scans import checked_scan_ids, known_outcomes, scans_in_order, write_outcomes
+from service.catalog.scans import (
+    as_kept,
+    checked_scan_ids,
+    known_outcomes,
+    scans_in_order,
+    write_outcomes,
+)
 from service.catalog.tables import Survey, SurveyObject, SurveyTile, new_id, now
 from service.catalog.versions import map_row, version_in_use
 from service.errors import Conflict, NotFound, NotReady
@@ -69,6 +76,7 @@ class Surveys:
                 threshold=threshold,
                 device_id=device_id,
                 captured_at=captured_at or max(taken, default=job.created),
+                warnings=as_kept(clock_warnings(captured_at, received=job.created)),
                 counts={},
                 job_id=job.job_id,
                 created=job.created,
@@ -113,7 +121,7 @@ class Surveys:
         with self._database.write() as session:
             row = _row(session, survey_id)
             tallies.tally_outcomes(session, "survey", outcomes, known_outcomes(row.scans))
-            write_outcomes(row.scans, outcomes)
+            write_outcomes(session, row.scans, outcomes)
             row.placement = None if placement is None else placement.model_dump()
             row.updated = now()
 

@@ -94,6 +94,7 @@ class Scan(Base):
     captured_at: Mapped[datetime | None]
     pose: Mapped[list[list[float]] | None]
     key: Mapped[str]
+    warnings: Mapped[list[dict[str, Any]] | None]
     created: Mapped[datetime]
     resent: Mapped[datetime | None]
 
@@ -201,6 +202,7 @@ class Survey(Base):
     threshold: Mapped[float | None]
     device_id: Mapped[str | None]
     captured_at: Mapped[datetime]
+    warnings: Mapped[list[dict[str, Any]] | None]
     placement: Mapped[dict[str, Any] | None]
     counts: Mapped[dict[str, int]]
     objects: Mapped[dict[str, int] | None]

@@ -88,7 +88,7 @@ class Versions:
         with self._database.write() as session:
             row = _row_of_job(session, job_id)
             tallies.tally_outcomes(session, "map", outcomes, known_outcomes(row.scans))
-            write_outcomes(row.scans, outcomes)
+            write_outcomes(session, row.scans, outcomes)
             row.updated = now()
 
     def save_result(
@@ -108,7 +108,7 @@ class Versions:
         with self._database.write() as session:
             row = _row_of_job(session, job_id)
             tallies.tally_outcomes(session, "map", outcomes, known_outcomes(row.scans))
-            write_outcomes(row.scans, outcomes)
+            write_outcomes(session, row.scans, outcomes)
             row.bounds = bounds.model_dump(mode="json")
             row.counts = dict(counts)
             row.registration = None if registration is None else dict(registration)

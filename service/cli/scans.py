@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
-from service.cli.tables import columns
+from service.cli.tables import columns, warnings
 from service.cli.terminal import Captured, Device, Terminal, read_pose
 from service.client import ClientError, Document
 
@@ -32,9 +32,13 @@ def add(
 
 
 def _table(scans: list[Document]) -> Table:
-    table = columns("scan", "file", "bytes", "sha256")
+    table = columns("scan", "file", "bytes", "sha256", "warnings")
     for scan in scans:
         table.add_row(
-            scan["scan_id"], scan.get("filename", ""), f"{scan.get('size', 0):,}", scan["sha256"][:16]
+            scan["scan_id"],
+            scan.get("filename", ""),
+            f"{scan.get('size', 0):,}",
+            scan["sha256"][:16],
+            warnings(scan),
         )
     return table

@@ -9,7 +9,7 @@ import typer
 from rich.console import Group
 from rich.table import Table
 
-from service.cli.tables import columns, counts, facts, number, placement, point, scan_table
+from service.cli.tables import columns, counts, facts, number, placement, point, scan_table, warnings
 from service.cli.terminal import Captured, Device, Model, Scans, Terminal, Wait
 from service.client import Document
 
@@ -96,6 +96,7 @@ def _whole(url: str) -> Callable[[Document], Group]:
             "tiles": counts(survey),
             "objects": counts(survey, "objects"),
             "moving": survey.get("moving"),
+            "warnings": warnings(survey),
         }
         if survey["status"] == "ready":
             rows |= {

@@ -47,6 +47,7 @@ PROBLEMS: dict[str, tuple[int | None, str]] = {
     "internal": (500, "The service failed"),
     "scan_too_large": (None, "The scan has too many points"),
     "scan_units": (None, "The scan is not in metres"),
+    "scan_far_away": (None, "The scan lies far from its origin"),
     "registration_failed": (None, "No scan could be registered"),
     "map_failed": (None, "The scans do not make a map"),
     "training_failed": (None, "The model could not be trained"),
