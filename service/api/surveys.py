@@ -11,7 +11,6 @@ from fastapi.concurrency import run_in_threadpool
 from pydantic import Field
 
 from service.api import features
-from service.api.features import FeatureResponse, feature_response
 from service.api.http import bodies, files
 from service.api.http.access import maps_of_key
 from service.api.http.bodies import Body
@@ -139,29 +138,13 @@ async def delete_survey(services: Provided, survey_id: SurveyId) -> None:
 
 
 @router.get(
-    "/surveys/{survey_id}/tiles",
-    summary="Every tile of a survey",
-    response_class=FeatureResponse,
-    response_model=None,
-    responses=features.documented() | MADE,
-)
-def get_tiles(request: HttpRequest, services: Provided, survey_id: SurveyId) -> FeatureResponse:
-    """Unchanged, changed, inconsistent and unobserved tiles alike."""
-    survey = services.catalog.surveys.ready(survey_id)
-    anchor = services.catalog.maps.get(survey.map_id).anchor
-    tiles = services.catalog.changes.of_survey(survey_id)
-    here = link(request, f"/surveys/{survey_id}/tiles", "self", features.MEDIA_TYPE)
-    return feature_response(tiles, matched=len(tiles), links=[here], anchor=anchor)
-
-
-@router.get(
     "/surveys/{survey_id}/cloud.ply",
     summary="The coloured cloud of a survey",
     response_class=Response,
     responses=files.documented(bodies.RAW, "The current map coloured by result, PLY") | MADE,
 )
 async def get_survey_cloud(services: Provided, survey_id: SurveyId) -> Response:
-    """With the scalar fields `change_score` and `tile_state` beside the colours."""
+    """With the scalar fields `scalar_change_score` and `scalar_tile_state` beside the colours; its header has the legend."""
     await run_in_threadpool(services.catalog.surveys.ready, survey_id)
     return await blob_response(
         services.catalog.blobs,

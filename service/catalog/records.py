@@ -432,6 +432,7 @@ class ChangeRecord(Record):
     map_id: str
     map_version: int
     survey_id: str
+    device_id: str | None = None  #: of the survey
     model: str
     threshold: float | None
     captured_at: Utc
@@ -450,6 +451,7 @@ class SightingRecord(Record):
     map_id: str
     map_version: int
     survey_id: str
+    device_id: str | None = None  #: of the survey
     model: str
     captured_at: Utc
     first_seen: Utc | None  #: of the object, by any survey

@@ -12,7 +12,7 @@ from fastapi.testclient import TestClient
 
 from service.api.geodesy import to_wgs84
 from service.api.http.paging import encoded
-from service.api.objects import ObjectCollection, ObjectHistory, SightingCollection
+from service.api.objects import FgObjectCollection, FgObjectHistory, FgSightingCollection
 from service.catalog.catalog import Catalog
 from service.catalog.records import Anchor, ObjectRecord
 from tests.support.samples import (
@@ -108,9 +108,9 @@ def test_an_object_is_a_prism_over_its_footprint_with_both_places(
     asked_often: tuple[TestClient, list[str]],
 ) -> None:
     client, (first, _, _) = asked_often
-    answer = client.get(f"/surveys/{first}/objects")
-    assert answer.headers["content-type"] == "application/geo+json"
-    SightingCollection.model_validate_json(answer.content)
+    answer = client.get(f"/surveys/{first}/objects", params={"profile": "jsonfg"})
+    assert answer.headers["content-type"] == "application/vnd.ogc.fg+json"
+    FgSightingCollection.model_validate_json(answer.content)
     body = answer.json()
     assert (body["featureType"], body["numberMatched"]) == ("spicd-object", 2)
     box, desk = body["features"]
@@ -138,13 +138,13 @@ def test_an_object_over_time_has_an_interval_and_each_of_its_sightings(
     asked_often: tuple[TestClient, list[str]],
 ) -> None:
     client, (first, second, _) = asked_often
-    answer = client.get("/maps/lobby/objects")
-    ObjectCollection.model_validate_json(answer.content)
+    answer = client.get("/maps/lobby/objects", params={"profile": "jsonfg"})
+    FgObjectCollection.model_validate_json(answer.content)
     (box,) = (one for one in answer.json()["features"] if one["properties"]["kind"] == "appeared")
     assert box["id"] == box["properties"]["object_id"]
     assert box["time"] == {"interval": ["2026-03-01T12:00:00Z", "2026-03-02T12:00:00Z"]}
-    answer = client.get(f"/maps/lobby/objects/{box['id']}")
-    ObjectHistory.model_validate_json(answer.content)
+    answer = client.get(f"/maps/lobby/objects/{box['id']}", params={"profile": "jsonfg"})
+    FgObjectHistory.model_validate_json(answer.content)
     found = answer.json()
     assert found["properties"] == box["properties"]
     assert [one["properties"]["survey_id"] for one in found["sightings"]] == [first, second]
@@ -267,9 +267,10 @@ def test_an_anchor_puts_footprints_on_the_earth(client: TestClient, catalog: Cat
     client.put("/maps/lobby/anchor", json=BERLIN)
     convert = to_wgs84(Anchor(**BERLIN))
     object_id = properties(client, kind="appeared")[0]["object_id"]
-    alone = client.get(f"/maps/lobby/objects/{object_id}").json()
-    listed = client.get("/maps/lobby/objects").json()["features"]
-    seen = client.get(f"/surveys/{first}/objects").json()["features"]
+    asked = {"profile": "jsonfg"}
+    alone = client.get(f"/maps/lobby/objects/{object_id}", params=asked).json()
+    listed = client.get("/maps/lobby/objects", params=asked).json()["features"]
+    seen = client.get(f"/surveys/{first}/objects", params=asked).json()["features"]
     for feature in (alone, *alone["sightings"], *listed, *seen):
         (ring,) = feature["geometry"]["coordinates"]
         (local,) = feature["place"]["base"]["coordinates"]

@@ -54,7 +54,9 @@ def test_no_two_states_share_a_colour() -> None:
 
 def test_open3d_reads_state_and_score_of_each_point(written: Path) -> None:
     cloud = o3d.t.io.read_point_cloud(written)
-    state, score = (cloud.point[name].numpy().ravel() for name in ("tile_state", "change_score"))
+    state, score = (
+        cloud.point[name].numpy().ravel() for name in ("scalar_tile_state", "scalar_change_score")
+    )
     assert state.tolist() == [0, 1, 1, 2, 2, 2, 3, 3, 3, 3, NOT_IN_A_TILE, NOT_IN_A_TILE]
     assert score[:6].tolist() == [0.25, 0.75, 0.75, 0.875, 0.875, 0.875]
     assert np.isnan(score[6:]).all()
@@ -81,7 +83,7 @@ def test_in_a_map_that_grew_below_its_origin_points_have_the_colours_of_their_ow
     )
     cloud = np.concatenate([in_tile(i - 2, 0, 0, 1) for i in range(5)])  # the last one is of no tile
     write_coloured_cloud(tmp_path / "c.ply", cloud, cloud, replace(known, pairs=pairs))
-    state = o3d.t.io.read_point_cloud(tmp_path / "c.ply").point["tile_state"].numpy().ravel()
+    state = o3d.t.io.read_point_cloud(tmp_path / "c.ply").point["scalar_tile_state"].numpy().ravel()
     assert state.tolist() == [0, 1, 2, 3, NOT_IN_A_TILE]
 
 
@@ -128,7 +130,8 @@ def by_voxels(tmp_path: Path) -> Path:
 def test_with_objects_each_point_bears_its_own_kind_score_and_number(by_voxels: Path) -> None:
     cloud = o3d.t.io.read_point_cloud(by_voxels).point
     kind, score, number, state = (
-        cloud[name].numpy().ravel() for name in ("kind", "change_score", "object_id", "tile_state")
+        cloud[f"scalar_{name}"].numpy().ravel()
+        for name in ("kind", "change_score", "object_id", "tile_state")
     )
     lost = PointKind.DISAPPEARED
     assert kind.tolist() == [
