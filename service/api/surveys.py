@@ -31,7 +31,7 @@ from service.api.http.submission import (
     submit,
 )
 from service.catalog import blob_keys
-from service.catalog.records import JobRecord, MapRecord, SurveyRecord, SurveyStatus
+from service.catalog.records import JobRecord, MapRecord, SurveyRecord, SurveyStatus, SurveySummary
 
 router = APIRouter(tags=["surveys"])
 MapId = Annotated[Id, Path()]
@@ -56,6 +56,13 @@ class SurveyDocument(SurveyRecord, Document):
     links: list[Link]
 
 
+class SurveySummaryDocument(SurveySummary, Document):
+    """A survey in short; the survey itself tells what became of each scan."""
+
+    problem: JobProblem  # type: ignore[assignment]  # as RFC 9457 has it
+    links: list[Link]
+
+
 class AcceptedSurvey(Document):
     """A survey that is going to be compared."""
 
@@ -69,7 +76,7 @@ class AcceptedSurvey(Document):
 class SurveyList(Document):
     """Surveys, newest first."""
 
-    surveys: list[SurveyDocument]
+    surveys: list[SurveySummaryDocument]
     links: list[Link]
 
 
@@ -110,11 +117,12 @@ async def create_survey(
 def list_surveys(
     request: HttpRequest, services: Provided, map_id: MapId, asked: Annotated[PageRequest, Query()]
 ) -> SurveyList:
-    """Of one map, newest first."""
+    """Of one map in short, newest first."""
     services.catalog.maps.get(map_id)
     page = services.catalog.surveys.page(map_id, after=asked.after(), limit=asked.limit)
     links = list_links(request, page, lambda record: (record.created, record.survey_id))
-    return SurveyList(surveys=[survey_document(record, request) for record in page.items], links=links)
+    surveys = [SurveySummaryDocument(**dict(one), links=_links(one, request)) for one in page.items]
+    return SurveyList(surveys=surveys, links=links)
 
 
 @router.get("/surveys/{survey_id}", summary="Look at a survey", responses=NAMED)
@@ -168,7 +176,7 @@ async def get_picture(services: Provided, survey_id: SurveyId) -> Response:
     return await blob_response(services.catalog.blobs, key, media_type="image/png")
 
 
-def _refused(survey: SurveyRecord) -> bool:
+def _refused(survey: SurveySummary) -> bool:
     """Whether a survey failed because no scan of it was accepted, which has a picture."""
     placement = survey.placement
     return survey.status == "failed" and placement is not None and placement.state == "refused"
@@ -208,6 +216,10 @@ def _delete(services: Services, survey_id: str) -> None:
 
 def survey_document(record: SurveyRecord, request: HttpRequest) -> SurveyDocument:
     """Return a survey with its links."""
+    return SurveyDocument(**dict(record), links=_links(record, request))
+
+
+def _links(record: SurveySummary, request: HttpRequest) -> list[Link]:
     here = f"/surveys/{record.survey_id}"
     links = [
         link(request, here, "self"),
@@ -224,4 +236,4 @@ def survey_document(record: SurveyRecord, request: HttpRequest) -> SurveyDocumen
         links.append(link(request, f"{here}/picture.png", "preview", "image/png"))
     if record.status == "ready" and record.objects is not None:
         links.append(link(request, f"{here}/objects", "objects", features.MEDIA_TYPE))
-    return SurveyDocument(**dict(record), links=links)
+    return links

@@ -32,6 +32,7 @@ ChangeSort = Literal[
 TileSort = Literal["tile_index", "-tile_index", "score", "-score"]
 VoxelKind = Literal["appeared", "disappeared"]  #: what voxels of a tile did
 
+_Tiles = Select[tables.SurveyTile, tables.Survey, tables.TileChange]
 _SCORE = func.coalesce(_TILE.score, -1.0)  #: tiles without a score are below all others
 
 
@@ -121,14 +122,16 @@ class Changes:
         """Return every tile of a survey, unobserved ones too, in the order of the grid."""
         return self.tiles(TileFilter(survey_id=survey_id)).items
 
-    def _page(self, query: Select[Any], order: Order, after: Values | None, limit: int | None) -> ChangePage:
+    def _page(self, query: _Tiles, order: Order, after: Values | None, limit: int | None) -> ChangePage:
         count = select(func.count()).select_from(query.subquery())
         rows = query if after is None else query.where(behind(order, after))
         rows = rows.add_columns(*(key.column for key in order)).order_by(*order_by(order))
         rows = rows if limit is None else rows.limit(limit + 1)
         with self._database.read() as session:
             matched = session.scalar(count) or 0
-            read = [(_record(*row[:3]), tuple(row[3:])) for row in session.execute(rows)]
+            read: list[tuple[ChangeRecord, Values]] = [
+                (_record(*row[:3]), tuple(row[3:])) for row in session.execute(rows)
+            ]
         shown = read[:limit]
         following = shown[-1][1] if shown and len(read) > len(shown) else None
         return ChangePage(items=tuple(record for record, _ in shown), matched=matched, following=following)
@@ -166,7 +169,7 @@ def _instant(wanted: ChangeFilter) -> InstrumentedAttribute[datetime]:
     return _TOLD.first_seen if wanted.once else _SURVEY.captured_at
 
 
-def _matching(wanted: ChangeFilter) -> Select[tables.SurveyTile, tables.Survey, tables.TileChange]:
+def _matching(wanted: ChangeFilter) -> _Tiles:
     query = _TILES.where(
         _SURVEY.map_id == wanted.map_id, _SURVEY.status == "ready", _TILE.state == wanted.state
     )
@@ -199,13 +202,13 @@ def _seen_by(device_id: str) -> ColumnElement[bool]:
     return exists().where(survey.map_id == _SURVEY.map_id, survey.device_id == device_id, *same)
 
 
-def _with_voxels(query: Select[Any], kind: VoxelKind | None) -> Select[Any]:
+def _with_voxels(query: _Tiles, kind: VoxelKind | None) -> _Tiles:
     if kind is None:
         return query
     return query.where((_TILE.appeared if kind == "appeared" else _TILE.disappeared) > 0)
 
 
-def _meeting(query: Select[Any], bounds: Bounds | None) -> Select[Any]:
+def _meeting(query: _Tiles, bounds: Bounds | None) -> _Tiles:
     """Keep the tiles whose box meets this one."""
     if bounds is None:
         return query

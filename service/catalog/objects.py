@@ -114,7 +114,9 @@ class Objects:
         rows = rows.add_columns(*(key.column for key in order)).order_by(*order_by(order)).limit(limit + 1)
         with self._database.read() as session:
             matched = session.scalar(count) or 0
-            read = [(_record(*row[:3]), tuple(row[3:])) for row in session.execute(rows)]
+            read: list[tuple[MapObjectRecord, Values]] = [
+                (_record(*row[:3]), tuple(row[3:])) for row in session.execute(rows)
+            ]
         items = tuple(record for record, _ in read[:limit])
         return ObjectPage(
             items=items, matched=matched, following=read[limit - 1][1] if len(read) > limit else None

@@ -19,7 +19,7 @@ def preferred(request: Request, offers: Sequence[str]) -> str:
     if not accept:
         return offers[0]
     try:
-        chosen = mimeparse.best_match(list(reversed(offers)), accept)
+        chosen: str = mimeparse.best_match(list(reversed(offers)), accept)
     except mimeparse.MimeTypeParseException:
         return offers[0]
     if not chosen:
