@@ -35,6 +35,7 @@ _STEEP = (
 )
 _STEPS = 16  #: pieces of each side of a box, whose corners are turned into the map's frame
 _UP_AND_DOWN = 10_000.0  #: metres that a map reaches above and below its origin
+_MOST = 10_001.0  #: metres that a map reaches along each axis
 _EVERYWHERE = sys.float_info.max
 _NOWHERE = Bounds(min=(_EVERYWHERE,) * 3, max=(_EVERYWHERE,) * 3)
 
@@ -159,13 +160,14 @@ def _held(span: tuple[float, float], latitudes: tuple[float, float], anchor: Anc
 
 
 def _tall(box: Bounds, heights: tuple[float, float] | None, anchor: Anchor) -> Bounds:
-    """Return a box with limits of height, metres above the ellipsoid; the Earth falls off by 8 m at 10 km."""
+    """Return a box with limits of height, metres above the ellipsoid; the Earth falls off by d^2 / 2r (16 m at 14 km)."""
     if heights is None:
         return box
-    fall = 10.0
     low, high = (height - anchor.height for height in heights)
     (x0, y0, _), (x1, y1, _) = box.min, box.max
-    return Bounds(min=(x0, y0, low - fall), max=(x1, y1, high + fall))
+    far = max(min(abs(side), _MOST) for side in (x0, x1)), max(min(abs(side), _MOST) for side in (y0, y1))
+    fall = 0.01 + (far[0] ** 2 + far[1] ** 2) / (2 * 6_300_000)
+    return Bounds(min=(x0, y0, low - fall), max=(x1, y1, high + 0.01))
 
 
 def _wrong(why: str, given: str | None, *, name: str = "bbox") -> RequestValidationError:

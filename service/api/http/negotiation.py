@@ -15,7 +15,7 @@ def preferred(request: Request, offers: Sequence[str]) -> str:
 
     Without that header, and where it cannot be read, that is the first (Section 12.5.1). Raises NotAcceptable.
     """
-    accept = ",".join(request.headers.getlist("accept")).strip()
+    accept = ",".join(request.headers.getlist("accept")).strip().lower()  # names are (Section 8.3.1)
     if not accept:
         return offers[0]
     try:
