@@ -78,8 +78,7 @@ def test_what_lies_in_a_box_on_the_earth_lies_in_its_box_of_the_map(anchor: Anch
         for corner in corners:
             assert holds(found, corner), (box, found, corner)
         for _ in range(20):  # anything else within it
-            point = tuple(rng.uniform(-size, size) for _ in range(2))
-            inside = (*point, rng.uniform(-30, 30))
+            inside = rng.uniform(-size, size), rng.uniform(-size, size), rng.uniform(-30, 30)
             lon, lat, height = convert(inside)
             lon = (lon + 180) % 360 - 180
             across = west <= lon <= east if west <= east else lon >= west or lon <= east

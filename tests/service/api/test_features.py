@@ -12,6 +12,7 @@ from fastapi.testclient import TestClient
 
 from service.api.boxes import CRS84H
 from service.api.features import CSV, JSON_FG, MEDIA_TYPE, Form, Kind, _rows
+from service.api.http.documents import Document
 from service.api.objects import ObjectCollection, ObjectHistory, SightingCollection
 from service.api.tiles import FgTileCollection, TileCollection
 from service.tile_features import MAP_FRAME, MAP_FRAME_WKT
@@ -19,6 +20,11 @@ from tests.service.api.test_objects import BERLIN, add_story
 from tests.support.samples import RememberingQueue, catalog_of, running, settings_in
 
 PROFILES = "http://www.opengis.net/def/profile/OGC/0/"
+SHAPES: dict[str, type[Document]] = {
+    "objects": ObjectCollection,
+    "object": ObjectHistory,
+    "sightings": SightingCollection,
+}
 ANSWERS = ("tiles", "sightings", "changes", "objects", "object")
 
 
@@ -71,8 +77,7 @@ def test_whoever_asks_for_nothing_else_gets_plain_geojson(served: Any, what: str
         assert f'<{PROFILES}rfc7946>; rel="profile"' in answer.headers["link"]
         assert answer.headers["vary"] == "Accept"
         assert "content-crs" not in answer.headers  # there are no coordinates
-    shape = {"objects": ObjectCollection, "object": ObjectHistory, "sightings": SightingCollection}
-    shape.get(what, TileCollection).model_validate_json(answer.content)
+    SHAPES.get(what, TileCollection).model_validate_json(answer.content)
 
 
 @pytest.mark.parametrize("what", ANSWERS)

@@ -247,12 +247,14 @@ def write_ply(
     *,
     colors: Colors | None = None,
     scalars: Mapping[str, NDArray[Any]] | None = None,
+    quality: NDArray[Any] | None = None,
     comments: Sequence[str] = (),
 ) -> None:
     """Write binary little endian PLY: float x y z, uchar red green blue, then one property for each scalar (N,).
 
-    A scalar `name` becomes the property `scalar_name`, by which CloudCompare and MeshLab know one from what they have a
-    place for; comments are lines of ASCII. Scalars of bool or uint8 become uchar, other integers int, floats float. The file appears whole or not at all.
+    A scalar `name` becomes the property `scalar_name`, which CloudCompare takes for a scalar field without being told;
+    `quality` (N,) becomes the property of that name, the only number of a point that MeshLab reads. Comments are lines
+    of ASCII. Scalars of bool or uint8 become uchar, other integers int, floats float. The file appears whole or not at all.
     Raises ValueError for a scalar whose name is no word, whose length is not N or whose values do not fit, and for a
     comment of more than a line.
     """
@@ -263,6 +265,8 @@ def write_ply(
         if re.fullmatch("[A-Za-z_][A-Za-z0-9_]*", name) is None:
             raise ValueError(f"scalar field {name!r} needs another name")
         columns[SCALAR + name] = _scalar(name, np.asarray(values))
+    if quality is not None:
+        columns["quality"] = np.asarray(quality, "<f4")
     if any(column.shape != (len(points),) for column in columns.values()):
         raise ValueError(f"columns of {[len(c) for c in columns.values()]} values for {len(points)} points")
     words = {code: word for word, code in _SHORT_NAMES.items()}

@@ -111,7 +111,7 @@ def write_coloured_cloud(path: Path, reference: Points, current: Points, changes
     """Write the survey's fused cloud (N, 3), map frame, as coloured PLY; with objects also what the map (M, 3) lost.
 
     Scalar fields, each with `scalar_` before its name in the file and told of in its header: `change_score` (float; NaN
-    where not scored) and `tile_state` (uchar; TileState, or 255 outside every tile). A detector of tiles alone colours each point by its tile's state. Where there are objects the score
+    where not scored; as `quality` too, for MeshLab) and `tile_state` (uchar; TileState, or 255 outside every tile). A detector of tiles alone colours each point by its tile's state. Where there are objects the score
     is the point's own, each point is coloured by its `kind` (uchar; PointKind), and `object_id` (int) is the number
     of its object, 0 where it is of none.
     """
@@ -119,7 +119,7 @@ def write_coloured_cloud(path: Path, reference: Points, current: Points, changes
         state, score = _of_tiles(current, changes)
         colors = _colors(STATE_COLORS)[state]
         scalars: dict[str, NDArray[Any]] = {"change_score": score, "tile_state": state}
-        write_ply(path, current, colors=colors, scalars=scalars, comments=_legend(scalars))
+        write_ply(path, current, colors=colors, scalars=scalars, quality=score, comments=_legend(scalars))
         return
     told = [
         _survey_points(current, changes.voxels, changes.objects),
@@ -132,7 +132,7 @@ def write_coloured_cloud(path: Path, reference: Points, current: Points, changes
     state, _ = _of_tiles(points, changes)
     scalars = {"change_score": score, "tile_state": state, "kind": kind, "object_id": number}
     colors = _colors(KIND_COLORS)[kind]
-    write_ply(path, points, colors=colors, scalars=scalars, comments=_legend(scalars))
+    write_ply(path, points, colors=colors, scalars=scalars, quality=score, comments=_legend(scalars))
 
 
 def _legend(names: Collection[str]) -> list[str]:
@@ -145,8 +145,12 @@ def _legend(names: Collection[str]) -> list[str]:
         "kind": kinds,
         "object_id": "number of the object in its survey, 0 none",
     }
-    frame = "metres, map frame, z up; colours by " + ("kind" if "kind" in names else "tile_state")
-    return [f"SPICD {frame}", *(f"{SCALAR}{name}: {meanings[name]}" for name in names)]
+    frame = f"SPICD: metres, map frame, z up; colours by {'kind' if 'kind' in names else 'tile_state'}"
+    return [
+        frame,
+        *(f"{SCALAR}{name}: {meanings[name]}" for name in names),
+        "quality: as scalar_change_score",
+    ]
 
 
 def _of_tiles(points: Points, changes: ChangeSet) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
