@@ -8,7 +8,7 @@ from datetime import datetime
 from typing import get_args
 
 from sqlalchemy import delete, select
-from sqlalchemy.orm import Session, selectinload
+from sqlalchemy.orm import Session, selectinload, undefer
 
 from service.catalog import blob_keys, history, tables, tallies
 from service.catalog.blobs import Blobs
@@ -24,6 +24,7 @@ from service.catalog.records import (
     Position,
     ScanOutcome,
     SurveyRecord,
+    SurveySummary,
     TileRecord,
     TileState,
 )
@@ -103,12 +104,12 @@ class Surveys:
             raise NotReady(f"survey {survey_id!r} has no result; job {survey.job_id} says why")
         return survey
 
-    def page(self, map_id: str, *, after: Position | None = None, limit: int = 100) -> Page[SurveyRecord]:
+    def page(self, map_id: str, *, after: Position | None = None, limit: int = 100) -> Page[SurveySummary]:
         """Return surveys of a map, newest first."""
         query = select(Survey).where(Survey.map_id == map_id)
-        query = query.options(selectinload(Survey.scans), selectinload(Survey.job))
+        query = query.options(undefer(Survey.scan_count), selectinload(Survey.job))
         created, key = Survey.created, Survey.survey_id
-        return self._database.page(query, created, key, SurveyRecord.of_row, after=after, limit=limit)
+        return self._database.page(query, created, key, SurveySummary.of_row, after=after, limit=limit)
 
     def save_outcomes(
         self, survey_id: str, outcomes: Iterable[ScanOutcome], *, placement: Placement | None = None

@@ -33,6 +33,7 @@ PROBLEMS: dict[str, tuple[int | None, str]] = {
     "too_large": (413, "The body is too large"),
     "too_slow": (408, "The body took too long"),
     "wrong_media_type": (415, "The media type is not taken here"),
+    "not_acceptable": (406, "No answer is of a media type that is accepted"),
     "unauthorized": (401, "An API key is needed"),
     "forbidden": (403, "This may not be done here"),
     "queue_full": (429, "Too many jobs wait"),

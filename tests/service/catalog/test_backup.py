@@ -138,7 +138,8 @@ def test_of_a_copy_taken_while_surveys_come_and_go_every_row_has_its_files(
         other = Settings(data_dir=tmp_path / f"other-{number}")
         restore(other, copy)
         restored = open_catalog(other)
-        for survey in restored.surveys.page("lobby").items:
+        for listed in restored.surveys.page("lobby").items:
+            survey = restored.surveys.get(listed.survey_id)
             if survey.status == "ready":
                 assert restored.blobs.exists(blob_keys.survey_cloud(survey.survey_id))
             for scan in survey.scans:
