@@ -24,6 +24,7 @@ from service.api.http.bodies import INCOMING
 from service.api.http.cards import Cards
 from service.api.http.cross_site import add_cross_site_checks
 from service.api.http.dependencies import Queue, Services
+from service.api.http.description import mended, operation_id
 from service.api.http.docs_pages import add_pages
 from service.api.http.lanes import UPLOAD_TURN_S, Lane
 from service.api.http.metrics import Metrics, MetricsMiddleware
@@ -96,7 +97,7 @@ class Api(FastAPI):
             for replaced in ("HTTPValidationError", "ValidationError"):  # by problems
                 schemas.pop(replaced, None)
             secured(document, problems.documented("unauthorized", "forbidden"))
-            self.openapi_schema = document
+            self.openapi_schema = mended(document)
         return self.openapi_schema
 
 
@@ -110,6 +111,7 @@ def create_app(settings: Settings, *, queue: Queue | None = None) -> FastAPI:
         lifespan=_lifespan(settings, queue),
         docs_url=None,
         redoc_url=None,
+        generate_unique_id_function=operation_id,
         redirect_slashes=False,  # it would be asked before any key and host, and name a host of the client's choice
         dependencies=[Depends(authorize)],
     )

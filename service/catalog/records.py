@@ -74,7 +74,12 @@ class Page(Generic[T]):
 class Record(BaseModel):
     """Base of every record: frozen, strict about names, and free of NaN and infinity."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+    model_config = ConfigDict(
+        extra="forbid",
+        frozen=True,
+        allow_inf_nan=False,
+        json_schema_serialization_defaults_required=True,  # documents have every member
+    )
 
     @classmethod
     def of_row(cls, row: object) -> Self:

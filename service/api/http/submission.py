@@ -34,7 +34,7 @@ P = ParamSpec("P")
 class ScansRequest(Request):
     """Scans that were uploaded before; others may come with the request."""
 
-    scan_ids: Annotated[tuple[Id, ...], BeforeValidator(names_from_text), Field(max_length=MAX_LISTED)] = ()
+    scan_ids: Annotated[tuple[Id, ...], Field(max_length=MAX_LISTED), BeforeValidator(names_from_text)] = ()
     captured_at: Annotated[Instant | None, Field(description="of the files in this request")] = None
     device_id: Annotated[DeviceId | None, Field(description="of the files in this request")] = None
 
