@@ -18,7 +18,7 @@ from starlette.types import ASGIApp
 from service.api import changes, health, jobs, maps, models, objects, scans, surveys, versions
 from service.api.features import TileCollection
 from service.api.housekeeping import housekeeping
-from service.api.http import problems
+from service.api.http import idempotency, problems
 from service.api.http.access import authorize, secured
 from service.api.http.bodies import INCOMING
 from service.api.http.cards import Cards
@@ -119,6 +119,7 @@ def create_app(settings: Settings, *, queue: Queue | None = None) -> FastAPI:
     add_cross_site_checks(app, settings)
     app.add_middleware(MetricsMiddleware, metrics=app.state.metrics)
     problems.add_handlers(app)
+    idempotency.add_handler(app)
     add_pages(app)
     for part in (scans, maps, versions, surveys, changes, objects, jobs, models, health):
         app.include_router(part.router, responses=None if part is health else problems.OUTAGES)

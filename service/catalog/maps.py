@@ -11,6 +11,7 @@ from sqlalchemy.exc import IntegrityError
 from service.catalog import blob_keys, tables
 from service.catalog.blobs import Blobs
 from service.catalog.database import Database
+from service.catalog.idempotency import ANY_TIMES, Once
 from service.catalog.jobs import new_job
 from service.catalog.records import Anchor, Built, JobRecord, MapRecord, Page, Position, ScanOutcome
 from service.catalog.scans import checked_scan_ids, scans_in_order
@@ -35,10 +36,11 @@ class Maps:
         name: str | None = None,
         settings: Mapping[str, Any] | None = None,
         anchor: Anchor | None = None,
+        once: Once = ANY_TIMES,
     ) -> tuple[MapRecord, JobRecord]:
         """Record a map, its version 1 and the job of that together.
 
-        Raises NotFound (a scan), Conflict (the id), BadRequest (the scans).
+        Raises NotFound (a scan), Conflict (the id), BadRequest (the scans), and what `once` does.
         """
         scan_ids = checked_scan_ids(scan_ids)
         map_id = map_id or new_id("map")
@@ -55,13 +57,16 @@ class Maps:
         )
         try:
             with self._database.write() as session:
+                once.claim(session)
                 scans_in_order(session, scan_ids)
                 session.add(row)
                 session.flush()
                 version = new_version(job, [ScanOutcome(scan_id=scan_id) for scan_id in scan_ids], 1)
                 session.add_all([version, job])
                 session.flush()
-                return _record(version), JobRecord.of_row(job)
+                made = _record(version), JobRecord.of_row(job)
+                once.keep(session, *made, job=job)
+                return made
         except IntegrityError as error:
             raise Conflict(f"map {map_id!r} exists; choose another id or delete that map") from error
 

@@ -13,6 +13,7 @@ from sqlalchemy.orm import Session, selectinload
 from service.catalog import blob_keys, history, tables, tallies
 from service.catalog.blobs import Blobs
 from service.catalog.database import Database
+from service.catalog.idempotency import ANY_TIMES, Once
 from service.catalog.jobs import new_job
 from service.catalog.records import (
     JobRecord,
@@ -49,12 +50,17 @@ class Surveys:
         device_id: str | None = None,
         captured_at: datetime | None = None,
         owner: str | None = None,
+        once: Once = ANY_TIMES,
     ) -> tuple[SurveyRecord, JobRecord]:
-        """Record a survey and its job together; `owner` takes turns with others, left out it is the device. Raises NotFound, NotReady (the map), BadRequest (the scans)."""
+        """Record a survey and its job together; `owner` takes turns with others, left out it is the device.
+
+        Raises NotFound, NotReady (the map), BadRequest (the scans), and what `once` does.
+        """
         scan_ids = checked_scan_ids(scan_ids)
         survey_id = new_id("survey")
         job = new_job("survey", map_id, survey_id, owner=owner or device_id)
         with self._database.write() as session:
+            once.claim(session)
             map_row(session, map_id, lock=True)  # nobody deletes the version meanwhile
             version = version_in_use(session, map_id)
             scans = scans_in_order(session, scan_ids)
@@ -78,7 +84,9 @@ class Surveys:
             session.flush()
             session.add(job)
             session.flush()
-            return SurveyRecord.of_row(row), JobRecord.of_row(job)
+            made = SurveyRecord.of_row(row), JobRecord.of_row(job)
+            once.keep(session, *made, job=job)
+            return made
 
     def get(self, survey_id: str) -> SurveyRecord:
         """Return one survey. Raises NotFound."""

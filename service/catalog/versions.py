@@ -11,6 +11,7 @@ from sqlalchemy.orm import Session, aliased, contains_eager, selectinload
 from service.catalog import blob_keys, tables, tallies
 from service.catalog.blobs import Blobs
 from service.catalog.database import Database
+from service.catalog.idempotency import ANY_TIMES, Once
 from service.catalog.jobs import new_job
 from service.catalog.records import Bounds, JobRecord, Page, Position, ScanOutcome, VersionRecord
 from service.catalog.scans import (
@@ -32,18 +33,24 @@ class Versions:
         self._blobs = blobs
 
     def create(
-        self, map_id: str, *, scan_ids: Sequence[str] = (), survey_id: str | None = None
+        self,
+        map_id: str,
+        *,
+        scan_ids: Sequence[str] = (),
+        survey_id: str | None = None,
+        once: Once = ANY_TIMES,
     ) -> tuple[VersionRecord, JobRecord]:
         """Record a version of further scans or of an accepted survey, and its job; the one in use is its base.
 
         Raises NotFound (map, survey, scan), NotReady (map, survey), BadRequest (the scans; both or neither of the two),
-        Conflict (another version builds; the base has taken the survey over).
+        Conflict (another version builds; the base has taken the survey over), and what `once` does.
         """
         if bool(scan_ids) == (survey_id is not None):
             raise BadRequest(
                 "a version is made either of scans (scan_ids or files) or of one survey (survey_id)"
             )
         with self._database.write() as session:
+            once.claim(session)
             map_row(session, map_id, lock=True)
             base = version_in_use(session, map_id)
             number = _next_number(session, map_id)
@@ -56,7 +63,9 @@ class Versions:
             row.base_version, row.survey_id = base.version, survey_id
             session.add_all([row, job])
             session.flush()
-            return VersionRecord.of_row(row), JobRecord.of_row(job)
+            made = VersionRecord.of_row(row), JobRecord.of_row(job)
+            once.keep(session, *made, job=job)
+            return made
 
     def get(self, map_id: str, number: int) -> VersionRecord:
         """Return one version. Raises NotFound."""

@@ -11,16 +11,17 @@ from dataclasses import asdict
 from typing import Annotated, ParamSpec, Self
 
 from fastapi import Request as HttpRequest
-from fastapi import Response
-from pydantic import BeforeValidator, Field
+from pydantic import BaseModel, BeforeValidator, Field
 
 from service import tracing
 from service.api.http.bodies import Body
 from service.api.http.dependencies import Services
 from service.api.http.documents import Link, Request, link
 from service.api.http.fields import MAX_LISTED, DeviceId, Id, Instant, names_from_text
+from service.api.http.idempotency import answered
 from service.api.http.lanes import Lane
 from service.catalog.catalog import Catalog
+from service.catalog.idempotency import ANY_TIMES, Answer, Once
 from service.catalog.records import JobRecord, ScanRecord
 from service.dispatch import Dispatcher
 from service.errors import QueueFull, QueueUnavailable, ServiceError, Unavailable
@@ -63,11 +64,14 @@ def kept_scans(catalog: Catalog, body: Body, wanted: ScansRequest) -> Iterator[t
         raise
 
 
-def monitor(request: HttpRequest, response: Response, job: JobRecord) -> Link:
-    """Return the link to a job that was submitted, which the answer names in `Location` as well."""
-    here = link(request, f"/jobs/{job.job_id}", "monitor")
-    response.headers["Location"] = here.href
-    return here
+def monitor(request: HttpRequest, job: JobRecord) -> Link:
+    """Return the link to a job that was submitted."""
+    return link(request, f"/jobs/{job.job_id}", "monitor")
+
+
+def accepted(request: HttpRequest, document: BaseModel, job: JobRecord) -> Answer:
+    """Return the answer to a request that submitted a job, which `Location` names."""
+    return answered(document, status=202, location=monitor(request, job).href)
 
 
 def admit(services: Services, owner: str | None = None) -> None:
@@ -81,14 +85,19 @@ def admit(services: Services, owner: str | None = None) -> None:
         )
 
 
-def submit(services: Services, job: JobRecord, *, forget: Callable[[], None]) -> None:
-    """Have a recorded job wait for its turn. Raises QueueUnavailable after `forget` has taken the record back."""
+def submit(services: Services, job: JobRecord, *, forget: Callable[[], None], once: Once = ANY_TIMES) -> None:
+    """Have a recorded job wait for its turn. Raises QueueUnavailable after `forget` has taken the record back.
+
+    `once` is what the record was made under.
+    """
     try:
         services.queue.ping()
         services.dispatcher.hand_over()
     except BaseException:
         forget()
+        once.drop()
         raise
+    once.settle()
     tracing.link_job(job.job_id)
     with about(job_id=job.job_id):  # the one line that has the ids of request and job
         log.info("the %s job waits", job.kind)
@@ -125,12 +134,13 @@ class Ticker:
             self._over.wait(self._every_s)
 
 
-def run_again(services: Services, job_id: str) -> JobRecord:
+def run_again(services: Services, job_id: str, once: Once = ANY_TIMES) -> JobRecord:
     """Have a failed job wait for its turn again. Raises NotFound, Conflict, QueueFull, QueueUnavailable, DiskFull."""
+    once.look()
     services.catalog.disk.require()
     admit(services)
     services.queue.ping()
-    job = services.catalog.jobs.run_again(job_id)
+    job = services.catalog.jobs.run_again(job_id, once=once)
     services.dispatcher.hand_over()
     return job
 
