@@ -265,6 +265,7 @@ def _create(services: Services, wanted: MapRequest, body: Body, once: Once) -> t
     with kept_scans(catalog, body, wanted) as scan_ids:
         record, job = catalog.maps.create(
             scan_ids=scan_ids,
+            poses=wanted.poses,
             model=model,
             map_id=wanted.id,
             name=wanted.name,

@@ -81,8 +81,9 @@ async def upload_scan(
     """One PLY or PCD, as the raw body or as the field `file` of a form; it is read later, by the job that uses it.
 
     What is said of the scan stands in the query, or in the form, which wins. The same bytes from the same device
-    are one scan: sent again with another `pose` or `captured_at`, it is corrected while no map or survey rests on it,
-    and refused (409) once one does.
+    are one scan: sent again with another `pose` or `captured_at`, these are kept from then on, as the answer shows.
+    Maps and surveys that were asked for before stay with what they were asked for with, and a request for one may name
+    a pose of its own (`scans`).
     """
 
     def accept(record: ScanRecord, is_new: bool) -> Answer:

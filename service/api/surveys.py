@@ -223,6 +223,7 @@ def _create(
         record, job = catalog.surveys.create(
             reference.map_id,
             scan_ids=scan_ids,
+            poses=wanted.poses,
             model=model,
             threshold=wanted.threshold,
             device_id=wanted.device_id,

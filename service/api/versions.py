@@ -181,7 +181,7 @@ def _create(
     catalog = services.catalog
     with kept_scans(catalog, body, wanted) as scan_ids:
         record, job = catalog.versions.create(
-            map_id, scan_ids=scan_ids, survey_id=wanted.survey_id, once=once
+            map_id, scan_ids=scan_ids, poses=wanted.poses, survey_id=wanted.survey_id, once=once
         )
         submit(services, job, forget=lambda: catalog.versions.take_back(job.job_id), once=once)
     return record, job

@@ -13,8 +13,8 @@ from service.catalog.blobs import Blobs
 from service.catalog.database import Database
 from service.catalog.idempotency import ANY_TIMES, Once
 from service.catalog.jobs import new_job
-from service.catalog.records import Anchor, Built, JobRecord, MapRecord, Page, Position, ScanOutcome
-from service.catalog.scans import checked_scan_ids, scans_in_order
+from service.catalog.records import Anchor, Built, JobRecord, MapRecord, Matrix, Page, Position
+from service.catalog.scans import NO_POSES, checked_scan_ids, new_uses, scans_in_order
 from service.catalog.tables import new_id, now
 from service.catalog.versions import check_ready, map_row, new_version, shown_version, versions_in_use
 from service.errors import Conflict
@@ -31,6 +31,7 @@ class Maps:
         self,
         *,
         scan_ids: Sequence[str],
+        poses: Mapping[str, Matrix] = NO_POSES,
         model: str,
         map_id: str | None = None,
         name: str | None = None,
@@ -38,7 +39,7 @@ class Maps:
         anchor: Anchor | None = None,
         once: Once = ANY_TIMES,
     ) -> tuple[MapRecord, JobRecord]:
-        """Record a map, its version 1 and the job of that together.
+        """Record a map, its version 1 and the job of that together; `poses` of scans, by id, count for this map alone.
 
         Raises NotFound (a scan), Conflict (the id), BadRequest (the scans), and what `once` does.
         """
@@ -58,10 +59,10 @@ class Maps:
         try:
             with self._database.write() as session:
                 once.claim(session)
-                scans_in_order(session, scan_ids)
+                uses = new_uses(scans_in_order(session, scan_ids), poses)
                 session.add(row)
                 session.flush()
-                version = new_version(job, [ScanOutcome(scan_id=scan_id) for scan_id in scan_ids], 1)
+                version = new_version(job, uses, 1)
                 session.add_all([version, job])
                 session.flush()
                 made = _record(version), JobRecord.of_row(job)

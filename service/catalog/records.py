@@ -140,6 +140,11 @@ class ScanOutcome(Record):
     """
 
     scan_id: str
+    pose: Matrix | None = Field(
+        None,
+        description="map_from_sensor that its registration starts from, row-major: as the request for this map or survey "
+        "gave it, else as the upload had it then; null: none",
+    )
     accepted: bool | None = None
     fitness: float | None = None  #: inlier fraction, 0..1
     rmse: float | None = None  #: metres, over the inliers

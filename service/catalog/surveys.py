@@ -17,6 +17,7 @@ from service.catalog.idempotency import ANY_TIMES, Once
 from service.catalog.jobs import new_job
 from service.catalog.records import (
     JobRecord,
+    Matrix,
     ObjectKind,
     ObjectRecord,
     Page,
@@ -27,7 +28,15 @@ from service.catalog.records import (
     TileRecord,
     TileState,
 )
-from service.catalog.scans import checked_scan_ids, known_outcomes, scans_in_order, write_outcomes
+from service.catalog.scans import (
+    NO_POSES,
+    checked_scan_ids,
+    known_outcomes,
+    new_uses,
+    outcome_columns,
+    scans_in_order,
+    write_outcomes,
+)
 from service.catalog.tables import Survey, SurveyObject, SurveyTile, new_id, now
 from service.catalog.versions import map_row, version_in_use
 from service.errors import Conflict, NotFound, NotReady
@@ -45,6 +54,7 @@ class Surveys:
         map_id: str,
         *,
         scan_ids: Sequence[str],
+        poses: Mapping[str, Matrix] = NO_POSES,
         model: str,
         threshold: float | None = None,
         device_id: str | None = None,
@@ -53,6 +63,8 @@ class Surveys:
         once: Once = ANY_TIMES,
     ) -> tuple[SurveyRecord, JobRecord]:
         """Record a survey and its job together; `owner` takes turns with others, left out it is the device.
+
+        `poses` of scans, by id, count for this survey alone.
 
         Raises NotFound, NotReady (the map), BadRequest (the scans), and what `once` does.
         """
@@ -78,7 +90,10 @@ class Surveys:
                 job_id=job.job_id,
                 created=job.created,
                 updated=job.created,
-                scans=[tables.SurveyScan(scan_id=scan_id, ordinal=n) for n, scan_id in enumerate(scan_ids)],
+                scans=[
+                    tables.SurveyScan(scan_id=use.scan_id, ordinal=n, **outcome_columns(use))
+                    for n, use in enumerate(new_uses(scans, poses))
+                ],
             )
             session.add(row)
             session.flush()

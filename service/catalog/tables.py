@@ -105,6 +105,7 @@ class Outcome:
     """The columns that `version_scans` and `survey_scans` share."""
 
     ordinal: Mapped[int]
+    pose: Mapped[list[list[float]] | None]
     accepted: Mapped[bool | None]
     fitness: Mapped[float | None]
     rmse: Mapped[float | None]

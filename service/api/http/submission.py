@@ -17,12 +17,12 @@ from service import tracing
 from service.api.http.bodies import Body
 from service.api.http.dependencies import Services
 from service.api.http.documents import Link, Request, link
-from service.api.http.fields import MAX_LISTED, DeviceId, Id, Instant, names_from_text
+from service.api.http.fields import MAX_LISTED, DeviceId, Id, Instant, Pose, names_from_text
 from service.api.http.idempotency import answered
 from service.api.http.lanes import Lane
 from service.catalog.catalog import Catalog
 from service.catalog.idempotency import ANY_TIMES, Answer, Once
-from service.catalog.records import JobRecord, ScanRecord
+from service.catalog.records import JobRecord, Matrix, ScanRecord
 from service.dispatch import Dispatcher
 from service.errors import QueueFull, QueueUnavailable, ServiceError, Unavailable
 from service.logs import about
@@ -32,12 +32,31 @@ log = logging.getLogger(__name__)
 P = ParamSpec("P")
 
 
+class ScanUse(Request):
+    """A scan that was uploaded before, with what counts in this map or survey alone."""
+
+    scan_id: Id
+    pose: Annotated[
+        Pose | None,
+        Field(description="4x4 row-major, map_from_sensor, in place of the upload's; left out: the upload's"),
+    ] = None
+
+
 class ScansRequest(Request):
     """Scans that were uploaded before; others may come with the request."""
 
     scan_ids: Annotated[tuple[Id, ...], Field(max_length=MAX_LISTED), BeforeValidator(names_from_text)] = ()
+    scans: Annotated[
+        tuple[ScanUse, ...],
+        Field(max_length=MAX_LISTED, description="further scans, each with a pose that counts here alone"),
+    ] = ()
     captured_at: Annotated[Instant | None, Field(description="of the files in this request")] = None
     device_id: Annotated[DeviceId | None, Field(description="of the files in this request")] = None
+
+    @property
+    def poses(self) -> dict[str, Matrix]:
+        """Those that count in this map or survey alone, by the id of the scan."""
+        return {use.scan_id: use.pose for use in self.scans if use.pose is not None}
 
 
 @contextlib.contextmanager
@@ -47,7 +66,7 @@ def kept_scans(catalog: Catalog, body: Body, wanted: ScansRequest) -> Iterator[t
     When the block raises, files that were new are forgotten again.
     """
     new: list[ScanRecord] = []
-    ids = list(wanted.scan_ids)
+    ids = [*wanted.scan_ids, *(use.scan_id for use in wanted.scans)]
     try:
         for upload in body.uploads:
             scan, is_new = catalog.scans.add(
