@@ -27,6 +27,7 @@ def mended(document: dict[str, Any]) -> dict[str, Any]:
     for schema in _only_sent(document):
         _leave_out_defaults(schema)
     _name_forms(document)
+    _join_equal_items(document)
     return document
 
 
@@ -84,6 +85,18 @@ def _leave_out_defaults(schema: Schema) -> None:
         if isinstance(default, int | float | str):
             said = field.get("description")
             field["description"] = f"{said}; left out: {default}" if said else f"left out: {default}"
+
+
+def _join_equal_items(node: Any) -> None:
+    """Describe a row of equal members, such as a matrix or a point, as a list of that length.
+
+    Tuples of sixteen numbers, each with a schema of its own, are more than some programs follow.
+    """
+    for child in node.values() if isinstance(node, dict) else node if isinstance(node, list) else ():
+        _join_equal_items(child)
+    members = node.get("prefixItems", []) if isinstance(node, dict) else []
+    if members and isinstance(members, list) and all(member == members[0] for member in members):
+        node["items"] = node.pop("prefixItems")[0]
 
 
 def _name_forms(document: dict[str, Any]) -> None:
