@@ -58,7 +58,7 @@ def sent(client: AuthenticatedClient, path: Path) -> str:
     pose = beside.read_text() if beside.exists() else UNSET
     with path.open("rb") as file:
         scan = upload_scan.sync(client=client, body=File(payload=file), filename=path.name, pose=pose)
-    return expected(ScanDocument, scan).scan_id
+    return str(expected(ScanDocument, scan).scan_id)
 
 
 def wait(client: AuthenticatedClient, job_id: str) -> None:

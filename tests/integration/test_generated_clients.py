@@ -60,7 +60,15 @@ def said(
     run("openapi-python-client", "generate", *words, "--fail-on-warning")
     (folder / "generated_client.py").write_text((ROOT / "examples" / "generated_client.py").read_text())
     cloud = folder / "changes.ply"
-    told = ("generated_client.py", service.url, *first, "--visit", visit, "--cloud", cloud)
+    told: tuple[str | Path, ...] = (
+        "generated_client.py",
+        service.url,
+        *first,
+        "--visit",
+        visit,
+        "--cloud",
+        cloud,
+    )
     return run("python", *told, cwd=folder, timeout_s=500), cloud
 
 

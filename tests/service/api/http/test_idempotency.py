@@ -147,7 +147,7 @@ def test_a_refused_request_is_not_remembered(client: TestClient, catalog: Catalo
 @pytest.mark.parametrize("text", ['"', '"a', "a b", '"a"b', "é".encode().decode("latin-1"), "a" * 256, ""])
 def test_a_key_that_cannot_be_read_is_refused(client: TestClient, lobby: str, text: str) -> None:
     headers = {"Idempotency-Key": text.encode("latin-1")}
-    answer = client.post("/maps", json={"scan_ids": [lobby]}, headers=headers)  # type: ignore[arg-type]
+    answer = client.post("/maps", json={"scan_ids": [lobby]}, headers=headers)
     assert answer.status_code == 400
     assert answer.json()["type"] == "urn:spicd:problem:idempotency_key_malformed"
 
