@@ -208,7 +208,7 @@ def _distinct(points: Points) -> float:
     return len(np.unique(sample, axis=0)) / len(sample) if len(sample) else 1.0
 
 
-def _grid(points: Floats) -> float:
+def _grid(points: Points) -> float:
     """Return the width of the grid that the points (N, 3) stand on, the same along all axes; 0 where there is none."""
     steps = []
     for along in points.T:

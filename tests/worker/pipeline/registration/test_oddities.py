@@ -124,7 +124,7 @@ def test_a_tilted_scan_is_told(room: Room) -> None:
 
 
 def test_a_scan_far_from_where_its_sensor_stood_is_told(hall: Scan) -> None:
-    moved = replace(hall, points=hall.points + np.float32([3_000, 400, 0]))
+    moved = replace(hall, points=hall.points + np.array([3_000, 400, 0], np.float32))
     assert "its points lie 3.0 km from where its file says" in told(moved)["far_from_origin"]
     pose = np.eye(4)
     pose[:3, 3] = 3_000, 400, 0
