@@ -43,7 +43,9 @@ def _queue_error(url: str) -> Exception | None:
             queue.ping()
         finally:
             queue.close()
-    except (QueueUnavailable, ValueError) as error:
+    except QueueUnavailable as error:  # whose sentence is for clients
+        return ConnectionError(f"it does not answer: {type(error.__cause__ or error).__name__}")
+    except ValueError as error:
         return error
     return None
 
