@@ -1,6 +1,7 @@
 """Starts one worker: `python -m worker geometry` or `python -m worker inference`.
 
-`python -m worker alive geometry` tells whether one of this host answers, for health checks of containers.
+`python -m worker alive geometry` tells whether one of this host answers, for health checks of containers, and
+`python -m worker check inference` whether this machine has the device that it would run on.
 """
 
 from __future__ import annotations
@@ -30,7 +31,9 @@ from service.logs import set_up_logging
 from service.permissions import PRIVATE_UMASK
 from service.queue import JobQueue
 from service.settings import Settings
+from service.up.embedded_redis import LaunchFailed
 from service.up.lifetime import end_with_parent
+from service.up.requirements import require_model, require_queue
 from worker.rq_workers import GeometryWorker, InferenceWorker
 from worker.scratch import sweep
 from worker.threads import wait_passively
@@ -50,6 +53,8 @@ def main(arguments: list[str] | None = None) -> int:
     words = sys.argv[1:] if arguments is None else arguments
     if words[:1] == ["alive"]:
         return alive(words[1:])
+    if words[:1] == ["check"]:
+        return check(words[1:])
     options = _parse(words)
     if options.parent:
         end_with_parent(options.parent)
@@ -60,6 +65,12 @@ def main(arguments: list[str] | None = None) -> int:
         print(
             "no queue to work on: set SPICD_REDIS_URL, or start everything with `spicd up`", file=sys.stderr
         )
+        return 2
+    try:
+        if not options.parent:  # who starts a worker of its own has looked
+            _require_all(settings, options.queue)
+    except LaunchFailed as error:
+        print(error, file=sys.stderr)
         return 2
     wait_passively()
     for module in WARM_MODULES[options.queue]:
@@ -99,6 +110,36 @@ def alive(arguments: list[str]) -> int:
         return 0
     print(f"no {queue} worker of {socket.gethostname()} answers", file=sys.stderr)
     return 1
+
+
+def check(arguments: list[str]) -> int:
+    """Return 0 where this machine has what a worker of a queue needs, by SPICD_DEVICE; 2 where not, and say so."""
+    parser = argparse.ArgumentParser(prog="python -m worker check", description=check.__doc__)
+    parser.add_argument("queue", choices=sorted(WARM_MODULES))
+    try:
+        _require_device(Settings(), parser.parse_args(arguments).queue)
+    except LaunchFailed as error:
+        print(error, file=sys.stderr)
+        return 2
+    return 0
+
+
+def _require_all(settings: Settings, queue: str) -> None:
+    """Raise LaunchFailed where the queue does not answer, or what would run the model is not there."""
+    require_queue(settings)
+    if queue == "inference":
+        _require_device(settings, queue)
+        require_model(settings)
+
+
+def _require_device(settings: Settings, queue: str) -> None:
+    if queue == "inference" and settings.device == "cuda":
+        from worker.jobs.models import finds_gpu  # noqa: PLC0415  # torch takes seconds
+
+        if not finds_gpu():
+            raise LaunchFailed(
+                "SPICD_DEVICE is cuda, but torch finds no CUDA GPU; set it to auto or cpu, or mend the driver"
+            )
 
 
 def _host(queue: str) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Protocol
 
 
@@ -28,3 +29,21 @@ def monotonic_progress(progress: Progress) -> Progress:
         progress(stage, highest[stage])
 
     return report
+
+
+def advancing(
+    progress: Progress, stage: str, begin: float, end: float, *, half: int = 60
+) -> Callable[[], None]:
+    """Return what is called before every small step of work whose length nobody knows, to report that it goes on.
+
+    The share goes from `begin` towards `end`, 0..1, ever more slowly: half of the way after `half` steps, two thirds
+    after twice as many. It never reaches `end`, which whoever ends the work reports.
+    """
+    steps = 0
+
+    def step() -> None:
+        nonlocal steps
+        progress(stage, begin + (end - begin) * steps / (steps + half))
+        steps += 1
+
+    return step

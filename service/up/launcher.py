@@ -37,6 +37,7 @@ from service.settings import Settings
 from service.up.children import WorkerPool
 from service.up.connections import limited_protocol, limits_of
 from service.up.embedded_redis import EmbeddedRedis, LaunchFailed
+from service.up.requirements import require_device, require_model, require_queue
 
 log = logging.getLogger("spicd")
 
@@ -78,6 +79,9 @@ def up(
 ) -> None:
     """Run the service until SIGINT, SIGTERM or SIGHUP; call from the main thread. Raises `LaunchFailed`."""
     _require_worker_packages(settings)
+    require_device(settings, environment_of(settings))
+    if settings.redis_url is not None:
+        require_queue(settings)
     with ExitStack() as stack:
         stop = stack.enter_context(_Signals())
         stack.enter_context(private_files())
@@ -92,6 +96,7 @@ def up(
             _release_claims(redis)
         settings = _resolve(settings, redis, listening)
         _migrate(settings)
+        require_model(settings)
         _require_a_key(settings)
         pool = WorkerPool(
             geometry=settings.geometry_workers,

@@ -10,10 +10,19 @@ from service.catalog.blobs import Blobs
 from service.catalog.records import ModelRecord, VersionRecord
 from worker.detectors.card import Card
 from worker.detectors.detector import Detector
-from worker.detectors.store import Device, make_detector, open_card, open_detector
+from worker.detectors.store import Device, make_detector, open_card, open_detector, resolve_device
 from worker.errors import DetectorUnavailable
 from worker.jobs.step import Context
 from worker.pipeline.settings import PipelineSettings
+
+
+def finds_gpu() -> bool:
+    """Tell whether torch finds the GPU that `cuda` asks for."""
+    try:
+        resolve_device("cuda")
+    except DetectorUnavailable:
+        return False
+    return True
 
 
 def kept_detector(context: Context, model: str) -> Detector:

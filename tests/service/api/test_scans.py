@@ -277,3 +277,21 @@ def test_every_real_scan_is_taken_by_its_first_bytes_sound_or_not(
         else:
             assert answer.json()["format"] == path.suffix[1:]
     assert refused == ["ascii_empty.pcd"]
+
+
+@pytest.mark.parametrize(
+    ("when", "said"), [("1970-01-01T00:00:07Z", "before 2010"), ("2099-01-01T00:00:00Z", "years after")]
+)
+def test_a_time_that_cannot_be_right_is_taken_and_told(client: TestClient, when: str, said: str) -> None:
+    scan = client.post("/scans", content=ply(), headers=RAW, params={"captured_at": when}).json()
+    assert scan["captured_at"] == when
+    (warning,) = scan["warnings"]
+    assert warning["reason"] == "clock"
+    assert said in warning["detail"]
+    assert client.get(f"/scans/{scan['scan_id']}").json()["warnings"] == [warning]
+
+
+def test_the_right_time_sent_later_takes_the_warning_back(client: TestClient) -> None:
+    for when, warned in (("1970-01-01T00:00:00Z", 1), ("2026-03-01T12:00:00Z", 0)):
+        scan = client.post("/scans", content=ply(), headers=RAW, params={"captured_at": when}).json()
+        assert len(scan["warnings"]) == warned

@@ -46,6 +46,12 @@ def api_alone(folder: Path, **given: Any) -> Settings:
     )
 
 
+@pytest.fixture(autouse=True)
+def _any_redis_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Take the Redis of these tests, which nobody asks, for one that answers; test_requirements.py has the check."""
+    monkeypatch.setattr("service.up.launcher.require_queue", lambda settings: None)
+
+
 def test_beyond_loopback_it_does_not_start_without_a_key_and_says_how_one_is_made(tmp_path: Path) -> None:
     with pytest.raises(LaunchFailed, match=r"spicd keys add .* SPICD_AUTH=none"):
         launch(tmp_path, host="0.0.0.0")

@@ -61,7 +61,8 @@ class Extent:
 
     def near(self, positions: Positions) -> Bools:
         """Tell (N,) which points (N, 3) lie near the others; counts the rest."""
-        near: Bools = ((positions >= self.low) & (positions <= self.high)).all(axis=1)
+        within: Bools = (positions >= self.low) & (positions <= self.high)
+        near: Bools = np.all(within, axis=1)
         far = positions[~near].astype(np.float64)
         if len(far):
             self.n_far += len(far)

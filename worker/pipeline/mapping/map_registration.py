@@ -40,7 +40,7 @@ from worker.pipeline.registration.diagnosis import Reason, without_doubles
 from worker.pipeline.registration.results import RegistrationResult, ScanFile, ScanRejected, ScanResult
 from worker.pipeline.registration.scan_to_scan import PairResult
 from worker.processes import default_processes
-from worker.progress import Progress, monotonic_progress, no_progress
+from worker.progress import Progress, advancing, monotonic_progress, no_progress
 
 _FEW = 4  # scans up to which processes cost more than they bring
 _FIRST_REFINEMENT, _REFINEMENTS = 0.6, 0.9  # of the stage's progress
@@ -268,6 +268,7 @@ class _Build:
         reference_from_map = inverse(map_from_reference(refined.poses, priors, reference))
         in_reference = {index: reference_from_map @ priors[index] for index in left_out if index in priors}
         errors: dict[int, Exception] = dict(left_out)
+        tick = advancing(self.progress, "refining", _REFINEMENTS, 1.0)
         for index in doubtful[: self.workspace.settings.placement.diagnosed]:
             task = PlaceTask(
                 folder=self.workspace.folder,
@@ -276,7 +277,7 @@ class _Build:
                 prior=in_reference.get(index),
                 settings=self.workspace.settings,
             )
-            found = task.run(place, tick=lambda: self.progress("refining", _REFINEMENTS))
+            found = task.run(place, tick=tick)
             errors[index] = found if isinstance(found, ScanRejected) else left_out[index]
         better = explained(
             errors,
@@ -285,7 +286,7 @@ class _Build:
             place,
             self.workspace,
             map_index=map_index,
-            tick=lambda: self.progress("refining", _REFINEMENTS),
+            tick=tick,
         )
         own = {index: error for index, error in errors.items() if _is_told(error)}
         return {

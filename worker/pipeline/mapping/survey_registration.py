@@ -50,11 +50,12 @@ from worker.pipeline.registration.scan_to_map import registration_result
 from worker.pipeline.registration.surface import Surface
 from worker.pipeline.registration.verification import rejected
 from worker.processes import default_processes
-from worker.progress import Progress, monotonic_progress, no_progress
+from worker.progress import Progress, advancing, monotonic_progress, no_progress
 
 MAP = -1  #: the map's index among the scans; the lowest, so that it is the target of every pair
 _DISTANCE, _EVERY = 0.05, 2  # metres; points: how a scan by itself is weighed
 _DISAGREE = 0.05  # metres that the other scans may move a scan from where it was registered
+_READ, _PLACED = 0.1, 0.85  # of the stage's progress; the rest finds out why scans found no place
 _FEW = 5  # scans up to which processes cost more than they bring
 _LIKELY = 0.5  # confidence below which a scan needs another one to vouch for it
 
@@ -148,8 +149,11 @@ class _Visit:
             for index, file in enumerate(self.files)
         ]
         priors: dict[int, Matrix4 | None] = {}
-        for index, scan in self.workspace.processes.map_unordered(read_and_prepare, tasks):
-            self.progress("registering", 0.0)
+        self.progress("registering", 0.0)
+        for count, (index, scan) in enumerate(
+            self.workspace.processes.map_unordered(read_and_prepare, tasks), start=1
+        ):
+            self.progress("registering", _READ * count / len(tasks))
             if isinstance(scan, ValidScan):
                 priors[index], self.oddities[index] = scan.prior, scan.oddities
             else:
@@ -175,7 +179,7 @@ class _Visit:
         ]
         placed: Placed = {}
         for count, (index, found) in enumerate(self._placing(tasks, place), start=1):
-            self.progress("registering", count / len(tasks))
+            self.progress("registering", _placed_share(count / len(tasks)))
             if isinstance(found, PlacedScan):
                 placed[index] = found
                 self.errors.pop(index, None)
@@ -191,10 +195,12 @@ class _Visit:
             yield from self.workspace.processes.map_unordered(place_one, tasks)
             return
         for count, task in enumerate(tasks):
-            yield task.index, task.run(place, tick=self._tick(count / len(tasks)))
+            begin, end = (_placed_share(done / len(tasks)) for done in (count, count + 1))
+            yield task.index, task.run(place, tick=self._tick(begin, end))
 
-    def _tick(self, share: float) -> Callable[[], None]:
-        return lambda: self.progress("registering", share)
+    def _tick(self, begin: float, end: float) -> Callable[[], None]:
+        """Return what every iteration of ICP calls; the progress of one scan moves with it."""
+        return advancing(self.progress, "registering", begin, end)
 
     def _vouch(self, placed: Placed, priors: Mapping[int, Matrix4 | None]) -> None:
         """Let scans with a frame in common vouch for each other; leave out those in doubt that none vouches for.
@@ -225,7 +231,7 @@ class _Visit:
             self.place,
             self.workspace,
             map_index=MAP,
-            tick=self._tick(1.0),
+            tick=self._tick(_PLACED, 1.0),
         )
         self.errors.update(better)
 
@@ -382,6 +388,11 @@ class _Visit:
         return SurveyPlacement(
             confidence=sure, in_doubt=sure < self.workspace.settings.placement.min_confidence
         )
+
+
+def _placed_share(share: float) -> float:
+    """Return the share of the stage where this share of the scans is placed, 0..1."""
+    return _READ + (_PLACED - _READ) * share
 
 
 def _known(prior: Matrix4 | None) -> Matrix4:

@@ -11,24 +11,26 @@ from dataclasses import dataclass
 import numpy as np
 
 from worker.cloud.formats.scan import Scan
-from worker.cloud.types import Floats, Matrix4
+from worker.cloud.types import Floats, Matrix4, Points
 from worker.pipeline.registration.diagnosis import Diagnosis, Reason, length
 from worker.pipeline.registration.preprocessing import PreparedScan
 
 MOST_MISSING = 0.7  #: share of the file's points without a return
-LEAST_DISTINCT = (
-    0.6  #: share of the points that differ from each other; from half as many on a scan is damaged
-)
+LEAST_DISTINCT = 0.45  #: share of the points that differ from each other; real scans have half and more
 LEAST_GRID = 0.02  #: metres; on a grid as wide as this, or wider, points are cells of a voxel filter
 HIGHEST, SMALLEST = 40.0, 1.0  #: metres: a room is lower than this, and some side of it is longer than that
 LEAST_AREA = 4.0  #: square metres of surfaces
 LEAST_TURN, LEAST_ELEVATIONS = 45.0, 4  #: degrees about the vertical; steps of two degrees of height
 FARTHEST_SENSOR = 250.0  #: metres between the sensor and the middle of the points
-STOREY = (1.9, 4.5)  #: metres from floor to ceiling
+STOREY = (2.1, 4.5)  #: metres from floor to ceiling
 TALLER = 1.8  #: times the height along another axis, that a scan reaches along z where that axis may be up
 LEAST_LEVEL = 0.02  #: share of the surfaces that lie level, or stand upright
 _SAMPLE = 50_000  # points looked at, evenly over the file
+_AT_ONCE = 1_000_000  # points hashed together
+_PRIMES = np.array([73_856_093, 19_349_663, 83_492_791], np.uint64)  # Teschner et al., VMV 2003
+_MIX = np.uint64(0x9E3779B97F4A7C15)  # 2^64 over the golden ratio (Knuth)
 _STRAYS = (1, 99)  # percentiles
+_FLATTER = 1.25  # times the share of level surfaces, that face an axis which may be up
 _LEVEL = (np.cos(np.radians(12.0)), np.sin(np.radians(12.0)))  # of normals against the vertical
 _STEP = np.radians(2.0)
 
@@ -65,7 +67,7 @@ class Figures:
         sensor = np.median(scan.points, axis=0) - scan.sensor_pose[:3, 3]
         return cls(
             missing=scan.n_dropped / max(declared, 1),
-            distinct=len(np.unique(sample, axis=0)) / len(sample),
+            distinct=_distinct(scan.points),
             grid=_grid(sample),
             size=high - low,
             area=len(points) * voxel_size**2,
@@ -183,7 +185,7 @@ def _up_axis(scan: Scan, figures: Figures) -> Found:  # noqa: ARG001
         return
     for axis in (0, 1):
         high = float(figures.size[axis])
-        flat = figures.facing[axis] > 1.5 * figures.facing[2]
+        flat = figures.facing[axis] > _FLATTER * figures.facing[2]
         if flat and STOREY[0] <= high <= STOREY[1] and figures.size[2] >= TALLER * high:
             yield (
                 "other_up_axis",
@@ -194,7 +196,19 @@ def _up_axis(scan: Scan, figures: Figures) -> Found:  # noqa: ARG001
             return
 
 
-def _grid(points: Floats) -> float:
+def _distinct(points: Points) -> float:
+    """Return the share of points (N, 3) that differ from each other, of those that a hash of their place chooses."""
+    step = max(1, len(points) // _SAMPLE)
+    chosen = []
+    for start in range(0, len(points), _AT_ONCE):
+        piece = np.ascontiguousarray(points[start : start + _AT_ONCE], np.float32)
+        mixed = (piece.view(np.uint32) * _PRIMES).sum(axis=1, dtype=np.uint64) * _MIX
+        chosen.append(piece[(mixed >> np.uint64(40)) % step == 0])
+    sample = np.concatenate(chosen)
+    return len(np.unique(sample, axis=0)) / len(sample) if len(sample) else 1.0
+
+
+def _grid(points: Points) -> float:
     """Return the width of the grid that the points (N, 3) stand on, the same along all axes; 0 where there is none."""
     steps = []
     for along in points.T:

@@ -22,6 +22,7 @@ from tests.support.walks import (
     written,
 )
 from worker.cloud.formats.pcd import write_pcd
+from worker.cloud.formats.scan import read_scan
 from worker.cloud.sight import Sights
 from worker.cloud.voxels import Voxels
 from worker.errors import Cancelled, ScanError, ScanTooLarge
@@ -104,6 +105,10 @@ def test_one_scan_stands_where_it_fits_the_map_and_tells_how_sure_that_is(
     assert (outcome.fitness, outcome.inlier_rmse) == (found.fitness, found.inlier_rmse)
     assert stages(told) == ["registering"]
     assert told[-1] == ("registering", 1.0)
+    shares = [share for _, share in told]
+    assert shares == sorted(shares)
+    assert len(set(shares)) > 10  # it moves while the one scan is registered
+    assert sum(0.1 < share < 0.85 for share in shares) > 10
 
 
 def test_several_scans_are_refined_together_against_the_map(
@@ -438,3 +443,20 @@ def test_a_scan_of_another_room_with_a_prior_outside_the_map_is_told_of_the_prio
     assert outcome.diagnosis is not None
     assert outcome.diagnosis.reason == "wrong_prior"
     assert "outside the map, and it was found nowhere else in the map" in outcome.diagnosis.detail
+
+
+def test_what_is_odd_about_a_file_goes_with_its_outcome_accepted_or_not(
+    room: Room, files: tuple[ScanFile, ...], strange: ScanFile, folder: Path, sights: Sights | None
+) -> None:
+    sent = []
+    for file in (files[0], strange):
+        points = read_scan(file.path).points.copy()
+        points[100] = 5000, 30, 1
+        path = folder / f"stray-{file.name}"
+        write_pcd(path, points)
+        sent.append(replace(file, name=path.name, path=path))
+    found = surveyed(sent, room, sights).outcomes
+    assert [outcome.registration is not None for outcome in found] == [True, False]
+    for outcome in found:
+        (warning,) = [one for one in outcome.warnings if one.reason == "far_points"]
+        assert "1 points far from all others were left out, the farthest 5.0 km away" in warning.detail
