@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import shutil
 import subprocess
+import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, cast
 
 import pytest
+import uvicorn
+from fastapi import FastAPI
 from fastapi.testclient import TestClient
 
 from tests.service.api.test_objects import BERLIN, add_story
 from tests.support.samples import RememberingQueue, catalog_of, running, settings_in
-from tests.support.tools import TESTS, needs_tools, run
+from tests.support.tools import ROOT, TESTS, needs_tools, run
 
 #: Where corners of BERLIN's map lie: its x axis points east, so that a metre is 1/67.8e3 and 1/111.3e3 degrees.
 LONGITUDE, LATITUDE, EAST, NORTH = 13.4, 52.5, 67_900, 111_270
@@ -27,13 +32,6 @@ def _has_qgis() -> bool:
         return subprocess.run(_QGIS, capture_output=True, timeout=60, check=False).returncode == 0
     except OSError:
         return False
-
-
-class Answers(NamedTuple):
-    """The answers of a service as files, and how many features each has."""
-
-    paths: dict[str, Path]
-    rows: dict[str, int]
 
 
 @pytest.fixture(scope="module")
@@ -161,6 +159,47 @@ def test_qgis_opens_every_answer_as_a_layer(anchored: Any, tmp_path: Path, crs: 
     for one in seen:
         assert {"z_min", "z_max", "center_x", "center_y"} <= set(one["fields"])
         assert one["geographic"] == (crs == "CRS84")
+
+
+@needs_tools
+@pytest.mark.skipif(shutil.which("ogr2ogr") is None, reason="no ogr2ogr on this machine")
+@pytest.mark.slow
+def test_the_commands_of_the_page_for_gis_users_work_over_http(anchored: Any, tmp_path: Path) -> None:
+    """The three of docs/gis.md, with another address."""
+    service, _ = anchored
+    page = (ROOT / "docs" / "gis.md").read_text()
+    with _listening(service) as url:
+        made = tmp_path / "changes.gpkg"
+        asked = "/maps/lobby/changes?limit=10000"
+        assert f'ogr2ogr changes.gpkg "$SPICD{asked}"' in page
+        _run(["ogr2ogr", str(made), f"{url}{asked}&state=unchanged"])
+        assert "Feature Count: 54" in _run(["ogrinfo", "-so", "-al", str(made)])
+        asked = "/maps/lobby/objects"
+        assert f'geopandas.read_file(f"{{SPICD}}{asked}")' in page
+        frame = run("python", "-c", f"import geopandas; print(len(geopandas.read_file('{url}{asked}')))")
+        assert frame.strip() == "3"
+        asked = "/maps/lobby/objects?f=csv"
+        assert f'curl -s -o objects.csv "$SPICD{asked}"' in page
+        _run(["curl", "-s", "-o", str(tmp_path / "objects.csv"), f"{url}{asked}"])
+        assert (tmp_path / "objects.csv").read_text().count("\n") == 4
+
+
+@contextlib.contextmanager
+def _listening(client: TestClient) -> Iterator[str]:
+    """Serve a running app on a port of its own as well; its address."""
+    config = uvicorn.Config(cast("FastAPI", client.app), port=0, lifespan="off", log_level="warning")
+    server = uvicorn.Server(config)
+    thread = threading.Thread(target=server.run)
+    thread.start()
+    try:
+        while not server.started:
+            assert thread.is_alive()
+            time.sleep(0.01)
+        port = server.servers[0].sockets[0].getsockname()[1]
+        yield f"http://127.0.0.1:{port}"
+    finally:
+        server.should_exit = True
+        thread.join()
 
 
 def _run(words: list[str]) -> str:

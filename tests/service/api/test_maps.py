@@ -11,7 +11,7 @@ from fastapi.testclient import TestClient
 from service.catalog import blob_keys
 from service.catalog.catalog import Catalog
 from service.settings import Settings
-from tests.support.samples import MODEL, RememberingQueue, add_map, add_scan, add_survey, ply
+from tests.support.samples import MODEL, RememberingQueue, add_map, add_scan, add_survey, ply, tile
 from worker.pipeline.settings import PipelineSettings
 
 
@@ -187,3 +187,30 @@ def test_a_map_can_be_deleted_while_the_queue_is_down(
     queue.down = True
     assert client.delete("/maps/lobby").status_code == 204
     assert client.get("/maps/lobby").status_code == 404
+
+
+def test_lists_are_short_and_the_thing_itself_tells_of_its_scans(
+    client: TestClient, catalog: Catalog
+) -> None:
+    add_map(catalog)
+    survey_id, _ = add_survey(catalog, [tile(0, 0)])
+    for path, name, itself in (
+        ("/maps", "maps", "/maps/lobby"),
+        ("/maps/lobby/versions", "versions", "/maps/lobby/versions/1"),
+        ("/maps/lobby/surveys", "surveys", f"/surveys/{survey_id}"),
+    ):
+        (listed,) = client.get(path).json()[name]
+        whole = client.get(itself).json()
+        assert set(whole) - set(listed) <= {"scans", "settings", "registration"}
+        assert "scans" in set(whole) - set(listed)
+        assert {member: whole[member] for member in listed} == listed
+        assert listed["scan_count"] == len(whole["scans"]) == 1
+
+
+def test_a_list_of_maps_does_not_grow_with_their_scans(client: TestClient, catalog: Catalog) -> None:
+    sizes = []
+    for name, count in (("few", 1), ("many", 60)):
+        ids = [add_scan(catalog, f"{name}-{number}").scan_id for number in range(count)]
+        catalog.maps.create(scan_ids=ids, model=MODEL, map_id=name)
+        sizes.append(len(str(client.get("/maps?limit=1").json()["maps"][0])))
+    assert sizes[1] < sizes[0] + 50
