@@ -170,7 +170,10 @@ class MapList(Document):
 async def create_map(
     request: HttpRequest, response: Response, services: Provided, keyed: Keyed
 ) -> AcceptedMap:
-    """From scans uploaded before (`scan_ids`) or sent here (`scans`); their poses, where given, set the frame of the map."""
+    """From scans uploaded before (`scan_ids`, or `scans` with poses for this map) or sent here, as files of a form.
+
+    Their poses, where given, set the frame of the map.
+    """
 
     def accept(record: MapRecord, job: JobRecord) -> Answer:
         return accepted(request, _accepted(request, record, job), job)

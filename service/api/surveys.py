@@ -89,7 +89,10 @@ class SurveyList(Document):
 async def create_survey(
     request: HttpRequest, response: Response, services: Provided, map_id: MapId, keyed: Keyed
 ) -> AcceptedSurvey:
-    """Of scans uploaded before (`scan_ids`) or sent here (`scans`), with the version of the map that is in use now."""
+    """Of scans uploaded before (`scan_ids`, or `scans` with poses for this survey) or sent here, as files of a form.
+
+    They are compared with the version of the map that is in use now.
+    """
 
     def accept(record: SurveyRecord, job: JobRecord) -> Answer:
         return accepted(request, _accepted(request, record, job), job)

@@ -39,8 +39,7 @@ Text = Annotated[
     Header(
         alias=NAME,
         description="chosen by the client, new for each thing that it wants made, and the same when it sends a request "
-        "again: a quoted string or one word, at most 255 letters of ASCII",
-        examples=['"8e03978e-40d5-43dd-bc93-6894a57f9324"'],
+        "again: a quoted string or one word, at most 255 letters of ASCII, such as a UUID",
         json_schema_extra={"pattern": _PATTERN},
     ),
 ]
