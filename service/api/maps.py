@@ -24,6 +24,7 @@ from service.api.http.submission import (
     accepted,
     admit,
     delete,
+    job_headers,
     kept_scans,
     lane,
     monitor,
@@ -185,7 +186,7 @@ async def create_map(
         require_map(request, wanted.id)
         once = keyed.once(body, accept)
         record, job = await lane(services, body).run(_create, services, wanted, body, once)
-    response.headers["Location"] = monitor(request, job).href
+    response.headers.update(job_headers(request, job))
     return _accepted(request, record, job)
 
 

@@ -27,6 +27,7 @@ from service.api.http.submission import (
     accepted,
     admit,
     delete,
+    job_headers,
     kept_scans,
     lane,
     monitor,
@@ -105,7 +106,7 @@ async def create_survey(
         record, job = await lane(services, body).run(
             _create, services, reference, wanted, body, maps_of_key(request), request.state.key, once
         )
-    response.headers["Location"] = monitor(request, job).href
+    response.headers.update(job_headers(request, job))
     return _accepted(request, record, job)
 
 

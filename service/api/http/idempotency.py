@@ -26,7 +26,7 @@ from service.catalog.tables import IdempotencyKey
 from service.errors import KeyMalformed
 
 NAME = "Idempotency-Key"
-REPLAYED = "Idempotency-Replayed"  #: header of an answer that was given before
+REPLAYED = "Idempotent-Replayed"  #: header of an answer that was given before
 #: What a request under a key may end in; documented in this order.
 KEYED = ("idempotency_key_malformed", "idempotency_key_reused", "idempotency_key_in_use")
 
@@ -102,10 +102,10 @@ def read_key(text: str) -> str:
     return _ESCAPED.sub(r"\1", text[1:-1]) if text.startswith('"') else text
 
 
-def answered(document: BaseModel, *, status: int, location: str) -> Answer:
+def answered(document: BaseModel, *, status: int, headers: dict[str, str]) -> Answer:
     """Return the answer that a document is, as it is kept."""
     body = document.model_dump(mode="json", by_alias=True)
-    return Answer(status=status, headers={"Location": location}, body=body)
+    return Answer(status=status, headers=headers, body=body)
 
 
 def add_handler(app: FastAPI) -> None:
