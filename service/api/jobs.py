@@ -15,7 +15,7 @@ from service.api.http.fields import Id
 from service.api.http.idempotency import KEYED, Keyed
 from service.api.http.paging import PageRequest, list_links
 from service.api.http.problems import LISTED, NAMED, JobProblem, documented
-from service.api.http.submission import accepted, dismiss, run_again
+from service.api.http.submission import accepted, dismiss, job_headers, run_again
 from service.api.models import model_path
 from service.catalog.idempotency import Answer
 from service.catalog.records import JobRecord, JobStatus
@@ -118,7 +118,7 @@ async def retry_job(
         return accepted(request, job_document(job, request), job)
 
     job = await services.writes.run(run_again, services, job_id, keyed.once(None, accept))
-    response.headers["Location"] = link(request, f"/jobs/{job_id}", "monitor").href
+    response.headers.update(job_headers(request, job))
     return job_document(job, request)
 
 

@@ -24,6 +24,7 @@ from service.api.http.submission import (
     accepted,
     admit,
     delete,
+    job_headers,
     kept_scans,
     lane,
     monitor,
@@ -177,7 +178,10 @@ class MapList(Document):
 async def create_map(
     request: HttpRequest, response: Response, services: Provided, keyed: Keyed
 ) -> AcceptedMap:
-    """From scans uploaded before (`scan_ids`) or sent here (`scans`); their poses, where given, set the frame of the map."""
+    """From scans uploaded before (`scan_ids`, or `scans` with poses for this map) or sent here, as files of a form.
+
+    Their poses, where given, set the frame of the map.
+    """
 
     def accept(record: MapRecord, job: JobRecord) -> Answer:
         return accepted(request, _accepted(request, record, job), job)
@@ -189,7 +193,7 @@ async def create_map(
         require_map(request, wanted.id)
         once = keyed.once(body, accept)
         record, job = await lane(services, body).run(_create, services, wanted, body, once)
-    response.headers["Location"] = monitor(request, job).href
+    response.headers.update(job_headers(request, job))
     return _accepted(request, record, job)
 
 

@@ -16,7 +16,7 @@ from service.api.http.documents import Document, Link, Request, checked, link
 from service.api.http.fields import Id, Model
 from service.api.http.idempotency import KEYED, Keyed
 from service.api.http.problems import BODY, documented
-from service.api.http.submission import accepted, admit, monitor, submit
+from service.api.http.submission import accepted, admit, job_headers, monitor, submit
 from service.catalog.idempotency import Answer, Once
 from service.catalog.models import name_for
 from service.catalog.records import JobRecord, ModelRecord, ModelStatus
@@ -100,7 +100,7 @@ async def train_model(
     async with bodies.received(request, services, takes=(bodies.JSON,)) as body:
         wanted, once = checked(TrainingRequest, body.fields), keyed.once(body, accept)
     record, job = await services.writes.run(_create, services, map_id, wanted, maps_of_key(request), once)
-    response.headers["Location"] = monitor(request, job).href
+    response.headers.update(job_headers(request, job))
     return _accepted(request, record, job)
 
 

@@ -12,7 +12,7 @@ from pydantic import Field
 from service.api.http import bodies
 from service.api.http.bodies import Body
 from service.api.http.dependencies import Provided
-from service.api.http.documents import Document, Link, Request, checked
+from service.api.http.documents import Document, Link, Request, checked, link
 from service.api.http.fields import DeviceId, Id, Instant, Pose, Text
 from service.api.http.idempotency import KEYED, Keyed, answered
 from service.api.http.paging import PageRequest, list_links
@@ -87,8 +87,9 @@ async def upload_scan(
     """
 
     def accept(record: ScanRecord, is_new: bool) -> Answer:
-        location = f"{request.scope.get('root_path', '')}/scans/{record.scan_id}"
-        return answered(ScanDocument.of_row(record), status=201 if is_new else 200, location=location)
+        location = link(request, f"/scans/{record.scan_id}", "self").href
+        status = 201 if is_new else 200
+        return answered(ScanDocument.of_row(record), status=status, headers={"Location": location})
 
     query = asked.model_dump(exclude_none=True)
     checked(ScanRequest, query, place="query")  # before a long upload

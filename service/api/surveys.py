@@ -26,6 +26,7 @@ from service.api.http.submission import (
     accepted,
     admit,
     delete,
+    job_headers,
     kept_scans,
     lane,
     monitor,
@@ -95,7 +96,10 @@ class SurveyList(Document):
 async def create_survey(
     request: HttpRequest, response: Response, services: Provided, map_id: MapId, keyed: Keyed
 ) -> AcceptedSurvey:
-    """Of scans uploaded before (`scan_ids`) or sent here (`scans`), with the version of the map that is in use now."""
+    """Of scans uploaded before (`scan_ids`, or `scans` with poses for this survey) or sent here, as files of a form.
+
+    They are compared with the version of the map that is in use now.
+    """
 
     def accept(record: SurveyRecord, job: JobRecord) -> Answer:
         return accepted(request, _accepted(request, record, job), job)
@@ -108,7 +112,7 @@ async def create_survey(
         record, job = await lane(services, body).run(
             _create, services, reference, wanted, body, maps_of_key(request), request.state.key, once
         )
-    response.headers["Location"] = monitor(request, job).href
+    response.headers.update(job_headers(request, job))
     return _accepted(request, record, job)
 
 

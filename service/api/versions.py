@@ -22,6 +22,7 @@ from service.api.http.submission import (
     accepted,
     admit,
     delete,
+    job_headers,
     kept_scans,
     lane,
     monitor,
@@ -107,7 +108,7 @@ async def create_version(
     async with bodies.received(request, services) as body:
         wanted, once = checked(VersionRequest, body.fields), keyed.once(body, accept)
         record, job = await lane(services, body).run(_create, services, map_id, wanted, body, once)
-    response.headers["Location"] = monitor(request, job).href
+    response.headers.update(job_headers(request, job))
     return _accepted(request, record, job)
 
 

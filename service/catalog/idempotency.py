@@ -103,7 +103,12 @@ class OnceByKey(Once):
         insert = postgresql.insert if _is_postgresql(session) else sqlite.insert
         statement = insert(IdempotencyKey).values(values).on_conflict_do_nothing()
         if session.execute(statement.returning(IdempotencyKey.key)).first() is None:
-            self._refuse(session.get_one(IdempotencyKey, self._at))
+            row = session.get(IdempotencyKey, self._at)
+            if row is None:  # it was taken back just now
+                raise KeyInUse(
+                    f"the request under the Idempotency-Key {self._request.key!r} is being carried out"
+                )
+            self._refuse(row)
 
     def keep(self, session: Session, *made: Any, job: Job | None = None) -> None:
         answer, row = self._answer(*made), session.get_one(IdempotencyKey, self._at)

@@ -48,6 +48,7 @@ ODD_HEADERS: tuple[tuple[bytes, bytes], ...] = (
     (b"range", b"bytes=0-0,2-3,4-5"), (b"range", b"lines=1"), (b"if-range", b"x"), (b"if-none-match", b"*"),
     (b"if-modified-since", b"never"), (b"accept", b"image/png"), (b"accept-encoding", b"gzip, br"), (b"expect", b"100-continue"),
     (b"x-forwarded-proto", b"https"), (b"x-forwarded-for", b"\xff"), (b"cookie", b"a=" + b"b" * 4000), (b"te", b"trailers"),
+    (b"idempotency-key", b'"a"'), (b"idempotency-key", b"b"), (b"idempotency-key", b'"'), (b"idempotency-key", b"\xff"),
     (b"x-http-method-override", b"DELETE"), (b"content-encoding", b"gzip"), (b"accept-language", b"\xe9"),
 )  # fmt: skip
 

@@ -26,7 +26,7 @@ from service.catalog.tables import IdempotencyKey
 from service.errors import KeyMalformed
 
 NAME = "Idempotency-Key"
-REPLAYED = "Idempotency-Replayed"  #: header of an answer that was given before
+REPLAYED = "Idempotent-Replayed"  #: header of an answer that was given before
 #: What a request under a key may end in; documented in this order.
 KEYED = ("idempotency_key_malformed", "idempotency_key_reused", "idempotency_key_in_use")
 
@@ -39,8 +39,7 @@ Text = Annotated[
     Header(
         alias=NAME,
         description="chosen by the client, new for each thing that it wants made, and the same when it sends a request "
-        "again: a quoted string or one word, at most 255 letters of ASCII",
-        examples=['"8e03978e-40d5-43dd-bc93-6894a57f9324"'],
+        "again: a quoted string or one word, at most 255 letters of ASCII, such as a UUID",
         json_schema_extra={"pattern": _PATTERN},
     ),
 ]
@@ -103,10 +102,10 @@ def read_key(text: str) -> str:
     return _ESCAPED.sub(r"\1", text[1:-1]) if text.startswith('"') else text
 
 
-def answered(document: BaseModel, *, status: int, location: str) -> Answer:
+def answered(document: BaseModel, *, status: int, headers: dict[str, str]) -> Answer:
     """Return the answer that a document is, as it is kept."""
     body = document.model_dump(mode="json", by_alias=True)
-    return Answer(status=status, headers={"Location": location}, body=body)
+    return Answer(status=status, headers=headers, body=body)
 
 
 def add_handler(app: FastAPI) -> None:

@@ -88,9 +88,14 @@ def monitor(request: HttpRequest, job: JobRecord) -> Link:
     return link(request, f"/jobs/{job.job_id}", "monitor")
 
 
+def job_headers(request: HttpRequest, job: JobRecord) -> dict[str, str]:
+    """Return the headers of the answer to a request that submitted a job."""
+    return {"Location": monitor(request, job).href}
+
+
 def accepted(request: HttpRequest, document: BaseModel, job: JobRecord) -> Answer:
-    """Return the answer to a request that submitted a job, which `Location` names."""
-    return answered(document, status=202, location=monitor(request, job).href)
+    """Return the answer to a request that submitted a job, as it is kept."""
+    return answered(document, status=202, headers=job_headers(request, job))
 
 
 def admit(services: Services, owner: str | None = None) -> None:

@@ -48,6 +48,7 @@ def test_a_map_of_known_scans_is_accepted_and_its_job_submitted(
     assert found["scans"] == [
         {
             "scan_id": scan.scan_id,
+            "pose": None,
             "accepted": None,
             "fitness": None,
             "rmse": None,

@@ -27,6 +27,8 @@ from tests.support.samples import RememberingQueue, add_map, add_scan, add_surve
 KEY = {"Idempotency-Key": '"8e03978e-40d5-43dd-bc93-6894a57f9324"'}
 RAW = {"Content-Type": "application/octet-stream"}
 
+MAKE_NOTHING: frozenset[str] = frozenset()  #: routes whose POST may be sent twice without any harm
+
 Send = Callable[[], httpx.Response]
 
 
@@ -94,7 +96,7 @@ def test_the_first_answer_is_given_again_and_nothing_is_made_twice(
 def test_every_route_that_makes_something_takes_a_key(client: TestClient) -> None:
     document: Any = client.app.openapi()  # type: ignore[attr-defined]
     for method, path in SCOPES:
-        if method == "POST":
+        if method == "POST" and path not in MAKE_NOTHING:
             names = [one["name"] for one in document["paths"][path]["post"].get("parameters", ())]
             assert "Idempotency-Key" in names, path
 
