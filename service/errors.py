@@ -9,6 +9,9 @@ ServiceError
 ├── TooLarge             too_large            a body over the limit
 ├── TooSlow              too_slow             a body that takes too long
 ├── WrongMediaType       wrong_media_type     neither a scan nor JSON
+├── WrongEncoding        wrong_encoding       a body in a content coding other than gzip
+├── WrongDigest          wrong_digest         a body that is not what its digest says
+├── BrokenRequest        broken_request       headers or a coding that cannot be read, a part of a body
 ├── DiskFull             disk_full            less space than the reserve is left, or none
 ├── QueueFull            queue_full           as many jobs wait as may
 ├── Unauthorized         unauthorized         no API key, or one that is not known
@@ -67,6 +70,18 @@ class TooSlow(ServiceError):
 
 class WrongMediaType(ServiceError):
     code = "wrong_media_type"
+
+
+class WrongEncoding(ServiceError):
+    code = "wrong_encoding"
+
+
+class WrongDigest(ServiceError):
+    code = "wrong_digest"
+
+
+class BrokenRequest(ServiceError):
+    code = "broken_request"
 
 
 class DiskFull(ServiceError):

@@ -14,6 +14,7 @@ from pydantic import BaseModel, BeforeValidator, Field
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 
+from service.api.http.codings import ACCEPTED
 from service.catalog.records import Problem
 from service.errors import ServiceError, Unavailable, is_disk_full
 
@@ -33,6 +34,11 @@ PROBLEMS: dict[str, tuple[int | None, str]] = {
     "too_large": (413, "The body is too large"),
     "too_slow": (408, "The body took too long"),
     "wrong_media_type": (415, "The media type is not taken here"),
+    "wrong_encoding": (415, "The content coding is not taken here"),
+    "wrong_digest": (400, "The body is not what its digest says"),
+    "broken_request": (400, "The request is no sound HTTP"),
+    "header_too_large": (431, "The header is too large"),
+    "range_not_satisfiable": (416, "There are no such bytes"),
     "unauthorized": (401, "An API key is needed"),
     "forbidden": (403, "This may not be done here"),
     "queue_full": (429, "Too many jobs wait"),
@@ -98,9 +104,12 @@ JobProblem = Annotated[ProblemDocument | None, BeforeValidator(problem_of)]
 #: What may be wrong with any body; documented in this order.
 BODY = (
     "incomplete_body",
+    "broken_request",
+    "wrong_digest",
     "too_slow",
     "too_large",
     "wrong_media_type",
+    "wrong_encoding",
     "bad_request",
     "invalid_request",
     "disk_full",
@@ -168,6 +177,8 @@ def _service_error(_request: Request, error: Exception) -> Response:
     headers = {}
     if code == "unauthorized":
         headers["WWW-Authenticate"] = 'Bearer realm="spicd"'  # RFC 6750, Section 3
+    if code == "wrong_encoding":
+        headers["Accept-Encoding"] = ACCEPTED  # RFC 7694, Section 3
     if (wait := getattr(error, "retry_after_s", None)) is not None:
         headers["Retry-After"] = str(wait)
     return response(code, str(error), headers=headers or None)
