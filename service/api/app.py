@@ -26,8 +26,10 @@ from service.api.http.cross_site import add_cross_site_checks
 from service.api.http.dependencies import Queue, Services
 from service.api.http.docs_pages import add_pages
 from service.api.http.lanes import UPLOAD_TURN_S, Lane
+from service.api.http.methods import MethodsMiddleware
 from service.api.http.metrics import Metrics, MetricsMiddleware
 from service.api.http.monitor import HealthMonitor
+from service.api.http.representations import RepresentationMiddleware
 from service.api.http.requests import RequestLog
 from service.api.http.security_headers import SecurityHeadersMiddleware
 from service.api.http.submission import Ticker
@@ -114,6 +116,8 @@ def create_app(settings: Settings, *, queue: Queue | None = None) -> FastAPI:
         dependencies=[Depends(authorize)],
     )
     app.state.metrics = Metrics()
+    app.add_middleware(RepresentationMiddleware)
+    app.add_middleware(MethodsMiddleware, routes=app.router.routes)
     add_cross_site_checks(app, settings)
     app.add_middleware(MetricsMiddleware, metrics=app.state.metrics)
     problems.add_handlers(app)

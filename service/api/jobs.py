@@ -14,7 +14,7 @@ from service.api.http.documents import Document, Link, link
 from service.api.http.fields import Id
 from service.api.http.paging import PageRequest, list_links
 from service.api.http.problems import LISTED, NAMED, JobProblem, documented
-from service.api.http.submission import dismiss, run_again
+from service.api.http.submission import dismiss, monitor, run_again
 from service.api.models import model_path
 from service.catalog.records import JobRecord, JobStatus
 from service.catalog.steps import JobKind
@@ -109,7 +109,7 @@ async def retry_job(request: Request, response: Response, services: Provided, jo
     A job that waits or runs is left as it is, so that a retry may be sent twice.
     """
     job = await services.writes.run(run_again, services, job_id)
-    response.headers["Location"] = link(request, f"/jobs/{job_id}", "monitor").href
+    monitor(request, response, job)
     return job_document(job, request)
 
 

@@ -15,6 +15,7 @@ from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 
 from service.api.http.codings import ACCEPTED
+from service.api.http.methods import allowed, is_head
 from service.catalog.records import Problem
 from service.errors import ServiceError, Unavailable, is_disk_full
 
@@ -216,7 +217,10 @@ def _http_error(request: Request, error: Exception) -> Response:
     if status == 404:
         return response("not_found", f"no such path: {request.url.path}; GET /docs shows those there are")
     if status == 405:
-        return response("method_not_allowed", f"{request.method} is not allowed here", headers=headers)
+        names = ", ".join(allowed(request.app.routes, request.scope))
+        method = "HEAD" if is_head(request.scope) else request.method
+        detail = f"{method} is not allowed here; {names} are"
+        return response("method_not_allowed", detail, headers={"Allow": names})
     if status < 500:
         detail = error.detail if isinstance(error, HTTPException) else "the request cannot be read"
         return response("bad_request", str(detail), headers=headers)

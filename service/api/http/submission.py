@@ -30,6 +30,8 @@ log = logging.getLogger(__name__)
 
 P = ParamSpec("P")
 
+LOOK_AGAIN_S = 2  #: seconds after which it makes sense to ask how far a job is
+
 
 class ScansRequest(Request):
     """Scans that were uploaded before; others may come with the request."""
@@ -64,9 +66,10 @@ def kept_scans(catalog: Catalog, body: Body, wanted: ScansRequest) -> Iterator[t
 
 
 def monitor(request: HttpRequest, response: Response, job: JobRecord) -> Link:
-    """Return the link to a job that was submitted, which the answer names in `Location` as well."""
+    """Return the link to a job that was submitted; the answer names it in `Location`, and when to look there."""
     here = link(request, f"/jobs/{job.job_id}", "monitor")
     response.headers["Location"] = here.href
+    response.headers["Retry-After"] = str(LOOK_AGAIN_S)
     return here
 
 
