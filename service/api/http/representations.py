@@ -163,7 +163,10 @@ def is_known(asked: Headers, headers: Headers) -> bool:
 
 def not_modified(headers: Headers) -> MutableHeaders:
     """Return the headers that a 304 repeats (RFC 9110, Section 15.4.5)."""
-    return MutableHeaders({name: value for name, value in headers.items() if name in _IN_304})
+    kept = MutableHeaders({name: value for name, value in headers.items() if name in _IN_304})
+    if shrinks(headers.get("content-type", "")):
+        kept.add_vary_header("Accept-Encoding")
+    return kept
 
 
 def etag_of(data: bytes) -> str:
