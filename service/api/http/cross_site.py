@@ -20,6 +20,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.api.http.methods import METHODS
 from service.api.http.problems import response
+from service.api.http.representations import add_vary
 from service.settings import Settings
 
 SAFE_METHODS = frozenset(
@@ -130,7 +131,7 @@ class CrossSiteMiddleware:
 
         async def vary(message: Message) -> None:
             if message["type"] == "http.response.start":
-                MutableHeaders(scope=message).add_vary_header("Origin")
+                add_vary(MutableHeaders(scope=message), "Origin")
             await send(message)
 
         return vary

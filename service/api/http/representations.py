@@ -72,7 +72,7 @@ class _Answer:
         headers = MutableHeaders(scope=start)
         media_type = headers.get("content-type", "")
         if shrinks(media_type):
-            headers.add_vary_header("Accept-Encoding")
+            add_vary(headers, "Accept-Encoding")
         if media_type.startswith("text/event-stream"):
             await self._send(start)  # its headers tell who follows that it is connected
         else:
@@ -165,8 +165,15 @@ def not_modified(headers: Headers) -> MutableHeaders:
     """Return the headers that a 304 repeats (RFC 9110, Section 15.4.5)."""
     kept = MutableHeaders({name: value for name, value in headers.items() if name in _IN_304})
     if shrinks(headers.get("content-type", "")):
-        kept.add_vary_header("Accept-Encoding")
+        add_vary(kept, "Accept-Encoding")
     return kept
+
+
+def add_vary(headers: MutableHeaders, name: str) -> None:
+    """Say that an answer depends on a header of the request, once."""
+    named = [entry.strip() for entry in headers.get("vary", "").split(",") if entry.strip()]
+    if name.lower() not in [entry.lower() for entry in named]:
+        headers["Vary"] = ", ".join([*named, name])
 
 
 def etag_of(data: bytes) -> str:

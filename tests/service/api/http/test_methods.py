@@ -47,14 +47,6 @@ def test_what_is_no_path_is_404_for_every_method(client: TestClient) -> None:
     assert client.post("/nowhere").json()["type"] == "urn:spicd:problem:not_found"
 
 
-def test_options_of_the_server_as_a_whole(client: TestClient) -> None:
-    answer = client.options("http://localhost/*")
-    assert answer.status_code in (
-        204,
-        404,
-    )  # as a path it is none; as `*`, which this client cannot send, it is 204
-
-
 READ = (
     "/maps",
     "/maps/lobby",
