@@ -29,6 +29,7 @@ from service.api.http.lanes import UPLOAD_TURN_S, Lane
 from service.api.http.methods import MethodsMiddleware
 from service.api.http.metrics import Metrics, MetricsMiddleware
 from service.api.http.monitor import HealthMonitor
+from service.api.http.prefix import PrefixMiddleware
 from service.api.http.representations import RepresentationMiddleware
 from service.api.http.requests import RequestLog
 from service.api.http.security_headers import SecurityHeadersMiddleware
@@ -77,7 +78,7 @@ class Api(FastAPI):
 
     def build_middleware_stack(self) -> ASGIApp:
         """Return the app; log and headers lie around it all, for unexpected errors are answered outside of middleware."""
-        return RequestLog(SecurityHeadersMiddleware(super().build_middleware_stack()))
+        return RequestLog(SecurityHeadersMiddleware(PrefixMiddleware(super().build_middleware_stack())))
 
     def openapi(self) -> dict[str, Any]:
         """Return the OpenAPI document: what FastAPI derives, and the bodies that are read by hand."""
@@ -110,6 +111,7 @@ def create_app(settings: Settings, *, queue: Queue | None = None) -> FastAPI:
         summary="LiDAR scans in, changed tiles and a coloured cloud out",
         description=DESCRIPTION,
         lifespan=_lifespan(settings, queue),
+        root_path=settings.root_path or "",
         docs_url=None,
         redoc_url=None,
         redirect_slashes=False,  # it would be asked before any key and host, and name a host of the client's choice

@@ -45,7 +45,9 @@ async def blob_response(
         if path is not None:
             status = await run_in_threadpool(path.stat)
             headers["ETag"] = etag_of(f"{key} {status.st_size} {status.st_mtime_ns}".encode())
-            return _File(path, headers=headers, media_type=media_type, filename=filename, stat_result=status)
+            return LocalFile(
+                path, headers=headers, media_type=media_type, filename=filename, stat_result=status
+            )
         size, stamp, pieces = await blobs.open_stream(key)
         first = await anext(pieces, b"")  # while the answer can still be a problem
     except FileNotFoundError as error:
@@ -62,7 +64,7 @@ def documented(media_type: str, what: str) -> dict[int | str, dict[str, Any]]:
     return {200: {"description": what, "content": {media_type: {"schema": schema}}}}
 
 
-class _File(FileResponse):
+class LocalFile(FileResponse):
     """A local file, read only where its bytes are wanted."""
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:

@@ -61,6 +61,5 @@ def test_the_pages_run_the_scripts_that_they_hold_and_no_other(client: TestClien
     for script in re.findall(r"<script>(.*?)</script>", page.text, re.DOTALL):
         digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
         assert f"'sha256-{digest}'" in scripts
-    for source in re.findall(r'<script src="(https://[^/"]+)', page.text):
-        assert source in scripts
+    assert "'self'" in scripts
     assert page.text.count("openapi.json") == 1
