@@ -2,6 +2,9 @@
 
 ServiceError
 ├── NotFound             not_found            no such scan, map, survey, job, tile or model
+│   ├── NoSuchProcess    no_such_process      no process of that id (OGC API - Processes)
+│   └── NoSuchJob        no_such_job          no job of that id, asked for its results (OGC API - Processes)
+├── ResultNotReady       result_not_ready     the job still waits or runs (OGC API - Processes)
 ├── NotReady             not_ready            the map is still building, the survey still running
 ├── Conflict             conflict             the id is taken, the scan is in use
 ├── BadRequest           bad_request          a value that the schema admits and the service does not
@@ -42,6 +45,18 @@ class ServiceError(Exception):
 
 class NotFound(ServiceError):
     code = "not_found"
+
+
+class NoSuchProcess(NotFound):
+    code = "no_such_process"
+
+
+class NoSuchJob(NotFound):
+    code = "no_such_job"
+
+
+class ResultNotReady(ServiceError):
+    code = "result_not_ready"
 
 
 class NotReady(ServiceError):

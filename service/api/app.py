@@ -15,7 +15,19 @@ from pydantic import BaseModel
 from pydantic.json_schema import JsonSchemaMode, models_json_schema
 from starlette.types import ASGIApp
 
-from service.api import changes, health, jobs, maps, models, objects, scans, surveys, versions
+from service.api import (
+    changes,
+    health,
+    jobs,
+    landing,
+    maps,
+    models,
+    objects,
+    processes,
+    scans,
+    surveys,
+    versions,
+)
 from service.api.features import TileCollection
 from service.api.housekeeping import housekeeping
 from service.api.http import problems
@@ -76,9 +88,12 @@ UNSEEN: dict[JsonSchemaMode, tuple[type[BaseModel], ...]] = {
 class Api(FastAPI):
     """FastAPI with our own description of itself, a line in the log for each request, and security headers."""
 
+    under: str = ""  #: the path that something in front has the API under
+
     def build_middleware_stack(self) -> ASGIApp:
         """Return the app; log and headers lie around it all, for unexpected errors are answered outside of middleware."""
-        return RequestLog(SecurityHeadersMiddleware(PrefixMiddleware(super().build_middleware_stack())))
+        stack = PrefixMiddleware(super().build_middleware_stack(), self.under)
+        return RequestLog(SecurityHeadersMiddleware(stack))
 
     def openapi(self) -> dict[str, Any]:
         """Return the OpenAPI document: what FastAPI derives, and the bodies that are read by hand."""
@@ -111,12 +126,12 @@ def create_app(settings: Settings, *, queue: Queue | None = None) -> FastAPI:
         summary="LiDAR scans in, changed tiles and a coloured cloud out",
         description=DESCRIPTION,
         lifespan=_lifespan(settings, queue),
-        root_path=settings.root_path or "",
         docs_url=None,
         redoc_url=None,
         redirect_slashes=False,  # it would be asked before any key and host, and name a host of the client's choice
         dependencies=[Depends(authorize)],
     )
+    app.under = settings.root_path or ""
     app.state.metrics = Metrics()
     app.add_middleware(RepresentationMiddleware)
     app.add_middleware(MethodsMiddleware, routes=app.router.routes)
@@ -124,8 +139,8 @@ def create_app(settings: Settings, *, queue: Queue | None = None) -> FastAPI:
     app.add_middleware(MetricsMiddleware, metrics=app.state.metrics)
     problems.add_handlers(app)
     add_pages(app)
-    for part in (scans, maps, versions, surveys, changes, objects, jobs, models, health):
-        app.include_router(part.router, responses=None if part is health else problems.OUTAGES)
+    for part in (landing, scans, maps, versions, surveys, changes, objects, jobs, processes, models, health):
+        app.include_router(part.router, responses=None if part in (health, landing) else problems.OUTAGES)
     return app
 
 

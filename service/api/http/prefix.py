@@ -12,13 +12,15 @@ class PrefixMiddleware:
     link is made of `root_path`.
     """
 
-    def __init__(self, app: ASGIApp) -> None:
-        self._app = app
+    def __init__(self, app: ASGIApp, root_path: str) -> None:
+        """Put `root_path` before ours; empty: what the server says, as `uvicorn --root-path` has it."""
+        self._app, self._root_path = app, root_path
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass a request on (ASGI)."""
         if scope["type"] == "http":
-            scope["path"] = _whole(scope["path"], scope.get("root_path", ""))
+            scope["root_path"] = self._root_path or scope.get("root_path", "")
+            scope["path"] = _whole(scope["path"], scope["root_path"])
         await self._app(scope, receive, send)
 
 

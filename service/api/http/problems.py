@@ -27,6 +27,9 @@ MEDIA_TYPE = "application/problem+json"
 #: code -> (HTTP status, title). A status of None is that of a failed job, which no request answers with.
 PROBLEMS: dict[str, tuple[int | None, str]] = {
     "not_found": (404, "There is no such thing"),
+    "no_such_process": (404, "There is no such process"),
+    "no_such_job": (404, "There is no such job"),
+    "result_not_ready": (404, "The job has not ended"),
     "not_ready": (409, "It is not ready yet"),
     "conflict": (409, "It is in the way of something else"),
     "bad_request": (422, "A value cannot be used"),
@@ -67,6 +70,14 @@ PROBLEMS: dict[str, tuple[int | None, str]] = {
     "dismissed": (None, "The job was dismissed"),
 }
 
+#: Types that a standard names (OGC 18-062r2, Section 7); all others are ours.
+_OGC = "http://www.opengis.net/def/exceptions/ogcapi-processes-1/1.0"
+_TYPES = {
+    "no_such_process": f"{_OGC}/no-such-process",
+    "no_such_job": f"{_OGC}/no-such-job",
+    "result_not_ready": f"{_OGC}/result-not-ready",
+}
+
 
 class InvalidValue(BaseModel):
     """One value that does not match, and where it stands."""
@@ -88,7 +99,7 @@ class ProblemDocument(BaseModel):
 
 
 def _type(code: str) -> str:
-    return f"urn:spicd:problem:{code}"
+    return _TYPES.get(code, f"urn:spicd:problem:{code}")
 
 
 def problem_of(problem: Problem | None) -> ProblemDocument | None:
@@ -128,6 +139,14 @@ def response(
     status = 500 if status is None else status
     content = {"type": _type(code), "title": title, "status": status, "detail": detail, **members}
     return JSONResponse(content, status, headers=headers, media_type=MEDIA_TYPE)
+
+
+def job_failed(problem: Problem) -> JSONResponse:
+    """Answer who asks for the results of a job that failed or was dismissed: its problem, as a conflict."""
+    status = 409
+    _, title = PROBLEMS.get(problem.code, PROBLEMS["pipeline_error"])
+    content = {"type": _type(problem.code), "title": title, "status": status, "detail": problem.detail}
+    return JSONResponse(content, status, media_type=MEDIA_TYPE)
 
 
 _RETRY_AFTER = {"description": "seconds, where it helps to wait", "schema": {"type": "integer"}}
