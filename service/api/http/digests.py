@@ -9,6 +9,7 @@ from __future__ import annotations
 import base64
 import hashlib
 from collections.abc import Mapping
+from typing import cast
 
 import http_sf
 from starlette.datastructures import Headers
@@ -93,7 +94,9 @@ def _dictionary(lines: list[str]) -> Mapping[str, object]:
     if not lines:
         return {}
     parsed = http_sf.parse(", ".join(lines).encode("latin-1"), tltype="dictionary")
-    return {str(name): value[0] for name, value in parsed.items()}
+    return {
+        str(name): value[0] for name, value in cast("Mapping[str, tuple[object, object]]", parsed).items()
+    }
 
 
 def _hash(algorithm: str) -> hashlib._Hash:

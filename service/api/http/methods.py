@@ -25,7 +25,7 @@ def allowed(routes: Iterable[BaseRoute], scope: MutableMapping[str, Any]) -> tup
 
 def is_head(scope: MutableMapping[str, Any]) -> bool:
     """Tell whether a GET was a HEAD when it came, so that no file has to be read for it."""
-    return scope["method"] == "HEAD" or scope.get(_HEAD, False)
+    return scope["method"] == "HEAD" or scope.get(_HEAD) is True
 
 
 class MethodsMiddleware:

@@ -70,7 +70,8 @@ def test_process_list(client: TestClient) -> None:
 
 def test_process_list_limit(client: TestClient) -> None:
     """/conf/core/pl-limit-definition, /conf/core/pl-limit-response, /conf/core/pl-links."""
-    seen, path = [], "/processes?limit=2"
+    seen: list[str] = []
+    path: str | None = "/processes?limit=2"
     while path:
         page = client.get(path).json()
         assert len(page["processes"]) <= 2

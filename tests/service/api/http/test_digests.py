@@ -110,7 +110,7 @@ def test_the_digest_of_a_gzipped_body_is_that_of_its_gzip(client: TestClient) ->
 )
 def test_a_digest_that_cannot_be_read_is_refused(client: TestClient, catalog: Catalog, value: str) -> None:
     header = [("content-type", RAW["Content-Type"]), ("content-digest", value.encode("latin-1"))]
-    answer = client.post("/scans", content=ply(), headers=header)  # type: ignore[arg-type]
+    answer = client.post("/scans", content=ply(), headers=header)
     assert answer.status_code == 400
     assert answer.json()["type"] == "urn:spicd:problem:broken_request"
     assert catalog.scans.page().items == []

@@ -267,8 +267,11 @@ def test_events_are_passed_on_at_once() -> None:
     async def note(message: Any) -> None:
         sent.append(message["type"])
 
-    scope = {"type": "http", "method": "GET", "headers": [(b"accept-encoding", b"gzip")]}
-    anyio.run(RepresentationMiddleware(app), scope, None, note)
+    async def nothing() -> Any:
+        raise AssertionError("nobody asks")
+
+    scope: Any = {"type": "http", "method": "GET", "headers": [(b"accept-encoding", b"gzip")]}
+    anyio.run(RepresentationMiddleware(app).__call__, scope, nothing, note)
     assert seen == [["http.response.start"], ["http.response.start", "http.response.body"]]
 
 
