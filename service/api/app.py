@@ -42,7 +42,7 @@ from service.api.http.methods import MethodsMiddleware
 from service.api.http.metrics import Metrics, MetricsMiddleware
 from service.api.http.monitor import HealthMonitor
 from service.api.http.prefix import PrefixMiddleware
-from service.api.http.representations import RepresentationMiddleware
+from service.api.http.representations import RepresentationMiddleware, add_conditions
 from service.api.http.requests import RequestLog
 from service.api.http.security_headers import SecurityHeadersMiddleware
 from service.api.http.submission import Ticker
@@ -113,6 +113,7 @@ class Api(FastAPI):
                 schemas.update(derived["$defs"])
             for replaced in ("HTTPValidationError", "ValidationError"):  # by problems
                 schemas.pop(replaced, None)
+            add_conditions(document)
             secured(document, problems.documented("unauthorized", "forbidden"))
             self.openapi_schema = document
         return self.openapi_schema

@@ -59,9 +59,13 @@ async def blob_response(
 
 
 def documented(media_type: str, what: str) -> dict[int | str, dict[str, Any]]:
-    """Return the 200 of a route that answers with a file, for the generated API description."""
-    schema = {"type": "string", "format": "binary"}
-    return {200: {"description": what, "content": {media_type: {"schema": schema}}}}
+    """Return the answers of a route that answers with a file, for the generated API description."""
+    content = {media_type: {"schema": {"type": "string", "format": "binary"}}}
+    return {
+        200: {"description": what, "content": content},
+        206: {"description": f"{what}: the bytes that `Range` asks for", "content": content},
+        **problems.documented("range_not_satisfiable"),
+    }
 
 
 class LocalFile(FileResponse):

@@ -13,7 +13,7 @@ import re
 import zlib
 from collections.abc import Callable
 from email.utils import parsedate_to_datetime
-from typing import ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 from fastapi.concurrency import run_in_threadpool
 from starlette.datastructures import Headers, MutableHeaders
@@ -145,6 +145,13 @@ class _Answer:
         for name in ("Content-Digest", "Repr-Digest"):  # of a whole answer they are the same
             if name not in headers and (algorithm := wanted(self._asked, f"Want-{name}")) is not None:
                 headers[name] = await _heavy(len(body), digest_of, algorithm, body)
+
+
+def add_conditions(document: dict[str, Any]) -> None:
+    """Write into an OpenAPI document that every GET may be answered by 304."""
+    for operations in document.get("paths", {}).values():
+        if "200" in (responses := operations.get("get", {}).get("responses", {})):
+            responses["304"] = {"description": "The client has it already (`If-None-Match`)"}
 
 
 def is_known(asked: Headers, headers: Headers) -> bool:

@@ -6,6 +6,7 @@ import base64
 import gzip
 import hashlib
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import anyio
@@ -17,7 +18,15 @@ from fastapi.testclient import TestClient
 from service.api.http.representations import RepresentationMiddleware
 from service.catalog import blob_keys
 from service.catalog.catalog import Catalog
-from tests.support.samples import add_map, add_survey, tile
+from tests.support.samples import (
+    RememberingQueue,
+    add_map,
+    add_survey,
+    catalog_of,
+    running,
+    settings_in,
+    tile,
+)
 
 PLAIN = {"Accept-Encoding": "identity"}
 PACKED = {"Accept-Encoding": "gzip"}
@@ -278,3 +287,22 @@ def test_events_are_passed_on_at_once() -> None:
 def test_what_is_coded_already_stays_as_it_is() -> None:
     client = TestClient(app_with_streams())
     assert client.get("/coded", headers=PACKED).text == "x" * 5000
+
+
+def test_a_file_of_a_store_elsewhere_has_an_etag_too(tmp_path: Path) -> None:
+    settings = settings_in(tmp_path).model_copy(update={"blob_url": "memory:///"})
+    with running(settings, RememberingQueue()) as client:
+        catalog = catalog_of(client)
+        key = blob_keys.map_cloud(add_map(catalog))
+        catalog.blobs.put_bytes(key, CLOUD)
+        assert not catalog.blobs.is_local
+        path = "/maps/lobby/cloud.ply"
+        first, head = client.get(path), client.head(path)
+        assert first.content == CLOUD
+        etag = first.headers["ETag"]
+        assert (head.status_code, head.content, head.headers["ETag"]) == (200, b"", etag)
+        assert head.headers["Content-Length"] == str(len(CLOUD))
+        again = client.get(path, headers={"If-None-Match": etag})
+        assert (again.status_code, again.content) == (304, b"")
+        catalog.blobs.put_bytes(key, CLOUD + b"!")
+        assert client.get(path, headers={"If-None-Match": etag}).content == CLOUD + b"!"
