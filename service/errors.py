@@ -2,6 +2,9 @@
 
 ServiceError
 ├── NotFound             not_found            no such scan, map, survey, job, tile or model
+│   ├── NoSuchProcess    no_such_process      no process of that id (OGC API - Processes)
+│   └── NoSuchJob        no_such_job          no job of that id, asked for its results (OGC API - Processes)
+├── ResultNotReady       result_not_ready     the job still waits or runs (OGC API - Processes)
 ├── NotReady             not_ready            the map is still building, the survey still running
 ├── Conflict             conflict             the id is taken, the scan is in use
 ├── BadRequest           bad_request          a value that the schema admits and the service does not
@@ -13,6 +16,9 @@ ServiceError
 ├── TooSlow              too_slow             a body that takes too long
 ├── WrongMediaType       wrong_media_type     neither a scan nor JSON
 ├── NotAcceptable        not_acceptable       the request accepts no media type that there is
+├── WrongEncoding        wrong_encoding       a body in a content coding other than gzip
+├── WrongDigest          wrong_digest         a body that is not what its digest says
+├── BrokenRequest        broken_request       headers or a coding that cannot be read, a part of a body
 ├── DiskFull             disk_full            less space than the reserve is left, or none
 ├── QueueFull            queue_full           as many jobs wait as may
 ├── Unauthorized         unauthorized         no API key, or one that is not known
@@ -43,6 +49,18 @@ class ServiceError(Exception):
 
 class NotFound(ServiceError):
     code = "not_found"
+
+
+class NoSuchProcess(NotFound):
+    code = "no_such_process"
+
+
+class NoSuchJob(NotFound):
+    code = "no_such_job"
+
+
+class ResultNotReady(ServiceError):
+    code = "result_not_ready"
 
 
 class NotReady(ServiceError):
@@ -88,6 +106,18 @@ class WrongMediaType(ServiceError):
 
 class NotAcceptable(ServiceError):
     code = "not_acceptable"
+
+
+class WrongEncoding(ServiceError):
+    code = "wrong_encoding"
+
+
+class WrongDigest(ServiceError):
+    code = "wrong_digest"
+
+
+class BrokenRequest(ServiceError):
+    code = "broken_request"
 
 
 class DiskFull(ServiceError):

@@ -18,6 +18,7 @@ def _model_store() -> Path:
 
 
 _ORIGIN = re.compile(r"https?://[a-z0-9.\[\]:_-]+")
+_ROOT_PATH = re.compile(r"(/[A-Za-z0-9._~-]+)+")
 
 
 class Settings(BaseSettings):
@@ -27,6 +28,11 @@ class Settings(BaseSettings):
 
     host: str = Field("127.0.0.1", description="address that the API listens on")
     port: int = Field(8000, ge=0, le=65535, description="port of the API; 0 takes a free one")
+    root_path: str | None = Field(
+        None,
+        description="path under which something in front has the API, as `/spicd`; links bear it, and requests may come "
+        "with it or without",
+    )
     auth: Literal["auto", "required", "none"] = Field(
         "auto",
         description="whether requests need an API key; `auto`: unless the API listens on loopback, "
@@ -105,6 +111,14 @@ class Settings(BaseSettings):
     log_format: Literal["text", "json"] = Field(
         "text", description="lines for people, or a JSON object a line"
     )
+
+    @field_validator("root_path")
+    @classmethod
+    def _root_path_is_a_path(cls, value: str | None) -> str | None:
+        trimmed = (value or "").rstrip("/")
+        if trimmed and not _ROOT_PATH.fullmatch(trimmed):
+            raise ValueError(f"{value!r} is no path to be under; give it as /name or /name/of/more")
+        return trimmed or None
 
     @field_validator("allowed_origins")
     @classmethod

@@ -15,7 +15,20 @@ from pydantic import BaseModel
 from pydantic.json_schema import JsonSchemaMode, models_json_schema
 from starlette.types import ASGIApp
 
-from service.api import changes, health, jobs, maps, models, objects, scans, surveys, tiles, versions
+from service.api import (
+    changes,
+    health,
+    jobs,
+    landing,
+    maps,
+    models,
+    objects,
+    processes,
+    scans,
+    surveys,
+    tiles,
+    versions,
+)
 from service.api.housekeeping import housekeeping
 from service.api.http import idempotency, problems
 from service.api.http.access import authorize, secured
@@ -27,8 +40,11 @@ from service.api.http.description import mended, operation_id
 from service.api.http.docs_pages import add_pages
 from service.api.http.known_query import refuse_unknown
 from service.api.http.lanes import UPLOAD_TURN_S, Lane
+from service.api.http.methods import MethodsMiddleware
 from service.api.http.metrics import Metrics, MetricsMiddleware
 from service.api.http.monitor import HealthMonitor
+from service.api.http.prefix import PrefixMiddleware
+from service.api.http.representations import RepresentationMiddleware, add_conditions
 from service.api.http.requests import RequestLog
 from service.api.http.security_headers import SecurityHeadersMiddleware
 from service.api.http.submission import Ticker
@@ -73,9 +89,12 @@ UNSEEN: dict[JsonSchemaMode, tuple[type[BaseModel], ...]] = {
 class Api(FastAPI):
     """FastAPI with our own description of itself, a line in the log for each request, and security headers."""
 
+    under: str = ""  #: the path that something in front has the API under
+
     def build_middleware_stack(self) -> ASGIApp:
         """Return the app; log and headers lie around it all, for unexpected errors are answered outside of middleware."""
-        return RequestLog(SecurityHeadersMiddleware(super().build_middleware_stack()))
+        stack = PrefixMiddleware(super().build_middleware_stack(), self.under)
+        return RequestLog(SecurityHeadersMiddleware(stack))
 
     def openapi(self) -> dict[str, Any]:
         """Return the OpenAPI document: what FastAPI derives, and the bodies that are read by hand."""
@@ -95,6 +114,7 @@ class Api(FastAPI):
                 schemas.update(derived["$defs"])
             for replaced in ("HTTPValidationError", "ValidationError"):  # by problems
                 schemas.pop(replaced, None)
+            add_conditions(document)
             secured(document, problems.documented("unauthorized", "forbidden"))
             self.openapi_schema = mended(document)
         return self.openapi_schema
@@ -114,14 +134,30 @@ def create_app(settings: Settings, *, queue: Queue | None = None) -> FastAPI:
         redirect_slashes=False,  # it would be asked before any key and host, and name a host of the client's choice
         dependencies=[Depends(authorize), Depends(refuse_unknown)],
     )
+    app.under = settings.root_path or ""
     app.state.metrics = Metrics()
+    app.add_middleware(RepresentationMiddleware)
+    app.add_middleware(MethodsMiddleware, routes=app.router.routes)
     add_cross_site_checks(app, settings)
     app.add_middleware(MetricsMiddleware, metrics=app.state.metrics)
     problems.add_handlers(app)
     idempotency.add_handler(app)
     add_pages(app)
-    for part in (scans, maps, versions, surveys, tiles, changes, objects, jobs, models, health):
-        app.include_router(part.router, responses=None if part is health else problems.OUTAGES)
+    for part in (
+        landing,
+        scans,
+        maps,
+        versions,
+        surveys,
+        tiles,
+        changes,
+        objects,
+        jobs,
+        processes,
+        models,
+        health,
+    ):
+        app.include_router(part.router, responses=None if part in (health, landing) else problems.OUTAGES)
     return app
 
 

@@ -93,7 +93,8 @@ async def get_readiness(request: Request) -> Ready | Response:
         return Ready(status="degraded", checks=checks, reasons=reasons)
     if reasons:
         detail = f"no answer from: {', '.join(reasons)}"
-        return response("unhealthy", detail, checks=checks, reasons=reasons)
+        headers = {"Retry-After": str(Unavailable.retry_after_s)}
+        return response("unhealthy", detail, headers=headers, checks=checks, reasons=reasons)
     return Ready(checks=checks)
 
 

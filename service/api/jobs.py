@@ -139,7 +139,10 @@ def job_document(record: JobRecord, request: Request, wait: Wait | None = None) 
     """Return a job with its links: itself, and its result once there is one; `wait` of one whose step waits."""
     links = [link(request, f"/jobs/{record.job_id}", "self")]
     if record.status == "successful":
-        links.append(link(request, _result(record), RESULTS))
+        links += [
+            link(request, _result(record), "related"),
+            link(request, f"/jobs/{record.job_id}/results", RESULTS),
+        ]
     position, waited_s = wait or (None, None)
     return JobDocument(links=links, queue_position=position, waiting_s=waited_s, **dict(record))
 

@@ -166,6 +166,7 @@ async def get_survey_cloud(services: Provided, survey_id: SurveyId) -> Response:
         blob_keys.survey_cloud(survey_id),
         media_type=bodies.RAW,
         filename=f"{survey_id}.ply",
+        immutable=True,
     )
 
 
@@ -177,10 +178,12 @@ async def get_survey_cloud(services: Provided, survey_id: SurveyId) -> Response:
 )
 async def get_picture(services: Provided, survey_id: SurveyId) -> Response:
     """Top view of the map with objects and tiles by state; where every scan was refused, the map and why."""
-    if not _refused(await run_in_threadpool(services.catalog.surveys.get, survey_id)):
+    refused = _refused(await run_in_threadpool(services.catalog.surveys.get, survey_id))
+    if not refused:
         await run_in_threadpool(services.catalog.surveys.ready, survey_id)
     key = blob_keys.survey_picture(survey_id)
-    return await blob_response(services.catalog.blobs, key, media_type="image/png")
+    # a survey that was refused may run again, one that is ready does not
+    return await blob_response(services.catalog.blobs, key, media_type="image/png", immutable=not refused)
 
 
 def _refused(survey: SurveySummary) -> bool:

@@ -162,14 +162,18 @@ class Blobs:
             result = obstore.get(self._streams, key)
         return _pieces(result)
 
-    async def open_stream(self, key: str) -> tuple[int, AsyncIterator[bytes]]:
-        """Return the size of a blob and its bytes in pieces, for the event loop: a stalled one holds no thread.
+    async def open_stream(self, key: str) -> tuple[int, str, AsyncIterator[bytes]]:
+        """Return size, stamp and bytes of a blob, these in pieces for the event loop: a stalled one holds no thread.
+
+        Another content has another stamp.
 
         Raises FileNotFoundError.
         """
         with _errors():
             result = await obstore.get_async(self._streams, key)
-        return int(result.meta["size"]), _pieces_async(result)
+        meta = result.meta
+        stamp = f"{meta['size']} {meta['last_modified'].isoformat()} {meta['e_tag']}"
+        return int(meta["size"]), stamp, _pieces_async(result)
 
     def size(self, key: str) -> int:
         """Return the number of bytes under `key`. Raises FileNotFoundError."""

@@ -23,6 +23,9 @@ def up(
     ctx: typer.Context,
     host: Annotated[str | None, typer.Option(help="Address to listen on.")] = None,
     port: Annotated[int | None, typer.Option(help="Port; 0 takes a free one.")] = None,
+    root_path: Annotated[
+        str | None, typer.Option("--root-path", help="Path that something in front has the API under.")
+    ] = None,
     data_dir: Annotated[Path | None, typer.Option("--data-dir", help="Everything that is kept.")] = None,
     geometry_workers: Annotated[int | None, typer.Option("--geometry-workers")] = None,
     inference_workers: Annotated[int | None, typer.Option("--inference-workers")] = None,
@@ -45,6 +48,7 @@ def up(
     settings = read_settings(
         host=host,
         port=port,
+        root_path=root_path,
         data_dir=data_dir,
         geometry_workers=geometry_workers,
         inference_workers=inference_workers,

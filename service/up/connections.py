@@ -14,6 +14,8 @@ connection (as mod_reqtimeout has them for Apache, `client_header_timeout` and `
 There are `connections` of them at most. One more closes the one of which least is lost, and its clock would end first:
 one that waits for a header or for another request, or that was answered and still sends, as who has no key is. Where
 there is none it is answered 503.
+
+What never becomes a request, for it is no sound HTTP or ends too early, is answered by a problem document as well.
 """
 
 from __future__ import annotations
@@ -22,14 +24,17 @@ import asyncio
 import logging
 import re
 import socket
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from http import HTTPStatus
 from typing import Any, ClassVar
 
 import h11
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
+from service.api.http import problems, security_headers
 from service.settings import Settings
 
 log = logging.getLogger("spicd")
@@ -81,10 +86,23 @@ class LimitedProtocol(H11Protocol):
         """Take what came, and look which clock has to run now."""
         self._window_bytes += len(data)
         if self.conn.their_state is h11.IDLE and self._is_too_long(data):
-            self._refuse(b"431 Request Header Fields Too Large")
+            most = self.limits.header_bytes
+            self._refuse("header_too_large", f"the head of the request has more than {most} bytes")
             return
         super().data_received(data)
         self._look(received=True)
+
+    def eof_received(self) -> None:
+        """Tell a client that ends within its body, and still listens, that nothing was kept; then close."""
+        if self.conn.their_state is h11.SEND_BODY and not self.cycle.response_started:
+            self._refuse("incomplete_body", "the connection ended within the body; nothing was kept")
+
+    def send_400_response(self, msg: str) -> None:
+        """Answer what h11 refuses; called where its error is handled."""
+        error = sys.exception()
+        detail = str(error) if isinstance(error, h11.RemoteProtocolError) else msg
+        too_large = getattr(error, "error_status_hint", 400) == 431
+        self._refuse("header_too_large" if too_large else "broken_request", detail)
 
     def on_response_complete(self) -> None:
         """Note that a request was answered, whether or not all of it was read."""
@@ -136,12 +154,12 @@ class LimitedProtocol(H11Protocol):
         return len(begun) >= longest and _END_OF_HEADER.search(begun, 0, longest) is None
 
     def _wait_for_header(self) -> None:
-        self._run("header", self.limits.header_s, self._refuse)
+        self._run("header", self.limits.header_s, self._refuse_slow)
 
     def _look_at_body(self) -> None:
         """Go on where enough of the body came, or it was us who did not read; else end it."""
         if self._window_bytes < self.limits.body_bytes and not self.flow.read_paused:
-            self._refuse()
+            self._refuse_slow()
             return
         self._window_bytes, self._state = 0, ""
         self._run("body", self.limits.body_window_s, self._look_at_body)
@@ -157,15 +175,20 @@ class LimitedProtocol(H11Protocol):
             self._clock.cancel()
         self._state, self._clock = "", None
 
-    def _refuse(self, status: bytes = b"408 Request Timeout") -> None:
-        """Answer in one line, where nothing was answered yet, and close."""
-        begun = self._window_bytes > 0 or self._state != "header"
-        if begun and not self.transport.is_closing() and not self._answering():
-            self.transport.write(b"HTTP/1.1 %b\r\nConnection: close\r\nContent-Length: 0\r\n\r\n" % status)
-        self._close()
+    def _refuse_slow(self) -> None:
+        what = "head" if self._state == "header" else "body"
+        self._refuse("too_slow", f"the {what} of the request came too slowly; send it again")
 
-    def _answering(self) -> bool:
-        return self.cycle is not None and self.cycle.response_started and not self.cycle.response_complete
+    def _refuse(self, code: str, detail: str, *, retry_after_s: int | None = None) -> None:
+        """Answer with a problem, where nothing was answered yet, and close."""
+        begun = self._window_bytes > 0 or self._state != "header"
+        answering = self.cycle is not None and self.cycle.response_started
+        answered = (
+            answering and self.conn.our_state is not h11.IDLE
+        )  # where it is, the next request has begun
+        if begun and not self.transport.is_closing() and not answered:
+            self.transport.write(raw_problem(code, detail, retry_after_s=retry_after_s))
+        self._close()
 
     def _close(self) -> None:
         log.debug("closing a connection of %s in the state %r", self.client and self.client[0], self._state)
@@ -185,12 +208,29 @@ class LimitedProtocol(H11Protocol):
             min(waiting, key=lambda entry: entry[0])[1]._close()
         else:
             self._state = "no room"
-            self._refuse(b"503 Service Unavailable\r\nRetry-After: 10")
+            most = self.limits.connections
+            self._refuse(
+                "unavailable", f"{most} connections are at work, as many as may be", retry_after_s=10
+            )
 
     def _waits_until(self) -> float | None:
         """Return when a connection ends by its clock on which nothing is going on; None where something is."""
         clock = self._clock if self._state in ("header", "linger") else self.timeout_keep_alive_task
         return None if clock is None or self.transport.is_closing() else clock.when()
+
+
+def raw_problem(code: str, detail: str, *, retry_after_s: int | None = None) -> bytes:
+    """Return a problem document as a whole answer (RFC 9112), for a request that never reached the app."""
+    answer = problems.response(code, detail)
+    answer.headers.update({**security_headers.HEADERS, "Cache-Control": "no-store", "Connection": "close"})
+    if retry_after_s is not None:
+        answer.headers["Retry-After"] = str(retry_after_s)
+    reason = HTTPStatus(answer.status_code).phrase
+    lines = [
+        f"HTTP/1.1 {answer.status_code} {reason}",
+        *(f"{name.title()}: {value}" for name, value in answer.headers.items()),
+    ]
+    return "\r\n".join([*lines, "", ""]).encode("latin-1") + bytes(answer.body)
 
 
 def _warn_of_crowd(connections: int) -> None:

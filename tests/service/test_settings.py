@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from pydantic import ValidationError
 
 from service import settings as settings_module
 from service.catalog.catalog import open_catalog
@@ -61,3 +62,16 @@ def test_without_a_checkout_the_models_are_looked_for_where_the_process_starts(
 def test_scratch_is_in_the_data_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     assert Settings(data_dir=Path("data")).scratch_dir() == tmp_path / "data" / "scratch"
+
+
+@pytest.mark.parametrize(
+    ("given", "path"), [("/spicd", "/spicd"), ("/a/b-1/", "/a/b-1"), ("/", None), ("", None)]
+)
+def test_a_prefix_is_a_path_without_its_last_slash(given: str, path: str | None) -> None:
+    assert Settings(root_path=given).root_path == path
+
+
+@pytest.mark.parametrize("given", ["spicd", "//evil.example", "/a//b", "/a b", "/a?b", "https://host/spicd"])
+def test_what_is_no_path_is_not_taken_for_a_prefix(given: str) -> None:
+    with pytest.raises(ValidationError, match="no path to be under"):
+        Settings(root_path=given)

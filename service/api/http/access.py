@@ -63,8 +63,13 @@ SCOPES: Mapping[tuple[str, str], Scopes] = {
     ("GET", "/maps/{map_id}/objects/{object_id}"): _READ,
     ("GET", "/jobs"): _READ,
     ("GET", "/jobs/{job_id}"): _READ | _SURVEYS | _MAPS,
+    ("GET", "/jobs/{job_id}/results"): _READ | _SURVEYS | _MAPS,
     ("DELETE", "/jobs/{job_id}"): _SURVEYS | _MAPS,  # of which one, by the kind of the job
     ("POST", "/jobs/{job_id}/retry"): _SURVEYS | _MAPS,  # the same
+    ("GET", "/"): OPEN,
+    ("GET", "/conformance"): OPEN,
+    ("GET", "/processes"): OPEN,
+    ("GET", "/processes/{process_id}"): OPEN,
     ("GET", "/health/live"): OPEN,
     ("GET", "/health/ready"): OPEN,
     ("GET", "/metrics"): _READ,

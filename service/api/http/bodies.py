@@ -21,12 +21,22 @@ from pydantic import BaseModel
 from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import MultipartParser, parse_options_header
 
+from service.api.http.codings import Coding, coding_of
 from service.api.http.dependencies import Services
 from service.api.http.description import not_null
+from service.api.http.digests import ExpectedDigests
 from service.api.http.json_text import read_json
 from service.api.http.uploads import Incoming, Upload
 from service.catalog.disk import Disk
-from service.errors import BadRequest, DiskFull, TooLarge, TooSlow, WrongMediaType, is_disk_full
+from service.errors import (
+    BadRequest,
+    BrokenRequest,
+    DiskFull,
+    TooLarge,
+    TooSlow,
+    WrongMediaType,
+    is_disk_full,
+)
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -69,9 +79,11 @@ async def received(
     """Receive the body of a request in one of the media types `takes`.
 
     `files` names the form field of files; `filename` that of a raw body. `needs_space` is said of a request that makes
-    anything larger than its row. Raises WrongMediaType, TooLarge, BadRequest, ScanUnreadable, DiskFull; leaves nothing
-    behind whichever way it ends.
+    anything larger than its row. The limits are those of the body as it came and as it is once decoded. Raises
+    WrongMediaType, WrongEncoding, WrongDigest, BrokenRequest, TooLarge, BadRequest, ScanUnreadable, DiskFull; leaves
+    nothing behind whichever way it ends.
     """
+    _require_whole(request)
     settings = services.settings
     disk = services.catalog.disk if needs_space else None
     media_type, options = _media_type(request)
@@ -185,6 +197,7 @@ async def _pour(
 
 async def _stream(request: Request, take: Callable[[bytes], None], limit: int, disk: Disk | None) -> None:
     _declared(request, limit)
+    intake = _Intake(request, take, limit, disk)
     size = 0
     piece = bytearray()
     async for chunk in request.stream():
@@ -193,16 +206,48 @@ async def _stream(request: Request, take: Callable[[bytes], None], limit: int, d
             raise TooLarge(f"the body has more than the {limit} bytes that are taken")
         piece += chunk
         if len(piece) >= PIECE:
-            await run_in_threadpool(_hand_on, take, bytes(piece), disk)
+            await run_in_threadpool(intake.feed, bytes(piece))
             piece.clear()
     if piece:
-        await run_in_threadpool(_hand_on, take, bytes(piece), disk)
+        await run_in_threadpool(intake.feed, bytes(piece))
+    intake.finish()
 
 
-def _hand_on(take: Callable[[bytes], None], piece: bytes, disk: Disk | None) -> None:
-    if disk is not None:
-        disk.require(len(piece))
-    _on_disk(take, piece)
+class _Intake:
+    """Between the body as it comes and who takes it: holds it against its digests, decodes it, and bounds it."""
+
+    def __init__(
+        self, request: Request, take: Callable[[bytes], None], limit: int, disk: Disk | None
+    ) -> None:
+        """Raises WrongEncoding and BrokenRequest for headers that cannot be met."""
+        self._take, self._limit, self._disk = take, limit, disk
+        self._coding: Coding = coding_of(request.headers)
+        self._digests = ExpectedDigests(request.headers)
+        self._size = 0
+
+    def feed(self, piece: bytes) -> None:
+        """Hand a piece on, in a thread. Raises TooLarge, BrokenRequest, DiskFull."""
+        self._digests.update(piece)
+        for part in self._coding.decoded(piece):
+            self._size += len(part)
+            if self._size > self._limit:
+                raise TooLarge(f"the body has more than the {self._limit} bytes that are taken, once decoded")
+            if self._disk is not None:
+                self._disk.require(len(part))
+            _on_disk(self._take, part)
+
+    def finish(self) -> None:
+        """Note that the body has ended. Raises BrokenRequest and WrongDigest."""
+        self._digests.check()
+        self._coding.finish()
+
+
+def _require_whole(request: Request) -> None:
+    """Raise BrokenRequest for a part of something: to take it for the whole is to lose the rest (RFC 9110, 14.5)."""
+    if (content_range := request.headers.get("content-range")) is not None:
+        raise BrokenRequest(
+            f"the body is the part {content_range[:100]!r} of something; send all of it at once"
+        )
 
 
 def _make(folder: Path) -> None:

@@ -14,22 +14,67 @@ import re
 import socket
 
 from fastapi import FastAPI
-from starlette.datastructures import Headers
+from starlette.datastructures import Headers, MutableHeaders
 from starlette.middleware.cors import CORSMiddleware
-from starlette.types import ASGIApp, Receive, Scope, Send
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from service.api.http.methods import METHODS
 from service.api.http.problems import response
+from service.api.http.representations import add_vary
 from service.settings import Settings
 
 SAFE_METHODS = frozenset(
     {"GET", "HEAD", "OPTIONS"}
 )  #: change nothing (RFC 9110, Section 9.2.1), here as well
 EXPOSED_HEADERS = (
-    "Location",
+    "Accept-Encoding",
+    "Accept-Ranges",
+    "Allow",
+    "Content-Digest",
+    "Content-Crs",
     "Content-Disposition",
+    "Content-Range",
     "ETag",
+    "Idempotent-Replayed",
+    "Link",
+    "Location",
+    "OGC-NumberMatched",
+    "OGC-NumberReturned",
+    "Repr-Digest",
     "Retry-After",
+    "Tus-Checksum-Algorithm",
+    "Tus-Extension",
+    "Tus-Max-Size",
+    "Tus-Resumable",
+    "Tus-Version",
+    "Upload-Expires",
+    "Upload-Length",
+    "Upload-Metadata",
+    "Upload-Offset",
     "WWW-Authenticate",
+    "X-Request-ID",
+)
+#: Headers that a page of a named origin may send; a browser asks for each that is not safelisted (Fetch, 4.8).
+ALLOWED_HEADERS = (
+    "Authorization",
+    "Content-Digest",
+    "Content-Encoding",
+    "Content-Type",
+    "Idempotency-Key",
+    "If-Match",
+    "If-Modified-Since",
+    "If-None-Match",
+    "If-Range",
+    "Last-Event-ID",
+    "Range",
+    "Repr-Digest",
+    "Tus-Resumable",
+    "Upload-Checksum",
+    "Upload-Length",
+    "Upload-Metadata",
+    "Upload-Offset",
+    "Want-Content-Digest",
+    "Want-Repr-Digest",
     "X-Request-ID",
 )
 _HOST = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[^\s:\[\]/@]+)(?::\d*)?")
@@ -42,8 +87,8 @@ def add_cross_site_checks(app: FastAPI, settings: Settings) -> None:
         app.add_middleware(
             CORSMiddleware,
             allow_origins=origins,
-            allow_methods=("GET", "POST", "PUT", "DELETE"),
-            allow_headers=("Authorization", "Content-Type", "X-Request-ID"),
+            allow_methods=METHODS,
+            allow_headers=ALLOWED_HEADERS,
             expose_headers=EXPOSED_HEADERS,
         )
     app.add_middleware(CrossSiteMiddleware, hosts=allowed_hosts(settings), origins=frozenset(origins))
@@ -77,7 +122,22 @@ class CrossSiteMiddleware:
             if refusal is not None:
                 await response("forbidden", refusal)(scope, receive, send)
                 return
-        await self._app(scope, receive, send)
+        await self._app(scope, receive, self._varied(send) if self._origins else send)
+
+    @staticmethod
+    def _varied(send: Send) -> Send:
+        """Tell caches that an answer depends on the origin, also of who had none (Fetch, Section 3.3.7).
+
+        A browser that had shown a picture as it is would else give the same to a page of a named origin, which may then
+        not read it.
+        """
+
+        async def vary(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                add_vary(MutableHeaders(scope=message), "Origin")
+            await send(message)
+
+        return vary
 
     def _foreign_host(self, headers: Headers) -> str | None:
         """Return the sentence for a `Host` that is not ours. Without one no browser asks: HTTP/1.0 probes have none."""

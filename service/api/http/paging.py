@@ -39,7 +39,7 @@ class PageRequest(Request):
 
 def list_links(request: HttpRequest, page: Page[Any], position: Callable[[Any], Position]) -> list[Link]:
     """Return the links `self`, and `next` while there is more."""
-    links = [Link(href=_here(request), rel="self")]
+    links = [Link(href=here(request), rel="self")]
     if page.more:
         created, key = position(page.items[-1])
         links.append(next_link(request, encoded(rfc3339(created), key)))
@@ -121,5 +121,6 @@ def _path(request: HttpRequest) -> str:
     return request.url.path.removeprefix(request.scope.get("root_path", ""))
 
 
-def _here(request: HttpRequest) -> str:
+def here(request: HttpRequest) -> str:
+    """Return the path and query of a request, as a link to itself has them."""
     return request.url.path + (f"?{request.url.query}" if request.url.query else "")

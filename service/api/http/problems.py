@@ -14,6 +14,8 @@ from pydantic import BaseModel, BeforeValidator, Field
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 
+from service.api.http.codings import ACCEPTED
+from service.api.http.methods import allowed, is_head
 from service.catalog.records import Problem
 from service.errors import ServiceError, Unavailable, is_disk_full
 
@@ -25,6 +27,9 @@ MEDIA_TYPE = "application/problem+json"
 #: code -> (HTTP status, title). A status of None is that of a failed job, which no request answers with.
 PROBLEMS: dict[str, tuple[int | None, str]] = {
     "not_found": (404, "There is no such thing"),
+    "no_such_process": (404, "There is no such process"),
+    "no_such_job": (404, "There is no such job"),
+    "result_not_ready": (404, "The job has not ended"),
     "not_ready": (409, "It is not ready yet"),
     "conflict": (409, "It is in the way of something else"),
     "bad_request": (422, "A value cannot be used"),
@@ -34,6 +39,11 @@ PROBLEMS: dict[str, tuple[int | None, str]] = {
     "too_slow": (408, "The body took too long"),
     "wrong_media_type": (415, "The media type is not taken here"),
     "not_acceptable": (406, "No answer is of a media type that is accepted"),
+    "wrong_encoding": (415, "The content coding is not taken here"),
+    "wrong_digest": (400, "The body is not what its digest says"),
+    "broken_request": (400, "The request is no sound HTTP"),
+    "header_too_large": (431, "The header is too large"),
+    "range_not_satisfiable": (416, "There are no such bytes"),
     "unauthorized": (401, "An API key is needed"),
     "forbidden": (403, "This may not be done here"),
     "queue_full": (429, "Too many jobs wait"),
@@ -65,6 +75,14 @@ PROBLEMS: dict[str, tuple[int | None, str]] = {
     "dismissed": (None, "The job was dismissed"),
 }
 
+#: Types that a standard names (OGC 18-062r2, Section 7); all others are ours.
+_OGC = "http://www.opengis.net/def/exceptions/ogcapi-processes-1/1.0"
+_TYPES = {
+    "no_such_process": f"{_OGC}/no-such-process",
+    "no_such_job": f"{_OGC}/no-such-job",
+    "result_not_ready": f"{_OGC}/result-not-ready",
+}
+
 
 class InvalidValue(BaseModel):
     """One value that does not match, and where it stands."""
@@ -86,7 +104,7 @@ class ProblemDocument(BaseModel):
 
 
 def _type(code: str) -> str:
-    return f"urn:spicd:problem:{code}"
+    return _TYPES.get(code, f"urn:spicd:problem:{code}")
 
 
 def problem_of(problem: Problem | None) -> ProblemDocument | None:
@@ -103,9 +121,12 @@ JobProblem = Annotated[ProblemDocument | None, BeforeValidator(problem_of)]
 #: What may be wrong with any body; documented in this order.
 BODY = (
     "incomplete_body",
+    "broken_request",
+    "wrong_digest",
     "too_slow",
     "too_large",
     "wrong_media_type",
+    "wrong_encoding",
     "bad_request",
     "invalid_request",
     "disk_full",
@@ -123,6 +144,14 @@ def response(
     status = 500 if status is None else status
     content = {"type": _type(code), "title": title, "status": status, "detail": detail, **members}
     return JSONResponse(content, status, headers=headers, media_type=MEDIA_TYPE)
+
+
+def job_failed(problem: Problem) -> JSONResponse:
+    """Answer who asks for the results of a job that failed or was dismissed: its problem, as a conflict."""
+    status = 409
+    _, title = PROBLEMS.get(problem.code, PROBLEMS["pipeline_error"])
+    content = {"type": _type(problem.code), "title": title, "status": status, "detail": problem.detail}
+    return JSONResponse(content, status, media_type=MEDIA_TYPE)
 
 
 _RETRY_AFTER = {"description": "seconds, where it helps to wait", "schema": {"type": "integer"}}
@@ -173,6 +202,8 @@ def _service_error(_request: Request, error: Exception) -> Response:
     headers = {}
     if code == "unauthorized":
         headers["WWW-Authenticate"] = 'Bearer realm="spicd"'  # RFC 6750, Section 3
+    if code == "wrong_encoding":
+        headers["Accept-Encoding"] = ACCEPTED  # RFC 7694, Section 3
     if (wait := getattr(error, "retry_after_s", None)) is not None:
         headers["Retry-After"] = str(wait)
     return response(code, str(error), headers=headers or None)
@@ -210,7 +241,10 @@ def _http_error(request: Request, error: Exception) -> Response:
     if status == 404:
         return response("not_found", f"no such path: {request.url.path}; GET /docs shows those there are")
     if status == 405:
-        return response("method_not_allowed", f"{request.method} is not allowed here", headers=headers)
+        names = ", ".join(allowed(request.app.routes, request.scope))
+        method = "HEAD" if is_head(request.scope) else request.method
+        detail = f"{method} is not allowed here; {names} are"
+        return response("method_not_allowed", detail, headers={"Allow": names})
     if status < 500:
         detail = error.detail if isinstance(error, HTTPException) else "the request cannot be read"
         return response("bad_request", str(detail), headers=headers)

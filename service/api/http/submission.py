@@ -31,6 +31,8 @@ log = logging.getLogger(__name__)
 
 P = ParamSpec("P")
 
+LOOK_AGAIN_S = 2  #: seconds after which it makes sense to ask how far a job is
+
 
 class ScanUse(Request):
     """A scan that was uploaded before, with what counts in this map or survey alone."""
@@ -90,7 +92,7 @@ def monitor(request: HttpRequest, job: JobRecord) -> Link:
 
 def job_headers(request: HttpRequest, job: JobRecord) -> dict[str, str]:
     """Return the headers of the answer to a request that submitted a job."""
-    return {"Location": monitor(request, job).href}
+    return {"Location": monitor(request, job).href, "Retry-After": str(LOOK_AGAIN_S)}
 
 
 def accepted(request: HttpRequest, document: BaseModel, job: JobRecord) -> Answer:

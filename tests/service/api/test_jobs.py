@@ -58,8 +58,10 @@ def test_a_finished_job_links_to_its_result(client: TestClient, catalog: Catalog
     survey_id, job_id = add_survey(catalog)
     job = client.get(f"/jobs/{job_id}").json()
     assert (job["status"], job["progress"], job["processID"]) == ("successful", 100, "survey")
-    (result,) = [link["href"] for link in job["links"] if link["rel"].endswith("/results")]
+    (result,) = [link["href"] for link in job["links"] if link["rel"] == "related"]
     assert result == f"/surveys/{survey_id}"
+    (results,) = [link["href"] for link in job["links"] if link["rel"].endswith("/results")]
+    assert client.get(results).json()["survey"]["href"] == result
 
 
 @pytest.mark.parametrize("code", ["registration_failed", "scan_unreadable", "internal", "something_new"])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import json
 import re
 import socket
 import threading
@@ -282,3 +283,97 @@ def test_idle_connections_of_a_client_that_comes_again_are_kept_for_a_moment(ser
             assert client.get("/health/live").status_code == 200
         assert server.open_connections() == 1
     until(lambda: server.open_connections() == 0)
+
+
+def problem_of(said: bytes) -> tuple[int, dict[str, str], Any]:
+    """The status, the headers and the document of an answer as it came over the wire."""
+    head, _, body = said.partition(b"\r\n\r\n")
+    first, *lines = head.decode().split("\r\n")
+    headers = dict(line.lower().split(": ", 1) for line in lines)
+    assert len(body) == int(headers["content-length"])
+    assert headers["content-type"] == "application/problem+json"
+    assert headers["connection"] == "close"
+    assert headers["cache-control"] == "no-store"
+    assert headers["x-content-type-options"] == "nosniff"
+    status = int(first.split()[1])
+    document = json.loads(body)
+    assert document["status"] == status
+    return status, headers, document
+
+
+@pytest.mark.parametrize(
+    "sent",
+    [
+        b"hello\r\n\r\n",
+        b"GET / HTTP/1.1\r\n\r\n",  # no Host
+        b"GET / HTTP/1.1\r\nHost: localhost\r\nbad header\r\n\r\n",
+        b"GET / HTTP/1.1\r\nHost: localhost\r\nX: a\x00b\r\n\r\n",
+        b"GET / HTTP/1.1\r\nHost: a\r\nHost: b\r\n\r\n",
+        b"POST /scans HTTP/1.1\r\nHost: localhost\r\nContent-Length: 1\r\nContent-Length: 2\r\n\r\nx",
+        b"POST /scans HTTP/1.1\r\nHost: localhost\r\nContent-Length: -1\r\n\r\nx",
+        b"POST /scans HTTP/1.1\r\nHost: localhost\r\nTransfer-Encoding: gzip\r\n\r\nx",
+        b"POST /scans HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/octet-stream\r\n"
+        b"Transfer-Encoding: chunked\r\n\r\nno-size\r\n",
+        b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03\r\n\r\n",  # TLS to a port without
+    ],
+)
+def test_what_is_no_http_is_told_so_in_a_problem(server: Server, sent: bytes) -> None:
+    with server.connect() as connection:
+        connection.sendall(sent)
+        status, _, document = problem_of(everything(connection))
+    assert (status, document["type"]) == (400, "urn:spicd:problem:broken_request")
+    assert document["detail"]
+    assert server.answers()
+    until(lambda: not server.incoming())
+
+
+def test_broken_http_behind_a_sound_request_is_told_too(server: Server) -> None:
+    with server.connect() as connection:
+        connection.sendall(b"GET /health/live HTTP/1.1\r\nHost: localhost\r\n\r\n")
+        until(lambda: b'"ok"' in connection.recv(65536))
+        connection.sendall(b"nonsense\r\n\r\n")
+        assert problem_of(everything(connection))[0] == 400
+
+
+def test_who_ends_within_a_body_and_listens_is_told_that_nothing_was_kept(server: Server) -> None:
+    with server.connect() as connection:
+        connection.sendall(UPLOAD % 1_000_000 + HEAD)
+        until(server.incoming)
+        connection.shutdown(socket.SHUT_WR)
+        status, _, document = problem_of(everything(connection))
+    assert (status, document["type"]) == (400, "urn:spicd:problem:incomplete_body")
+    until(lambda: not server.incoming())
+    listed = httpx.get(f"http://127.0.0.1:{server.port}/scans", timeout=5).json()
+    assert listed["scans"] == []
+
+
+def test_slow_and_long_requests_are_told_so_in_a_problem(server: Server) -> None:
+    for sent, status, code in (
+        (b"GET /hea", 408, "too_slow"),
+        (UPLOAD % 1_000_000 + HEAD, 408, "too_slow"),
+        (b"GET / HTTP/1.1\r\nX: " + b"x" * 17_000, 431, "header_too_large"),
+    ):
+        with server.connect() as connection:
+            connection.sendall(sent)
+            told = problem_of(everything(connection))
+        assert (told[0], told[2]["type"]) == (status, f"urn:spicd:problem:{code}")
+    until(lambda: not server.incoming())
+
+
+def test_head_and_304_go_over_the_wire_without_content(server: Server) -> None:
+    with httpx.Client(base_url=f"http://127.0.0.1:{server.port}") as client:
+        get = client.get("/openapi.json")
+        head = client.head("/openapi.json")
+        again = client.get("/openapi.json", headers={"If-None-Match": get.headers["ETag"]})
+        options = client.options("/maps")
+        assert (head.status_code, head.content) == (200, b"")
+        assert head.headers["Content-Length"] == get.headers["Content-Length"]
+        assert (again.status_code, again.content) == (304, b"")
+        assert options.headers["Allow"] == "GET, HEAD, POST, OPTIONS"
+        assert server.open_connections() == 1  # each answer ended where the next one begins
+
+
+def test_options_of_the_server_as_a_whole(server: Server) -> None:
+    with server.connect() as connection:
+        connection.sendall(b"OPTIONS * HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n")
+        assert everything(connection).startswith(b"HTTP/1.1 204")

@@ -67,7 +67,7 @@ def routes() -> set[tuple[str, str]]:
 
 def filled(path: str) -> str:
     ids = {"{map_id}": "lobby", "{number}": "1", "{scan_id}": "scan-1", "{survey_id}": "survey-1"}
-    ids |= {"{job_id}": "job-1", "{object_id}": "object-1", "{name}": "spicd-net"}
+    ids |= {"{job_id}": "job-1", "{object_id}": "object-1", "{name}": "spicd-net", "{process_id}": "map"}
     for name, value in ids.items():
         path = path.replace(name, value)
     return path
@@ -77,6 +77,10 @@ def test_no_route_is_left_without_scopes_and_no_scope_without_a_route() -> None:
     assert routes() == set(SCOPES)
     assert set(SCOPES) >= OF_ALL_MAPS
     assert {route for route, scopes in SCOPES.items() if scopes == OPEN} == {
+        ("GET", "/"),
+        ("GET", "/conformance"),
+        ("GET", "/processes"),
+        ("GET", "/processes/{process_id}"),
         ("GET", "/health/live"),
         ("GET", "/health/ready"),
     }
@@ -90,7 +94,7 @@ def test_what_changes_something_takes_a_scope_to_write() -> None:
 @pytest.mark.parametrize(("method", "path"), sorted(SCOPES))
 def test_each_route_asks_for_a_key_and_for_the_scope(guarded: TestClient, method: str, path: str) -> None:
     if SCOPES[method, path] == OPEN:
-        assert guarded.request(method, path).status_code == 200
+        assert guarded.request(method, filled(path)).status_code == 200
         return
     bare = guarded.request(method, filled(path))
     assert (bare.status_code, code(bare)) == (401, "unauthorized")

@@ -124,6 +124,46 @@ def test_a_named_dashboard_may_read_and_change(named: TestClient) -> None:
     assert "Access-Control-Allow-Credentials" not in answer.headers
 
 
+@pytest.mark.parametrize(
+    ("method", "headers"),
+    [
+        ("POST", "authorization,content-type,idempotency-key,content-digest,repr-digest,content-encoding"),
+        ("GET", "authorization,if-none-match,last-event-id,range,if-range,want-repr-digest"),
+        ("PATCH", "content-type,tus-resumable,upload-offset,upload-checksum"),
+        ("POST", "tus-resumable,upload-length,upload-metadata"),
+        ("HEAD", "tus-resumable"),
+        ("DELETE", "tus-resumable"),
+        ("PUT", "if-match,x-request-id"),
+    ],
+)
+def test_a_named_dashboard_may_send_the_headers_that_the_api_knows(
+    named: TestClient, method: str, headers: str
+) -> None:
+    asked = {"Access-Control-Request-Method": method, "Access-Control-Request-Headers": headers}
+    preflight = named.options("/scans", headers={"Origin": DASHBOARD, **asked})
+    assert preflight.status_code == 200, preflight.text
+    assert method in preflight.headers["Access-Control-Allow-Methods"]
+    refused = {"Access-Control-Request-Method": method, "Access-Control-Request-Headers": "x-unheard-of"}
+    assert named.options("/scans", headers={"Origin": DASHBOARD, **refused}).status_code == 400
+
+
+def test_a_named_dashboard_may_read_the_headers_that_the_api_answers_with(named: TestClient) -> None:
+    answer = named.get("/maps", headers={"Origin": DASHBOARD})
+    exposed = {name.strip() for name in answer.headers["Access-Control-Expose-Headers"].split(",")}
+    assert exposed >= {"Location", "ETag", "Retry-After", "Link", "Allow", "Content-Range", "Repr-Digest"}
+    assert exposed >= {"Tus-Resumable", "Upload-Offset", "Upload-Expires", "Accept-Encoding"}
+
+
+def test_caches_keep_answers_to_pages_apart(named: TestClient) -> None:
+    for headers in ({}, {"Origin": DASHBOARD}, {"Origin": "https://evil.example"}):
+        vary = [name.strip() for name in named.get("/maps", headers=headers).headers["Vary"].split(",")]
+        assert vary.count("Origin") == 1
+
+
+def test_where_no_origin_is_named_no_answer_depends_on_it(client: TestClient) -> None:
+    assert "Origin" not in client.get("/maps").headers.get("Vary", "")
+
+
 def test_a_page_of_another_origin_may_not_even_read(named: TestClient) -> None:
     answer = named.get("/maps", headers={"Origin": "https://evil.example"})
     assert "Access-Control-Allow-Origin" not in answer.headers

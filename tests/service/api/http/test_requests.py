@@ -60,7 +60,7 @@ def test_the_line_has_the_route_and_sizes_and_nothing_that_a_client_sent(
     client: TestClient, catalog: Catalog, lines: Lines
 ) -> None:
     add_map(catalog)
-    headers = {"Authorization": "Bearer s3cret"}
+    headers = {"Authorization": "Bearer s3cret", "Accept-Encoding": "identity"}
     answer = client.get("/maps/lobby?token=s3cret", headers=headers)
     (line,) = lines.of("spicd.requests")
     assert line.levelno == logging.INFO
