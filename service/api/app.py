@@ -15,7 +15,7 @@ from pydantic import BaseModel
 from pydantic.json_schema import JsonSchemaMode, models_json_schema
 from starlette.types import ASGIApp
 
-from service.api import changes, health, jobs, maps, models, objects, scans, surveys, versions
+from service.api import changes, health, jobs, maps, models, objects, scans, surveys, tus, versions
 from service.api.features import TileCollection
 from service.api.housekeeping import housekeeping
 from service.api.http import problems
@@ -31,6 +31,7 @@ from service.api.http.monitor import HealthMonitor
 from service.api.http.requests import RequestLog
 from service.api.http.security_headers import SecurityHeadersMiddleware
 from service.api.http.submission import Ticker
+from service.api.http.tus import TusHeaders
 from service.api.http.uploads import sweep
 from service.catalog.catalog import open_catalog
 from service.catalog.patience import REQUESTS
@@ -116,9 +117,10 @@ def create_app(settings: Settings, *, queue: Queue | None = None) -> FastAPI:
     app.state.metrics = Metrics()
     add_cross_site_checks(app, settings)
     app.add_middleware(MetricsMiddleware, metrics=app.state.metrics)
+    app.add_middleware(TusHeaders)
     problems.add_handlers(app)
     add_pages(app)
-    for part in (scans, maps, versions, surveys, changes, objects, jobs, models, health):
+    for part in (scans, tus, maps, versions, surveys, changes, objects, jobs, models, health):
         app.include_router(part.router, responses=None if part is health else problems.OUTAGES)
     return app
 
@@ -143,6 +145,7 @@ def _lifespan(settings: Settings, queue: Queue | None) -> Any:
             writes=Lane(),
             uploads=Lane(turn_s=UPLOAD_TURN_S),
         )
+        app.state.receiver = tus.Receiver(settings)
         app.state.monitor = HealthMonitor(health.parts(app.state.services))
         await run_in_threadpool(app.state.monitor.start)
         ticker = Ticker(dispatcher)
@@ -167,8 +170,9 @@ async def _go_on_sweeping(settings: Settings) -> None:
 
 
 def _sweep(settings: Settings) -> None:
-    """Remove what uploads of killed processes left."""
+    """Remove what uploads of killed processes left, and resumable ones that have expired."""
     sweep(settings.data_dir / INCOMING, upload_timeout_s=settings.upload_timeout_s)
+    tus.Receiver(settings).uploads.sweep()
 
 
 def _version() -> str:

@@ -50,6 +50,7 @@ class Scans:
         device_id: str | None = None,
         captured_at: datetime | None = None,
         pose: Matrix | None = None,
+        frame: str | None = None,
     ) -> tuple[ScanRecord, bool]:
         """Keep the file at `path` (moved when it can be) and say whether it is new.
 
@@ -71,13 +72,19 @@ class Scans:
             device_id=device_id,
             captured_at=captured_at,
             pose=None if pose is None else [list(line) for line in pose],
+            frame=frame,
             key=key,
             created=tables.now(),
         )
         return self._insert(row)
 
     def correct(
-        self, scan_id: str, *, captured_at: datetime | None = None, pose: Matrix | None = None
+        self,
+        scan_id: str,
+        *,
+        captured_at: datetime | None = None,
+        pose: Matrix | None = None,
+        frame: str | None = None,
     ) -> ScanRecord:
         """Change what is said of a scan; what is None stays. Raises NotFound.
 
@@ -88,16 +95,18 @@ class Scans:
             known = ScanRecord.of_row(row)
             new_time = captured_at is not None and captured_at != known.captured_at
             new_pose = pose is not None and pose != known.pose
-            if not (new_time or new_pose):
+            new_frame = frame is not None and frame != known.frame
+            if not (new_time or new_pose or new_frame):
                 return known
             if session.scalar(select(_in_use(scan_id))):
-                what = " and ".join(["pose"] * new_pose + ["captured_at"] * new_time)
+                what = " and ".join(["pose"] * new_pose + ["frame"] * new_frame + ["captured_at"] * new_time)
                 raise Conflict(
                     f"scan {scan_id!r} has the same bytes, another {what}, and belongs to a map or survey; delete "
                     "what rests on it, then the scan, and send it again"
                 )
             row.captured_at = captured_at or known.captured_at
             row.pose = row.pose if pose is None else [list(line) for line in pose]
+            row.frame = frame or known.frame
             session.flush()
             return ScanRecord.of_row(row)
 

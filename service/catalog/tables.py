@@ -93,6 +93,7 @@ class Scan(Base):
     device_id: Mapped[str | None]
     captured_at: Mapped[datetime | None]
     pose: Mapped[list[list[float]] | None]
+    frame: Mapped[str | None]
     key: Mapped[str]
     created: Mapped[datetime]
     resent: Mapped[datetime | None]

@@ -24,6 +24,27 @@ from service.settings import Settings
 SAFE_METHODS = frozenset(
     {"GET", "HEAD", "OPTIONS"}
 )  #: change nothing (RFC 9110, Section 9.2.1), here as well
+TUS_REQUEST = (  #: headers of a resumable upload (tus 1.0.0)
+    "Tus-Resumable",
+    "Upload-Length",
+    "Upload-Offset",
+    "Upload-Metadata",
+    "Upload-Checksum",
+    "X-HTTP-Method-Override",
+)
+TUS_ANSWER = (
+    "Tus-Resumable",
+    "Tus-Version",
+    "Tus-Extension",
+    "Tus-Max-Size",
+    "Tus-Checksum-Algorithm",
+    "Upload-Length",
+    "Upload-Offset",
+    "Upload-Metadata",
+    "Upload-Expires",
+    "Scan-Id",
+    "Link",
+)
 EXPOSED_HEADERS = (
     "Location",
     "Content-Disposition",
@@ -31,6 +52,7 @@ EXPOSED_HEADERS = (
     "Retry-After",
     "WWW-Authenticate",
     "X-Request-ID",
+    *TUS_ANSWER,
 )
 _HOST = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[^\s:\[\]/@]+)(?::\d*)?")
 
@@ -42,8 +64,8 @@ def add_cross_site_checks(app: FastAPI, settings: Settings) -> None:
         app.add_middleware(
             CORSMiddleware,
             allow_origins=origins,
-            allow_methods=("GET", "POST", "PUT", "DELETE"),
-            allow_headers=("Authorization", "Content-Type", "X-Request-ID"),
+            allow_methods=("GET", "HEAD", "POST", "PUT", "PATCH", "DELETE"),
+            allow_headers=("Authorization", "Content-Type", "X-Request-ID", *TUS_REQUEST),
             expose_headers=EXPOSED_HEADERS,
         )
     app.add_middleware(CrossSiteMiddleware, hosts=allowed_hosts(settings), origins=frozenset(origins))
