@@ -210,11 +210,13 @@ class Client:
         device_id: str | None = None,
         model: str | None = None,
         threshold: float | None = None,
+        idempotency_key: str | None = None,
     ) -> Document:
         """Compare scans with a map; returns `survey_id` and `job_id`."""
         about = _given(captured_at=captured_at, device_id=device_id, model=model, threshold=threshold)
         body = {**about, "scan_ids": list(scan_ids)}
-        return self._json("POST", f"/maps/{_quoted(map_id)}/surveys", json=body)
+        headers = _given(**{"Idempotency-Key": idempotency_key})
+        return self._json("POST", f"/maps/{_quoted(map_id)}/surveys", json=body, headers=headers)
 
     def surveys(self, map_id: str) -> list[Document]:
         """Return every survey of a map."""

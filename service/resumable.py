@@ -91,6 +91,10 @@ class Memory:
         if self._urls.pop(key, None) is not None:
             self._save()
 
+    def ended(self, key: str) -> None:
+        """Drop an upload that became a scan."""
+        self.forget(key)
+
     def _save(self) -> None:
         if self._path is not None:
             write_aside(self._path, json.dumps(self._urls, indent=1))
@@ -201,7 +205,7 @@ class _Sending:
                     self.memory.forget(self.key)
                 raise
             self._check(scan)
-            self.memory.forget(self.key)
+            self.memory.ended(self.key)
             return scan
 
     def _attempt(self) -> Document:

@@ -319,9 +319,9 @@ class _Piece:
         self._kept = time.monotonic()
 
     def add(self, chunk: bytes) -> bool:
-        """Gather a chunk; whether there is enough to write."""
+        """Gather a chunk; whether there is enough to write, or what there is has waited long enough."""
         self._waiting += chunk
-        return len(self._waiting) >= PIECE
+        return len(self._waiting) >= PIECE or time.monotonic() - self._kept > KEEP_S
 
     def write(self) -> None:
         """Write what was gathered, and from time to time have it on the disk for sure."""

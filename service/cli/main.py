@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from service.cli import backups, jobs, keys, maps, models, objects, scans, surveys, sweep, up, versions
+from service.cli import backups, jobs, keys, maps, models, objects, scans, surveys, sweep, up, versions, watch
 from service.cli.terminal import Terminal
 from service.client import DEFAULT_URL, ClientError
 from service.up.embedded_redis import LaunchFailed
@@ -40,7 +40,7 @@ def _commands() -> typer.Typer:
     commands.command()(sweep.sweep)
     commands.command()(backups.backup)
     commands.command()(backups.restore)
-    _add_group(commands, "scans", "Upload scans.", scans.add)
+    _add_group(commands, "scans", "Upload scans.", scans.add, watch.watch)
     _add_group(commands, "maps", "Reference maps.", maps.create, maps.list_, maps.show, maps.delete)
     of_versions = (versions.add, versions.list_, versions.show, versions.delete)
     _add_group(commands, "versions", "Versions of a map.", *of_versions)

@@ -5,10 +5,11 @@ Results go to stdout, as a table or, with `--json`, as JSON and nothing else. Pr
 
 from __future__ import annotations
 
+import contextlib
 import json
 import re
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -25,7 +26,7 @@ from rich.progress import (
 )
 
 from service.client import Client, ClientError, Document, JobFailed, OnProgress, Pose
-from service.resumable import default_memory
+from service.resumable import OnSent, default_memory
 from service.sidecars import SidecarError, read_pose_text, read_sidecar
 
 T = TypeVar("T")
@@ -114,12 +115,7 @@ class Terminal:
 
         Raises `ClientError`, also where the file cannot be read.
         """
-        with self._bar(_title(), BarColumn(), DownloadColumn()) as bar:
-            task = bar.add_task(path.name, total=None)
-
-            def on_sent(sent: int, size: int) -> None:
-                bar.update(task, completed=sent, total=size)
-
+        with self.sending(path.name) as on_sent:
             try:
                 said = read_sidecar(path) | {
                     name: value for name, value in about.items() if value is not None
@@ -133,6 +129,13 @@ class Terminal:
                 raise ClientError(str(error)) from error
             except OSError as error:
                 raise ClientError(f"{path}: the file cannot be read ({error.strerror or error})") from error
+
+    @contextlib.contextmanager
+    def sending(self, name: str) -> Iterator[OnSent]:
+        """Show a progress bar of a file that is sent; yields what is told how far it is."""
+        with self._bar(_title(), BarColumn(), DownloadColumn()) as bar:
+            task = bar.add_task(name, total=None)
+            yield lambda sent, size: bar.update(task, completed=sent, total=size)
 
     def waiting(self, seconds: float, why: str) -> None:
         """Say that the service does not answer, and when it is asked again; short waits are not worth a line."""
