@@ -28,6 +28,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "service.tracing": (),
     "service.permissions": (),
     "service.poses": (),
+    "service.bags": ("service.poses",),
     "service.resumable": (),
     "service.sidecars": ("service.poses",),
     "service.client": ("service.resumable",),
@@ -71,6 +72,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
         "service.up",
         "service.catalog",
         "service.client",
+        "service.bags",
         "service.watching",
         "service.resumable",
         "service.sidecars",
@@ -243,6 +245,7 @@ ONLY_IN = {
     "obstore": ("service.catalog",),
     "fastapi": ("service.api", "service.up"),
     "opentelemetry": ("service.tracing",),
+    "rosbags": ("service.bags",),
 }
 
 #: The files of the worker that know the service; the demo and the rest are in ROOMS.
