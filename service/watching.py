@@ -265,9 +265,13 @@ class Watcher:
         if time.monotonic() < not_before:
             return False
         map_id, scans = self._options.map_id or "", self._state.scans(visit)
-        about = {"device_id": self._options.device_id, "idempotency_key": key_of(map_id, visit, scans)}
         try:
-            answer = self._client.submit_survey(map_id, scans, **about)
+            answer = self._client.submit_survey(
+                map_id,
+                scans,
+                device_id=self._options.device_id,
+                idempotency_key=key_of(map_id, visit, scans),
+            )
         except (Unreachable, RequestRefused) as error:
             if isinstance(error, RequestRefused) and not _may_pass(error):
                 raise

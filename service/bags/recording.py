@@ -81,7 +81,9 @@ class Recording:
         self.skipped: dict[str, int] = {}  #: why clouds became no scan, and how many
         self._path = path
         self._reader = _open(path)
-        self._topics = {connection.topic: connection.msgtype for connection in self._reader.connections}
+        self._topics: dict[str, str] = {
+            connection.topic: connection.msgtype for connection in self._reader.connections
+        }
 
     def __enter__(self) -> Recording:
         return self
@@ -91,7 +93,7 @@ class Recording:
 
     def scans(self, options: BagOptions) -> Iterator[BagScan]:
         """Yield the scans in the order of the recording, each as soon as it is known to be one."""
-        topic = self._cloud_topic(options.topic)
+        topic: str = self._cloud_topic(options.topic)
         tree = self._transforms(topic, options)
         posed = self._posed(topic, tree, options)
         yield from (_each_stop if options.each == "stop" else _each_so_often)(posed, options)
@@ -143,7 +145,7 @@ class Recording:
         body = options.body_frame
         if body is None and not is_odometry:
             first = next(iter(self._messages(cloud_topic)), None)
-            body = first[2].header.frame_id if first else "sensor"
+            body = str(first[2].header.frame_id) if first else "sensor"
         dropped: set[str] = set()
         for _, _, message in self._messages(options.pose_topic or ""):
             pose = message.pose.pose if hasattr(message.pose, "pose") else message.pose

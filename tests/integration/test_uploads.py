@@ -7,6 +7,7 @@ import hashlib
 import json
 import os
 import random
+import re
 import socket
 import subprocess
 import sys
@@ -148,6 +149,24 @@ def test_a_connection_that_breaks_within_a_piece_with_a_checksum_leaves_nothing_
             old.sendall(head.encode() + data[:5_000_000])
             until(lambda: api.received() > 4_000_000)
         assert http.head(url, headers=TUS).headers["Upload-Offset"] == "0"
+
+
+def test_the_page_for_robots_uploads_with_curl(api: ApiProcess, scan: Path) -> None:
+    page = (ROOT / "docs/robots.md").read_text()
+    (script,) = re.findall(r"^```sh\n(TUS=.*?)^```", page, re.MULTILINE | re.DOTALL)
+    environment = {**os.environ, "SPICD_URL": api.url, "SPICD_KEY": "none"}
+    done = subprocess.run(
+        ["bash", "-euc", script],
+        cwd=scan.parent,
+        env=environment,
+        capture_output=True,
+        check=True,
+        timeout=60,
+    )
+    assert b"Scan-Id" in done.stdout or b"scan-id" in done.stdout
+    (document,) = httpx.get(f"{api.url}/scans").json()["scans"]
+    assert (document["sha256"], document["frame"]) == (sha256(scan), "map")
+    assert [row[3] for row in document["pose"]] == [2.5, 0, 0.35, 1]
 
 
 @needs_tools

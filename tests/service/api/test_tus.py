@@ -54,15 +54,15 @@ def code(answer: httpx.Response) -> str:
 
 
 def test_pieces_become_the_scan_that_one_body_would_have_become(client: TestClient) -> None:
-    said = {"filename": "hall.ply", "device_id": "robot-7", "captured_at": "2026-03-01T12:00:00Z"}
-    url = begin(client, **said, pose=POSE, frame="map")
+    when = "2026-03-01T12:00:00Z"
+    url = begin(client, filename="hall.ply", device_id="robot-7", captured_at=when, pose=POSE, frame="map")
     for start in range(0, len(SCAN), 1000):
         answer = send(client, url, start, SCAN[start : start + 1000])
         assert (answer.status_code, answer.headers["Tus-Resumable"]) == (204, "1.0.0")
         assert int(answer.headers["Upload-Offset"]) == min(start + 1000, len(SCAN)) == offset(client, url)
     scan = client.get(f"/scans/{answer.headers['Scan-Id']}").json()
     assert scan["sha256"] == hashlib.sha256(SCAN).hexdigest()
-    assert scan["captured_at"] == "2026-03-01T12:00:00Z"
+    assert scan["captured_at"] == when
     assert [scan[name] for name in ("filename", "device_id", "frame")] == ["hall.ply", "robot-7", "map"]
     for row, wanted in zip(scan["pose"], TURNED, strict=True):
         assert row == pytest.approx(wanted, abs=1e-6)
