@@ -100,15 +100,22 @@ _TAKES = documented(
     "disk_full",
     "unavailable",
 )
-_BODY = {
-    "requestBody": {
-        "required": False,
-        "content": {tus.PIECE_TYPE: {"schema": {"type": "string", "format": "binary"}}},
-    }
-}
+_NUMBER = {"type": "integer", "minimum": 0}
+_VERSION = tus.documented("Tus-Resumable", {"type": "string", "enum": [tus.VERSION]}, required=True)
+_METADATA = tus.documented("Upload-Metadata", {"type": "string", "examples": ["filename aGFsbC5wbHk="]})
+_CHECKSUM = tus.documented("Upload-Checksum", {"type": "string", "pattern": "^sha(1|256) [A-Za-z0-9+/]+=*$"})
+_LENGTH = tus.documented("Upload-Length", _NUMBER, required=True)
+_OFFSET = tus.documented("Upload-Offset", _NUMBER, required=True)
+_PIECE = {"content": {tus.PIECE_TYPE: {"schema": {"type": "string", "format": "binary"}}}}
 
 
-@router.options("/uploads", status_code=204, summary="Which parts of tus are spoken")
+def _takes(*headers: dict[str, Any], piece: bool | None = None) -> dict[str, Any]:
+    """Return what FastAPI cannot see of a request: its headers, and whether a piece is its body (None: it may be)."""
+    body = {} if piece is False else {"requestBody": {"required": piece is True, **_PIECE}}
+    return {"parameters": [_VERSION, *headers], **body}
+
+
+@router.options("/uploads", status_code=204, summary="Which parts of tus are spoken", response_class=Response)
 def describe_uploads(services: Provided) -> Response:
     """Versions, extensions, checksums and the largest file, as headers (tus 1.0.0, OPTIONS)."""
     headers = {
@@ -124,8 +131,9 @@ def describe_uploads(services: Provided) -> Response:
     "/uploads",
     status_code=201,
     summary="Begin a resumable upload",
+    response_class=Response,
     responses=_TAKES | documented("too_many_uploads"),
-    openapi_extra=_BODY,
+    openapi_extra=_takes(_LENGTH, _METADATA, _CHECKSUM),
 )
 async def create_upload(request: HttpRequest, services: Provided, receiver: Received) -> Response:
     """Tell the size of a PLY or PCD in `Upload-Length`; its pieces go to the `Location` of the answer by PATCH.
@@ -156,7 +164,11 @@ async def create_upload(request: HttpRequest, services: Provided, receiver: Rece
 
 
 @router.head(
-    "/uploads/{upload_id}", summary="How far an upload is", responses=_ONE | documented("scan_unreadable")
+    "/uploads/{upload_id}",
+    summary="How far an upload is",
+    response_class=Response,
+    responses=_ONE | documented("scan_unreadable", "bad_request", "disk_full"),
+    openapi_extra=_takes(piece=False),
 )
 async def upload_offset(
     request: HttpRequest, services: Provided, receiver: Received, upload_id: UploadId
@@ -202,8 +214,9 @@ def get_upload(request: HttpRequest, receiver: Received, upload_id: UploadId) ->
     "/uploads/{upload_id}",
     status_code=204,
     summary="Send a piece of an upload",
+    response_class=Response,
     responses=_ONE | _TAKES | documented("offset_mismatch"),
-    openapi_extra=_BODY,
+    openapi_extra=_takes(_OFFSET, _CHECKSUM, piece=True),
 )
 async def send_piece(
     request: HttpRequest, services: Provided, receiver: Received, upload_id: UploadId
@@ -233,8 +246,15 @@ async def send_piece(
     "/uploads/{upload_id}",
     status_code=204,
     summary="PATCH or DELETE, for who can send no other method",
+    response_class=Response,
     responses=_ONE | _TAKES | documented("offset_mismatch", "method_not_allowed"),
-    openapi_extra=_BODY,
+    openapi_extra=_takes(
+        tus.documented(
+            "X-HTTP-Method-Override", {"type": "string", "enum": ["PATCH", "DELETE"]}, required=True
+        ),
+        tus.documented("Upload-Offset", _NUMBER),
+        _CHECKSUM,
+    ),
 )
 async def override_method(
     request: HttpRequest, services: Provided, receiver: Received, upload_id: UploadId
@@ -252,7 +272,14 @@ async def override_method(
     )
 
 
-@router.delete("/uploads/{upload_id}", status_code=204, summary="Give an upload up", responses=_ONE)
+@router.delete(
+    "/uploads/{upload_id}",
+    status_code=204,
+    summary="Give an upload up",
+    response_class=Response,
+    responses=_ONE,
+    openapi_extra=_takes(piece=False),
+)
 async def delete_upload(request: HttpRequest, receiver: Received, upload_id: UploadId) -> Response:
     """Its bytes go; the scan that it became, if it did, stays."""
     tus.require_version(request.headers)

@@ -113,15 +113,22 @@ class Uploads:
         removed = 0
         for folder in self._folder.iterdir() if self._folder.is_dir() else ():
             with contextlib.suppress(OSError, NotFound, UploadBusy):
-                record = _read(folder)
-                if record is None:
-                    gone = time.time() - folder.stat().st_mtime > _YOUNG_S
-                else:
-                    gone = record.expires < now()
-                if gone and (record is None or _is_idle(folder, record.upload_id)):
-                    shutil.rmtree(folder, ignore_errors=True)
-                    removed += 1
+                removed += self._removed(folder)
         return removed
+
+    def _removed(self, folder: Path) -> bool:
+        """Remove the folder of an upload that has expired, or that was never more than begun; whether it was."""
+        record = _read(folder)
+        if record is None:
+            is_old = time.time() - folder.stat().st_mtime > _YOUNG_S
+            if is_old:
+                shutil.rmtree(folder, ignore_errors=True)
+            return is_old
+        if record.expires >= now():
+            return False
+        with _locked(folder, record.upload_id):
+            shutil.rmtree(folder, ignore_errors=True)
+        return True
 
     def _path(self, upload_id: str) -> Path:
         if not _ID.fullmatch(upload_id):
@@ -237,11 +244,6 @@ def _lock(descriptor: int, upload_id: str) -> None:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         raise UploadBusy(f"another request writes to upload {upload_id!r}; try again shortly") from None
-
-
-def _is_idle(folder: Path, upload_id: str) -> bool:
-    with _locked(folder, upload_id):
-        return True
 
 
 def _read(folder: Path) -> UploadRecord | None:

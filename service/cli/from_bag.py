@@ -58,7 +58,7 @@ def from_bag(
       spicd scans from-bag patrol.mcap --to /data/visits/monday       files for `spicd scans watch`
       spicd scans from-bag patrol/ --topic /lidar/points --each time --every 2 --upload
 
-    Needs the package rosbags: pip install 'spicd[ros]'.
+    Needs the package rosbags: pip install 'spicd\\[ros]'.
     """
     if (to is None) == (not upload):
         raise ClientError("say where the scans go: --to FOLDER, or --upload")

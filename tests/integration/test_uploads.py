@@ -156,7 +156,7 @@ def test_the_page_for_robots_uploads_with_curl(api: ApiProcess, scan: Path) -> N
     (script,) = re.findall(r"^```sh\n(TUS=.*?)^```", page, re.MULTILINE | re.DOTALL)
     environment = {**os.environ, "SPICD_URL": api.url, "SPICD_KEY": "none"}
     done = subprocess.run(
-        ["bash", "-euc", script],
+        ["/bin/bash", "-euc", script],
         cwd=scan.parent,
         env=environment,
         capture_output=True,

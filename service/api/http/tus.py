@@ -114,6 +114,11 @@ def told(record: UploadRecord, root_path: str = "") -> dict[str, str]:
     return headers
 
 
+def documented(name: str, schema: dict[str, Any], *, required: bool = False) -> dict[str, Any]:
+    """Return a header of a request as OpenAPI has it."""
+    return {"name": name, "in": "header", "required": required, "schema": schema}
+
+
 def _whole_number(headers: Mapping[str, str], name: str) -> int:
     value = headers[name]
     if not (value.isascii() and value.isdigit() and len(value) <= 18):

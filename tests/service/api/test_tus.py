@@ -14,7 +14,7 @@ from fastapi.testclient import TestClient
 
 from service.catalog.tables import now
 from service.catalog.uploads import Uploads
-from service.errors import DatabaseUnavailable
+from service.errors import DatabaseUnavailable, DiskFull
 from service.settings import Settings
 from tests.support.samples import RememberingQueue, catalog_of, ply, running
 
@@ -322,6 +322,23 @@ def test_a_disk_without_room_for_the_file_takes_none_of_it(tmp_path: Path, setti
     with running(full, RememberingQueue()) as client:
         answer = client.post("/uploads", headers={**TUS, "Upload-Length": "9"})
         assert (answer.status_code, code(answer)) == (507, "disk_full")
+
+
+def test_a_disk_that_fills_while_pieces_come_keeps_those_before(
+    client: TestClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(_self: object, coming: int = 0) -> None:
+        raise DiskFull("no room")
+
+    url = begin(client)
+    send(client, url, 0, SCAN[:500])
+    with monkeypatch.context() as patch:
+        patch.setattr("service.catalog.disk.Disk.require", full)
+        answer = send(client, url, 500, SCAN[500:])
+        assert (answer.status_code, code(answer)) == (507, "disk_full")
+        assert offset(client, url) == 500
+    scan_id = send(client, url, 500, SCAN[500:]).headers["Scan-Id"]
+    assert client.get(f"/scans/{scan_id}").json()["sha256"] == hashlib.sha256(SCAN).hexdigest()
 
 
 def test_the_pose_forms_say_the_same(client: TestClient) -> None:
