@@ -144,6 +144,8 @@ class Client:
             raise RequestRefused(refused.problem, refused.status) from refused
         except resumable.UploadStalled as stalled:
             raise Unreachable(str(stalled)) from stalled
+        except resumable.UploadError as error:
+            raise ClientError(str(error)) from error
 
     # maps
 

@@ -2,6 +2,7 @@
 
 UploadError              base; `str()` is one sentence
 ├── UploadRefused        the service said no; `problem` is its RFC 9457 document, `status` its HTTP status
+├── FileChanged          somebody wrote to the file while it was sent
 └── UploadStalled        nothing went on for longer than `Persistence.idle_s`; it can be gone on with later
 
 What was sent is on the service's disk, and the next connection, or the next process, goes on there: `Memory` keeps the
@@ -46,6 +47,10 @@ class UploadRefused(UploadError):
     def __init__(self, problem: Document, status: int) -> None:
         super().__init__(_sentence(problem))
         self.problem, self.status = problem, status
+
+
+class FileChanged(UploadError):
+    """What was sent is neither what the file was nor what it is."""
 
 
 class UploadStalled(UploadError):
@@ -178,7 +183,7 @@ class _Sending:
 
     def __post_init__(self) -> None:
         status = self.path.stat()
-        self.size = status.st_size
+        self.size, self.changed = status.st_size, status.st_mtime_ns
         self.piece = self.persistence.first_piece
         self.metadata = _metadata(self.said)
         about = [
@@ -270,7 +275,7 @@ class _Sending:
                 sent += len(data)
                 self.on_sent(sent, self.size)
         if sent < end:
-            raise OSError(f"{self.path} has become shorter while it was sent")
+            raise FileChanged(f"{self.path.name} has become shorter while it was sent")
 
     def _wait(self, error: Exception) -> None:
         """Wait before the next attempt: longer after each, with jitter, and as long as the service asks."""
@@ -289,14 +294,20 @@ class _Sending:
         time.sleep(seconds)
 
     def _check(self, scan: Document) -> None:
-        """Hold what arrived against the file. Raises UploadRefused."""
+        """Hold what arrived against the file. Raises FileChanged, UploadRefused."""
+        status = self.path.stat()
+        if (status.st_size, status.st_mtime_ns) != (self.size, self.changed):
+            self.memory.forget(self.key)
+            raise FileChanged(
+                f"{self.path.name} was written to while it was sent; send it again once it is whole"
+            )
         with self.path.open("rb") as file:
             digest = hashlib.file_digest(file, "sha256").hexdigest()
         if scan.get("sha256") != digest:
             self.memory.forget(self.key)
             detail = (
-                f"the service has the SHA-256 {scan.get('sha256')} of {self.path.name}, which has {digest}; the file "
-                f"changed while it was sent, delete scan {scan.get('scan_id')} and send it again"
+                f"the service has the SHA-256 {scan.get('sha256')} of {self.path.name}, which has {digest}; "
+                f"delete scan {scan.get('scan_id')} and send it again"
             )
             raise UploadRefused({"title": "Another file arrived", "detail": detail}, 0)
 

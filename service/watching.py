@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any, Literal, Self
 
 from service.client import Client, ClientError, Document, RequestRefused, Unreachable
-from service.resumable import Memory, OnSent, OnWait, Persistence, write_aside
+from service.resumable import FileChanged, Memory, OnSent, OnWait, Persistence, write_aside
 from service.sidecars import SidecarError, read_sidecar, sidecar_of
 
 DONE, REFUSED, STATE = "done", "refused", ".spicd"
@@ -192,8 +192,14 @@ class Watcher:
             if refused.status in _NO_FAULT_OF_THE_FILE:
                 raise
             self._refuse(path, refused.problem)
+        except ClientError as error:
+            if not isinstance(error.__cause__, FileChanged):
+                raise
+            self._seen.pop(path, None)  # it was not whole yet
         except FileNotFoundError:
             return  # taken away by who put it there
+        except OSError as error:
+            self._refuse(path, {"title": "The file cannot be read", "detail": error.strerror or str(error)})
         else:
             self._keep(path, scan)
 
