@@ -18,6 +18,8 @@ from urllib.parse import quote
 
 import httpx
 
+from service import resumable
+
 DEFAULT_URL = "http://127.0.0.1:8000"
 PIECE = 1 << 20  #: bytes sent at a time
 
@@ -97,6 +99,7 @@ class Client:
         device_id: str | None = None,
         captured_at: str | None = None,
         pose: Pose | None = None,
+        frame: str | None = None,
         on_sent: OnSent | None = None,
     ) -> Document:
         """Send one PLY or PCD, streamed from disk; `captured_at` is RFC 3339, `pose` map_from_sensor in metres."""
@@ -105,11 +108,44 @@ class Client:
             device_id=device_id,
             captured_at=captured_at,
             pose=None if pose is None else json.dumps([list(row) for row in pose]),
+            frame=frame,
         )
         size = source.stat().st_size if isinstance(source, Path) else len(source)
         headers = {"Content-Type": "application/octet-stream", "Content-Length": str(size)}
         content = _pieces(source, size, on_sent)
         return self._json("POST", "/scans", params=query, headers=headers, content=content)
+
+    def upload_scan_resumable(
+        self,
+        path: Path,
+        *,
+        memory: resumable.Memory | None = None,
+        persistence: resumable.Persistence | None = None,
+        on_sent: OnSent | None = None,
+        on_wait: resumable.OnWait | None = None,
+        **said: Any,
+    ) -> Document:
+        """Send one PLY or PCD in as many pieces as it takes, and go on where an earlier attempt ended.
+
+        `said` are `filename device_id captured_at pose frame`. Raises `RequestRefused`, and `Unreachable` where nothing
+        goes on for longer than `persistence` says.
+        """
+        try:
+            return resumable.upload(
+                self._http,
+                path,
+                said=said,
+                memory=memory,
+                persistence=persistence,
+                on_sent=on_sent,
+                on_wait=on_wait,
+            )
+        except resumable.UploadRefused as refused:
+            raise RequestRefused(refused.problem, refused.status) from refused
+        except resumable.UploadStalled as stalled:
+            raise Unreachable(str(stalled)) from stalled
+        except resumable.UploadError as error:
+            raise ClientError(str(error)) from error
 
     # maps
 
@@ -176,11 +212,13 @@ class Client:
         device_id: str | None = None,
         model: str | None = None,
         threshold: float | None = None,
+        idempotency_key: str | None = None,
     ) -> Document:
         """Compare scans with a map; returns `survey_id` and `job_id`."""
         about = _given(captured_at=captured_at, device_id=device_id, model=model, threshold=threshold)
         body = {**about, "scan_ids": list(scan_ids)}
-        return self._json("POST", f"/maps/{_quoted(map_id)}/surveys", json=body)
+        headers = _given(**{"Idempotency-Key": idempotency_key})
+        return self._json("POST", f"/maps/{_quoted(map_id)}/surveys", json=body, headers=headers)
 
     def surveys(self, map_id: str) -> list[Document]:
         """Return every survey of a map."""

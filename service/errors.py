@@ -19,6 +19,12 @@ ServiceError
 ├── WrongEncoding        wrong_encoding       a body in a content coding other than gzip
 ├── WrongDigest          wrong_digest         a body that is not what its digest says
 ├── BrokenRequest        broken_request       headers or a coding that cannot be read, a part of a body
+├── OffsetMismatch       offset_mismatch      a piece of an upload that begins where none is wanted
+├── ChecksumMismatch     checksum_mismatch    a piece of an upload that is not what was sent
+├── UploadBusy           upload_busy          another request writes to the upload
+├── TooManyUploads       too_many_uploads     as many uploads are begun as may be
+├── TusVersion           tus_version          a request of another version of the protocol
+├── TusMalformed         tus_malformed        a header of the protocol that is missing or cannot be read
 ├── DiskFull             disk_full            less space than the reserve is left, or none
 ├── QueueFull            queue_full           as many jobs wait as may
 ├── Unauthorized         unauthorized         no API key, or one that is not known
@@ -118,6 +124,32 @@ class WrongDigest(ServiceError):
 
 class BrokenRequest(ServiceError):
     code = "broken_request"
+
+
+class OffsetMismatch(ServiceError):
+    code = "offset_mismatch"
+
+
+class ChecksumMismatch(ServiceError):
+    code = "checksum_mismatch"
+
+
+class UploadBusy(ServiceError):
+    code = "upload_busy"
+    retry_after_s = 2  #: seconds that the API asks a client to wait
+
+
+class TooManyUploads(ServiceError):
+    code = "too_many_uploads"
+    retry_after_s = 60  #: seconds that the API asks a client to wait
+
+
+class TusVersion(ServiceError):
+    code = "tus_version"
+
+
+class TusMalformed(ServiceError):
+    code = "tus_malformed"
 
 
 class DiskFull(ServiceError):

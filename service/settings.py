@@ -65,6 +65,9 @@ class Settings(BaseSettings):
     inference_workers: int = Field(1, ge=0, description="worker processes of the inference queue")
     max_upload_bytes: int = Field(2 * 1024**3, gt=0, description="largest body of one request")
     upload_timeout_s: int = Field(14_400, gt=0, description="longest time of the body of one request")
+    keep_uploads_hours: float = Field(
+        24, gt=0, description="hours that a resumable upload (`/uploads`) waits for its next bytes"
+    )
     shutdown_grace_s: int = Field(
         2, ge=0, description="that requests have to end, uploads above all, once the service is told to stop"
     )

@@ -13,8 +13,8 @@ from packaging.utils import canonicalize_name
 
 from tests.test_imports import ROOT, read_imports, within
 
-#: Imported only where a collector of traces is named: the extra `otel`.
-OPTIONAL = {"opentelemetry"}
+#: Imported only where a collector of traces is named (the extra `otel`), and where a recording is read (`ros`).
+OPTIONAL = {"opentelemetry", "rosbags"}
 #: Imported though another package is required, which hands them on as its own.
 HANDED_ON = {
     "anyio": "fastapi",
@@ -67,7 +67,7 @@ def test_the_worker_and_evaluate_extras_add_what_only_the_worker_imports() -> No
 
 def test_every_requirement_is_pinned_to_a_version_that_it_admits() -> None:
     pinned = pins()
-    wanted = requirements("worker", "evaluate", "otel", "dev")
+    wanted = requirements("worker", "evaluate", "otel", "ros", "dev")
     assert {name for name, needed in wanted.items() if not needed.specifier.contains(pinned[name])} == set()
 
 

@@ -27,6 +27,7 @@ from service.api import (
     scans,
     surveys,
     tiles,
+    tus,
     versions,
 )
 from service.api.housekeeping import housekeeping
@@ -48,6 +49,7 @@ from service.api.http.representations import RepresentationMiddleware, add_condi
 from service.api.http.requests import RequestLog
 from service.api.http.security_headers import SecurityHeadersMiddleware
 from service.api.http.submission import Ticker
+from service.api.http.tus import TusHeaders
 from service.api.http.uploads import sweep
 from service.catalog.catalog import open_catalog
 from service.catalog.patience import REQUESTS
@@ -140,12 +142,14 @@ def create_app(settings: Settings, *, queue: Queue | None = None) -> FastAPI:
     app.add_middleware(MethodsMiddleware, routes=app.router.routes)
     add_cross_site_checks(app, settings)
     app.add_middleware(MetricsMiddleware, metrics=app.state.metrics)
+    app.add_middleware(TusHeaders)
     problems.add_handlers(app)
     idempotency.add_handler(app)
     add_pages(app)
     for part in (
         landing,
         scans,
+        tus,
         maps,
         versions,
         surveys,
@@ -181,6 +185,7 @@ def _lifespan(settings: Settings, queue: Queue | None) -> Any:
             writes=Lane(),
             uploads=Lane(turn_s=UPLOAD_TURN_S),
         )
+        app.state.receiver = tus.Receiver(settings)
         app.state.monitor = HealthMonitor(health.parts(app.state.services))
         await run_in_threadpool(app.state.monitor.start)
         ticker = Ticker(dispatcher)
@@ -205,8 +210,9 @@ async def _go_on_sweeping(settings: Settings) -> None:
 
 
 def _sweep(settings: Settings) -> None:
-    """Remove what uploads of killed processes left."""
+    """Remove what uploads of killed processes left, and resumable ones that have expired."""
     sweep(settings.data_dir / INCOMING, upload_timeout_s=settings.upload_timeout_s)
+    tus.Receiver(settings).uploads.sweep()
 
 
 def _version() -> str:

@@ -13,11 +13,12 @@ from service.api.http import bodies
 from service.api.http.bodies import Body
 from service.api.http.dependencies import Provided
 from service.api.http.documents import Document, Link, Request, checked, link
-from service.api.http.fields import DeviceId, Id, Instant, Pose, Text
+from service.api.http.fields import DeviceId, Frame, Id, Instant, Pose, Text
 from service.api.http.idempotency import KEYED, Keyed, answered
 from service.api.http.paging import PageRequest, list_links
 from service.api.http.problems import BODY, LISTED, NAMED, documented
 from service.api.http.submission import delete, lane
+from service.api.http.uploads import Upload
 from service.catalog.catalog import Catalog
 from service.catalog.idempotency import ANY_TIMES, Answer, Once
 from service.catalog.records import ScanRecord
@@ -35,11 +36,25 @@ class ScanQuery(Request):
     ] = None
     captured_at: Annotated[Instant | None, Field(description="RFC 3339")] = None
     device_id: DeviceId | None = None
-    pose: Annotated[str | None, Field(description="JSON: 4x4 row-major, map_from_sensor")] = None
+    pose: Annotated[
+        str | None,
+        Field(
+            description="map_from_sensor: 4x4 rows as JSON, or `x y z qx qy qz qw` (metres, unit quaternion)",
+            examples=["2.5 0 0.35 0 0 0 1"],
+        ),
+    ] = None
+    frame: Annotated[
+        Frame | None,
+        Field(description="that the pose leads to, such as `map` or `odom` (REP 105); kept and told"),
+    ] = None
 
 
 Start = Annotated[
-    Pose | None, Field(description="4x4 row-major, map_from_sensor; a start for the registration")
+    Pose | None,
+    Field(
+        description="map_from_sensor, a start for the registration: 4x4 row-major, or x y z qx qy qz qw "
+        "(metres, unit quaternion)"
+    ),
 ]
 
 
@@ -134,21 +149,32 @@ async def delete_scan(services: Provided, scan_id: Annotated[Id, Path()]) -> Non
     await delete(services, services.catalog.scans.delete, scan_id)
 
 
-def _keep(
-    catalog: Catalog, body: Body, wanted: ScanRequest, once: Once = ANY_TIMES
+def keep_scan(
+    catalog: Catalog, upload: Upload, wanted: ScanRequest, once: Once = ANY_TIMES
 ) -> tuple[ScanRecord, bool]:
-    """Keep one scan. The answer is kept after it: cut off in between, the same bytes are the same scan."""
-    once.look()
-    if len(body.uploads) != 1:
-        raise BadRequest(f"{len(body.uploads)} files in the form; send one, in the field 'file'")
-    upload = body.uploads[0]
+    """Make a file that arrived whole a scan, or find that it is one; says whether it is new.
+
+    The answer is kept after it: cut off in between, the same bytes are the same scan.
+    """
     record, is_new = catalog.scans.add(
         **{**asdict(upload), "filename": wanted.filename or upload.filename},
         device_id=wanted.device_id,
         captured_at=wanted.captured_at,
         pose=wanted.pose,
+        frame=wanted.frame,
     )
     if not is_new:
-        record = catalog.scans.correct(record.scan_id, captured_at=wanted.captured_at, pose=wanted.pose)
+        record = catalog.scans.correct(
+            record.scan_id, captured_at=wanted.captured_at, pose=wanted.pose, frame=wanted.frame
+        )
     once.note(record, is_new)
     return record, is_new
+
+
+def _keep(
+    catalog: Catalog, body: Body, wanted: ScanRequest, once: Once = ANY_TIMES
+) -> tuple[ScanRecord, bool]:
+    once.look()
+    if len(body.uploads) != 1:
+        raise BadRequest(f"{len(body.uploads)} files in the form; send one, in the field 'file'")
+    return keep_scan(catalog, body.uploads[0], wanted, once)

@@ -139,7 +139,12 @@ class ScanRecord(Record):
     sha256: str
     device_id: str | None
     captured_at: Utc | None
-    pose: Matrix | None = Field(description="map_from_sensor as it was given, row-major")
+    pose: Matrix | None = Field(
+        description="map_from_sensor: from the sensor's axes, metres, to `frame`; row-major, whichever way it was given"
+    )
+    frame: str | None = Field(
+        None, description="name of the frame that the pose leads to (REP 105)", examples=["map"]
+    )
     key: str = Field(exclude=True)  #: of the blob; clients do not see it
     warnings: Warnings = Field(
         (), description="what is odd about it: of its clock at once, of its points once a job has read it"

@@ -74,6 +74,7 @@ class Scans:
         device_id: str | None = None,
         captured_at: datetime | None = None,
         pose: Matrix | None = None,
+        frame: str | None = None,
     ) -> tuple[ScanRecord, bool]:
         """Keep the file at `path` (moved when it can be) and say whether it is new.
 
@@ -96,6 +97,7 @@ class Scans:
             device_id=device_id,
             captured_at=captured_at,
             pose=None if pose is None else [list(line) for line in pose],
+            frame=frame,
             key=key,
             warnings=as_kept(clock_warnings(captured_at, received=received)),
             created=received,
@@ -103,7 +105,12 @@ class Scans:
         return self._insert(row)
 
     def correct(
-        self, scan_id: str, *, captured_at: datetime | None = None, pose: Matrix | None = None
+        self,
+        scan_id: str,
+        *,
+        captured_at: datetime | None = None,
+        pose: Matrix | None = None,
+        frame: str | None = None,
     ) -> ScanRecord:
         """Change what is said of a scan; what is None stays. Raises NotFound.
 
@@ -116,6 +123,7 @@ class Scans:
                 row.captured_at = captured_at
                 row.warnings = as_kept((*clock_warnings(captured_at, received=tables.now()), *others))
             row.pose = row.pose if pose is None else [list(line) for line in pose]
+            row.frame = frame or known.frame
             session.flush()
             return ScanRecord.of_row(row)
 

@@ -96,6 +96,7 @@ class Scan(Base):
     device_id: Mapped[str | None]
     captured_at: Mapped[datetime | None]
     pose: Mapped[list[list[float]] | None]
+    frame: Mapped[str | None]
     key: Mapped[str]
     warnings: Mapped[list[dict[str, Any]] | None]
     created: Mapped[datetime]

@@ -8,7 +8,21 @@ from typing import Annotated
 
 import typer
 
-from service.cli import backups, jobs, keys, maps, models, objects, scans, surveys, sweep, up, versions
+from service.cli import (
+    backups,
+    from_bag,
+    jobs,
+    keys,
+    maps,
+    models,
+    objects,
+    scans,
+    surveys,
+    sweep,
+    up,
+    versions,
+    watch,
+)
 from service.cli.terminal import Terminal
 from service.client import DEFAULT_URL, ClientError
 from service.up.embedded_redis import LaunchFailed
@@ -40,7 +54,7 @@ def _commands() -> typer.Typer:
     commands.command()(sweep.sweep)
     commands.command()(backups.backup)
     commands.command()(backups.restore)
-    _add_group(commands, "scans", "Upload scans.", scans.add)
+    _add_group(commands, "scans", "Upload scans.", scans.add, watch.watch, from_bag.from_bag)
     _add_group(commands, "maps", "Reference maps.", maps.create, maps.list_, maps.show, maps.delete)
     of_versions = (versions.add, versions.list_, versions.show, versions.delete)
     _add_group(commands, "versions", "Versions of a map.", *of_versions)
@@ -60,7 +74,7 @@ def _add_group(commands: typer.Typer, name: str, help_text: str, *group: Callabl
     """Add a group of commands to the command line, each under the name of its function."""
     added = typer.Typer(no_args_is_help=True, help=help_text)
     for command in group:
-        added.command(command.__name__.rstrip("_"))(command)
+        added.command(command.__name__.rstrip("_").replace("_", "-"))(command)
     commands.add_typer(added, name=name)
     return added
 

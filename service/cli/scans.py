@@ -9,7 +9,7 @@ import typer
 from rich.table import Table
 
 from service.cli.tables import columns, warnings
-from service.cli.terminal import Captured, Device, Terminal, read_pose
+from service.cli.terminal import Captured, Device, Frame, Terminal, read_pose
 from service.client import ClientError, Document
 
 
@@ -19,15 +19,20 @@ def add(
     device_id: Device = None,
     captured_at: Captured = None,
     pose: Annotated[
-        Path | None, typer.Option(help="File with a 4x4 map_from_sensor pose, JSON or sixteen numbers.")
+        str | None,
+        typer.Option(
+            help="map_from_sensor: 'x y z qx qy qz qw' (metres, unit quaternion), 16 numbers row by row, or a file "
+            "with either; without it the sidecar of the scan counts, hall.pose.txt or hall.pose.json of hall.ply."
+        ),
     ] = None,
+    frame: Frame = None,
 ) -> None:
-    """Upload scans; the same bytes from the same device are one scan."""
+    """Upload scans; the same bytes from the same device are one scan, and an upload that broke goes on."""
     terminal: Terminal = ctx.obj
     if pose is not None and len(files) > 1:
         raise ClientError("one pose belongs to one scan; add the files one at a time")
     start = read_pose(pose) if pose else None
-    about = {"device_id": device_id, "captured_at": captured_at, "pose": start}
+    about = {"device_id": device_id, "captured_at": captured_at, "pose": start, "frame": frame}
     terminal.ask(lambda client: [terminal.upload(client, file, **about) for file in files], _table)
 
 

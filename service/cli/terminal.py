@@ -5,10 +5,11 @@ Results go to stdout, as a table or, with `--json`, as JSON and nothing else. Pr
 
 from __future__ import annotations
 
+import contextlib
 import json
 import re
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -25,15 +26,22 @@ from rich.progress import (
 )
 
 from service.client import Client, ClientError, Document, JobFailed, OnProgress, Pose
+from service.resumable import OnSent, default_memory
+from service.sidecars import SidecarError, read_pose_text, read_sidecar
 
 T = TypeVar("T")
 
 Scans = Annotated[list[str], typer.Argument(help="Files, which are uploaded, or ids of scans.")]
 Captured = Annotated[str | None, typer.Option("--captured-at", help="RFC 3339, with its zone.")]
 Device = Annotated[str | None, typer.Option("--device-id", help="Which robot or scanner.")]
+Frame = Annotated[
+    str | None, typer.Option("--frame", help="Name of the frame that the poses lead to, such as map or odom.")
+]
 Model = Annotated[str | None, typer.Option(help="`name/version`; `spicd models` lists them.")]
 Wait = Annotated[bool, typer.Option("--wait", help="Follow the job to its end.")]
 
+NOTED_WAIT_S = 5.0
+RESUMABLE_FROM = 256 << 10  #: bytes; a smaller file goes in one request, which is as soon sent again
 PIPE_WIDTH = 160  #: characters; where nobody says how wide the place is that stdout goes to
 _ID = re.compile(r"[A-Za-z0-9_-]{1,64}")
 
@@ -103,15 +111,36 @@ class Terminal:
         self.err.print(text, style="bold red", highlight=False, soft_wrap=True)
 
     def upload(self, client: Client, path: Path, **about: Any) -> Document:
-        """Send one file under a progress bar. Raises `ClientError`, also where the file cannot be read."""
-        with self._bar(_title(), BarColumn(), DownloadColumn()) as bar:
-            task = bar.add_task(path.name, total=None)
+        """Send one file under a progress bar, resumed where it was broken off; what its sidecar says counts as said.
+
+        Raises `ClientError`, also where the file cannot be read.
+        """
+        with self.sending(path.name) as on_sent:
             try:
-                return client.upload_scan(
-                    path, on_sent=lambda sent, size: bar.update(task, completed=sent, total=size), **about
+                said = read_sidecar(path) | {
+                    name: value for name, value in about.items() if value is not None
+                }
+                if path.stat().st_size < RESUMABLE_FROM:
+                    return client.upload_scan(path, on_sent=on_sent, **said)
+                return client.upload_scan_resumable(
+                    path, memory=default_memory(), on_sent=on_sent, on_wait=self.waiting, **said
                 )
+            except SidecarError as error:
+                raise ClientError(str(error)) from error
             except OSError as error:
-                raise ClientError(f"{path}: the file cannot be read ({error.strerror})") from error
+                raise ClientError(f"{path}: the file cannot be read ({error.strerror or error})") from error
+
+    @contextlib.contextmanager
+    def sending(self, name: str) -> Iterator[OnSent]:
+        """Show a progress bar of a file that is sent; yields what is told how far it is."""
+        with self._bar(_title(), BarColumn(), DownloadColumn()) as bar:
+            task = bar.add_task(name, total=None)
+            yield lambda sent, size: bar.update(task, completed=sent, total=size)
+
+    def waiting(self, seconds: float, why: str) -> None:
+        """Say that the service does not answer, and when it is asked again; short waits are not worth a line."""
+        if seconds >= NOTED_WAIT_S:
+            self.note(f"{why}; next attempt in {seconds:.0f} s")
 
     def scan_ids(self, client: Client, names: Sequence[str], **about: Any) -> list[str]:
         """Return ids of the named scans: files are uploaded first, other names are taken as ids."""
@@ -163,17 +192,17 @@ def _advance(bar: Progress) -> OnProgress:
     return advance
 
 
-def read_pose(path: Path) -> Pose:
-    """Read a pose from a file: a JSON 4x4, or sixteen numbers with spaces, row by row. Raises `ClientError`."""
+def read_pose(given: str) -> Pose:
+    """Read a pose: a file, or the numbers themselves. Raises `ClientError`.
+
+    Either has a 4x4 as JSON or as sixteen numbers row by row, or `x y z qx qy qz qw`.
+    """
+    path = Path(given)
     try:
-        text = path.read_text()
-        if text.lstrip().startswith("["):
-            rows = [[float(number) for number in row] for row in json.loads(text)]
-        else:
-            numbers = [float(word) for word in text.replace(",", " ").split()]
-            rows = [numbers[start : start + 4] for start in range(0, len(numbers), 4)]
+        is_file = path.is_file()
+    except OSError:  # too long for a name
+        is_file = False
+    try:
+        return read_pose_text(path.read_text() if is_file else given)
     except (OSError, ValueError, TypeError) as error:
-        raise ClientError(f"{path}: the pose cannot be read: {error}") from error
-    if len(rows) != 4 or any(len(row) != 4 for row in rows):
-        raise ClientError(f"{path}: a pose is four rows of four numbers, row-major, metres")
-    return rows
+        raise ClientError(f"{given[:100]}: the pose cannot be read: {error}") from error

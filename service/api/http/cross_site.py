@@ -42,6 +42,7 @@ EXPOSED_HEADERS = (
     "OGC-NumberReturned",
     "Repr-Digest",
     "Retry-After",
+    "Scan-Id",
     "Tus-Checksum-Algorithm",
     "Tus-Extension",
     "Tus-Max-Size",
@@ -75,6 +76,7 @@ ALLOWED_HEADERS = (
     "Upload-Offset",
     "Want-Content-Digest",
     "Want-Repr-Digest",
+    "X-HTTP-Method-Override",
     "X-Request-ID",
 )
 _HOST = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[^\s:\[\]/@]+)(?::\d*)?")

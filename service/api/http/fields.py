@@ -12,6 +12,7 @@ from pydantic import AfterValidator, BeforeValidator, Field, WithJsonSchema
 
 from service.api.http.json_text import read_json
 from service.catalog.records import Matrix
+from service.poses import FRAME, numbers_of, rows_of
 
 RIGID_TOLERANCE = 1e-3  #: of R Rᵀ against the identity; poses written with four decimals pass
 MAX_LISTED = 1000  #: names in one list of a request
@@ -52,6 +53,18 @@ def from_text(value: Any) -> Any:
         raise ValueError(f"this is not JSON: {error}") from error
 
 
+def pose_from_text(value: Any) -> Any:
+    """Read a pose: 4x4 rows, 16 numbers, or `x y z qx qy qz qw`, as JSON or with blanks between. Raises ValueError."""
+    if isinstance(value, str) and not value.lstrip().startswith(("[", "{")):
+        try:
+            value = numbers_of(value)
+        except ValueError as error:
+            raise ValueError(f"this is not JSON, nor numbers with blanks between: {error}") from error
+        if not value:
+            raise ValueError("the pose is empty; leave it out, or give `x y z qx qy qz qw`")
+    return rows_of(from_text(value))
+
+
 def names_from_text(value: Any) -> Any:
     """Read a list of names in a form: repeated fields, a JSON list, or names with commas between.
 
@@ -89,11 +102,23 @@ def rigid(matrix: Matrix) -> Matrix:
     return matrix
 
 
-_MATRIX_SCHEMA = {
-    "type": "array",
-    "minItems": 4,
-    "maxItems": 4,
-    "items": {"type": "array", "minItems": 4, "maxItems": 4, "items": {"type": "number"}},
+_POSE_SCHEMA = {
+    "anyOf": [
+        {
+            "type": "array",
+            "description": "4x4, row-major",
+            "minItems": 4,
+            "maxItems": 4,
+            "items": {"type": "array", "minItems": 4, "maxItems": 4, "items": {"type": "number"}},
+        },
+        {
+            "type": "array",
+            "description": "x y z qx qy qz qw: metres, and a unit quaternion",
+            "minItems": 7,
+            "maxItems": 7,
+            "items": {"type": "number"},
+        },
+    ],
     "example": [[1, 0, 0, 2.5], [0, 1, 0, 0], [0, 0, 1, 0.35], [0, 0, 0, 1]],
 }
 
@@ -103,7 +128,8 @@ Instant = Annotated[
     BeforeValidator(instant),
     WithJsonSchema({"type": "string", "format": "date-time", "example": "2026-03-01T12:00:00Z"}),
 ]
-Pose = Annotated[Matrix, BeforeValidator(from_text), AfterValidator(rigid), WithJsonSchema(_MATRIX_SCHEMA)]
+Pose = Annotated[Matrix, BeforeValidator(pose_from_text), AfterValidator(rigid), WithJsonSchema(_POSE_SCHEMA)]
+Frame = Annotated[str, Field(pattern=FRAME, examples=["map"])]
 Text = Annotated[str, Field(pattern=r"^[^\x00-\x1f\x7f]*$")]  #: one line; PostgreSQL takes no NUL
 DeviceId = Annotated[Text, Field(min_length=1, max_length=128, examples=["robot-7"])]
 Model = Annotated[

@@ -47,6 +47,12 @@ PROBLEMS: dict[str, tuple[int | None, str]] = {
     "unauthorized": (401, "An API key is needed"),
     "forbidden": (403, "This may not be done here"),
     "queue_full": (429, "Too many jobs wait"),
+    "offset_mismatch": (409, "The upload goes on elsewhere"),
+    "checksum_mismatch": (460, "The piece is not what was sent"),
+    "upload_busy": (423, "Another request writes to the upload"),
+    "too_many_uploads": (429, "Too many uploads are begun"),
+    "tus_version": (412, "The version of the upload protocol is not spoken here"),
+    "tus_malformed": (400, "The request breaks the upload protocol"),
     "disk_full": (507, "The disk is full"),
     "unavailable": (503, "A part of the service does not answer"),
     "queue_unavailable": (503, "The job queue does not answer"),
@@ -170,7 +176,7 @@ def documented(*codes: str) -> dict[int | str, dict[str, Any]]:
             "description": meaning if known is None else f"{known['description']}; {meaning}",
             "content": {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/ProblemDocument"}}},
         }
-        if status in (429, 503) or code == "idempotency_key_in_use":
+        if status in (423, 429, 503) or code == "idempotency_key_in_use":
             answers[status]["headers"] = {"Retry-After": _RETRY_AFTER}
     return answers
 

@@ -19,7 +19,7 @@ from service.errors import ScanUnreadable
 
 AFTERWARDS_S = 3600.0  #: that a file may lie here when its body has ended, until the request has
 _written_here: set[Path] = set()  #: files of requests that this process is at, whole or not
-_HEAD = 256  #: bytes that are enough to tell the format
+HEAD_BYTES = 256  #: bytes that are enough to tell the format
 _PLY = re.compile(rb"ply[ \t]*\r?\n")
 _PCD = re.compile(rb"\s*(#[^\n]*\.PCD|(VERSION|FIELDS|COLUMNS)\s)")
 
@@ -40,7 +40,7 @@ class Incoming:
 
     def __init__(self, folder: Path, filename: str) -> None:
         """Open a file in `folder`; `filename` is the client's, is cut to one short line, and is not used as a path."""
-        self.filename = _shown(filename)
+        self.filename = shown(filename)
         self._path = folder / f"{uuid4().hex}.part"
         self._file = self._path.open("wb")
         _written_here.add(self._path)
@@ -50,8 +50,8 @@ class Incoming:
 
     def write(self, data: bytes | memoryview) -> None:
         """Take the next piece."""
-        if len(self._head) < _HEAD:
-            self._head += bytes(data[: _HEAD - len(self._head)])
+        if len(self._head) < HEAD_BYTES:
+            self._head += bytes(data[: HEAD_BYTES - len(self._head)])
         self._file.write(data)
         self._sha256.update(data)
         self._size += len(data)
@@ -62,20 +62,9 @@ class Incoming:
         return Upload(
             path=self._path,
             filename=self.filename,
-            format=self._format(),
+            format=format_of(self._head, self.filename),
             size=self._size,
             sha256=self._sha256.hexdigest(),
-        )
-
-    def _format(self) -> ScanFormat:
-        if not self._head:
-            raise ScanUnreadable(f"{self.filename}: the file is empty; send a PLY or PCD")
-        if _PLY.match(self._head):
-            return "ply"
-        if _PCD.match(self._head):
-            return "pcd"
-        raise ScanUnreadable(
-            f"{self.filename}: neither PLY nor PCD, it starts with {self._head[:12]!r}; send the scan as one of the two"
         )
 
     def __enter__(self) -> Self:
@@ -103,5 +92,19 @@ def sweep(folder: Path, *, upload_timeout_s: float) -> None:
                 path.unlink()
 
 
-def _shown(filename: str) -> str:
+def format_of(head: bytes, filename: str) -> ScanFormat:
+    """Return the format that the first bytes of a file tell. Raises ScanUnreadable where it is neither PLY nor PCD."""
+    if not head:
+        raise ScanUnreadable(f"{filename}: the file is empty; send a PLY or PCD")
+    if _PLY.match(head):
+        return "ply"
+    if _PCD.match(head):
+        return "pcd"
+    raise ScanUnreadable(
+        f"{filename}: neither PLY nor PCD, it starts with {head[:12]!r}; send the scan as one of the two"
+    )
+
+
+def shown(filename: str) -> str:
+    """Return a client's name of a file as one short line."""
     return "".join(letter for letter in filename if letter.isprintable())[:255] or "scan"
