@@ -123,7 +123,7 @@ class Scans:
                 row.captured_at = captured_at
                 row.warnings = as_kept((*clock_warnings(captured_at, received=tables.now()), *others))
             row.pose = row.pose if pose is None else [list(line) for line in pose]
-            row.frame = frame or known.frame
+            row.frame = frame or row.frame
             session.flush()
             return ScanRecord.of_row(row)
 

@@ -294,15 +294,14 @@ def test_a_whole_upload_becomes_a_scan_when_the_database_is_back(
     assert client.get(f"/scans/{head.headers['Scan-Id']}").status_code == 200
 
 
-def test_a_scan_in_use_with_another_pose_is_refused_for_good(client: TestClient) -> None:
+def test_a_scan_in_use_that_comes_again_with_another_pose_is_corrected(client: TestClient) -> None:
     catalog = catalog_of(client)
     scan_id = send(client, begin(client, pose=POSE), 0, SCAN).headers["Scan-Id"]
     catalog.maps.create(scan_ids=[scan_id], model="spicd-net/1", map_id="lobby")
-    url = begin(client, pose="0 0 0 0 0 0 1")
-    answer = send(client, url, 0, SCAN)
-    assert (answer.status_code, code(answer)) == (422, "bad_request")  # 409 is that of another offset
-    assert "another pose" in answer.json()["detail"]
-    assert client.get(url).json()["problem"]["detail"] == answer.json()["detail"]
+    answer = send(client, begin(client, pose="0 0 0 0 0 0 1"), 0, SCAN)
+    assert (answer.status_code, answer.headers["Scan-Id"]) == (204, scan_id)
+    identity = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+    assert client.get(f"/scans/{scan_id}").json()["pose"] == identity
 
 
 def test_no_more_uploads_are_begun_than_may_be(client: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
