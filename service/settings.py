@@ -98,6 +98,11 @@ class Settings(BaseSettings):
     keep_surveys_days: float = Field(
         0, ge=0, description="days that surveys are kept which no version of a map took over; 0: for ever"
     )
+    keep_events_days: float = Field(
+        30,
+        gt=0,
+        description="days that events are kept; who follows them and was away for longer begins anew",
+    )
     log_level: Literal["debug", "info", "warning", "error"] = Field("info", description="of every process")
     log_format: Literal["text", "json"] = Field(
         "text", description="lines for people, or a JSON object a line"

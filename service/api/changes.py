@@ -14,6 +14,7 @@ from pydantic import AfterValidator, Field
 
 from service.api import features
 from service.api.features import FeatureResponse, feature_response
+from service.api.feeds import After, feed_links, feed_members, require_alone
 from service.api.http.dependencies import Provided
 from service.api.http.documents import Link, Request, link
 from service.api.http.fields import Id, instant
@@ -21,6 +22,7 @@ from service.api.http.paging import Cursor, decoded, encoded, finite, next_link
 from service.api.http.problems import documented
 from service.catalog.catalog import Catalog
 from service.catalog.changes import ChangeFilter, ChangePosition
+from service.catalog.events import FeedCursor
 from service.catalog.records import Bounds, rfc3339
 from service.errors import NotFound
 
@@ -101,6 +103,7 @@ class ChangesRequest(Request):
     ] = None
     limit: Annotated[int, Field(ge=1, le=10000, description="most features in one answer")] = 100
     cursor: Cursor = None
+    after: After = None
 
 
 @router.get(
@@ -110,7 +113,7 @@ class ChangesRequest(Request):
     response_model=None,
     responses={
         **features.documented(),
-        **documented("not_found", "not_ready", "invalid_request", "bad_request"),
+        **documented("not_found", "not_ready", "gone", "invalid_request", "bad_request"),
     },
 )
 def get_changes(
@@ -125,6 +128,9 @@ def get_changes(
     `last_seen` and `max_score` over all of them. It ends where a visit sees the tile unchanged, or a version of the map
     takes it over; a change after that is another one.
 
+    With `after` those that were published since an earlier answer, in the order of publication: each once, whatever the
+    order in which surveys come in, so that a visit which is uploaded late is not missed.
+
     A survey that still runs or failed has no say here; asked for by name it answers 409 and not an empty list,
     for nothing found is not the same as no change.
     """
@@ -133,19 +139,23 @@ def get_changes(
     if asked.survey is not None:
         _require_survey(catalog, asked.survey, map_id)
     since, until = (None, None) if asked.datetime is None else span_of(asked.datetime)
-    page = catalog.changes.page(
-        ChangeFilter(
-            map_id=map_id,
-            survey_id=asked.survey,
-            repeats=asked.repeats,
-            bounds=None if asked.bbox is None else bounds_of(asked.bbox),
-            since=since,
-            until=until,
-            min_score=asked.min_score,
-        ),
-        after=position_of(asked.cursor),
-        limit=asked.limit,
+    wanted = ChangeFilter(
+        map_id=map_id,
+        survey_id=asked.survey,
+        repeats=asked.repeats,
+        bounds=None if asked.bbox is None else bounds_of(asked.bbox),
+        since=since,
+        until=until,
+        min_score=asked.min_score,
     )
+    if asked.after is not None:
+        require_alone(after=asked.after, cursor=asked.cursor, survey=asked.survey, repeats=asked.repeats)
+        feed = catalog.changes.published(wanted, after=FeedCursor.read(asked.after), limit=asked.limit)
+        links = feed_links(request, feed.cursor, features.MEDIA_TYPE)
+        links.append(link(request, f"/maps/{map_id}", "map"))
+        members = feed_members(feed.cursor, feed.withdrawn)
+        return feature_response(feed.items, matched=feed.matched, links=links, anchor=anchor, members=members)
+    page = catalog.changes.page(wanted, after=position_of(asked.cursor), limit=asked.limit)
     links = [
         Link(href=str(request.url.replace(scheme="", netloc="")), rel="self", type=features.MEDIA_TYPE),
         link(request, f"/maps/{map_id}", "map"),

@@ -14,6 +14,7 @@ from fastapi.responses import Response
 from pydantic import Field
 from pydantic_core import to_json
 
+from service.api.feeds import FEED_CURSOR, FEED_WITHDRAWN, WithdrawnDocument
 from service.api.geodesy import ToWgs84, to_wgs84
 from service.api.http.documents import Document, Link
 from service.catalog.records import Anchor, ChangeRecord, TileState, Vector3, rfc3339
@@ -106,6 +107,11 @@ class TileProperties(Document):
         description="likewise, before it was gone again or taken over", examples=["2026-03-08T12:00:00Z"]
     )
     max_score: float | None = Field(description="over those visits", examples=[0.97])
+    change_id: str | None = Field(
+        None,
+        description="of the change, the same for as long as it is told; null where the tile is not changed",
+        examples=["change-5c02"],
+    )
 
 
 class TileFeature(Document):
@@ -131,6 +137,8 @@ class TileCollection(Document):
     numberReturned: int = Field(examples=[1])  # noqa: N815
     links: list[Link]
     features: list[TileFeature]
+    cursor: str | None = FEED_CURSOR
+    withdrawn: list[WithdrawnDocument] | None = FEED_WITHDRAWN
 
 
 class FeatureResponse(Response):
@@ -140,12 +148,17 @@ class FeatureResponse(Response):
 
 
 def feature_response(
-    changes: Iterable[ChangeRecord], *, matched: int, links: Iterable[Link], anchor: Anchor | None
+    changes: Iterable[ChangeRecord],
+    *,
+    matched: int,
+    links: Iterable[Link],
+    anchor: Anchor | None,
+    members: Mapping[str, Any] | None = None,
 ) -> FeatureResponse:
-    """Answer with tiles of a map that lies at `anchor`; `matched` counts those of every page."""
+    """Answer with tiles of a map that lies at `anchor`; `matched` counts those of every page, `members` stand beside."""
     convert = None if anchor is None else to_wgs84(anchor)
     collection = tile_collection((feature(change, convert) for change in changes), matched=matched)
-    collection |= {"timeStamp": rfc3339(now()), "links": list(links)}
+    collection |= {"timeStamp": rfc3339(now()), "links": list(links), **(members or {})}
     return FeatureResponse(to_json(collection, inf_nan_mode="null"))
 
 

@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import logging
 from collections.abc import AsyncIterator
+from datetime import timedelta
 
 from fastapi.concurrency import run_in_threadpool
 
@@ -42,7 +43,10 @@ async def _repeat(services: Services) -> None:
 
 
 def sweep(services: Services) -> None:
-    """Remove what retention lets go; nothing where more files have no row than kills leave."""
+    """Remove old events, and what retention lets go; nothing of that where more files have no row than kills leave."""
+    kept = timedelta(days=services.settings.keep_events_days)
+    if events := services.catalog.events.sweep(now() - kept):
+        log.info("swept %d events", events)
     policy = retention.policy_of(services.settings, now())
     found = retention.find(services.catalog, policy)
     if found.doubtful:

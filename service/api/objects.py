@@ -5,7 +5,7 @@ Answers are written as they are built, like those of `service.api.features`; a t
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Path, Query
@@ -25,12 +25,22 @@ from service.api.features import (
     on_earth,
     plain,
 )
+from service.api.feeds import (
+    FEED_CURSOR,
+    FEED_WITHDRAWN,
+    After,
+    WithdrawnDocument,
+    feed_links,
+    feed_members,
+    require_alone,
+)
 from service.api.geodesy import ToWgs84, to_wgs84
 from service.api.http.dependencies import Provided
 from service.api.http.documents import Document, Link, Request, link
 from service.api.http.fields import Id, instant
 from service.api.http.paging import Cursor, count, decoded, encoded, next_link
 from service.api.http.problems import MADE, documented
+from service.catalog.events import FeedCursor
 from service.catalog.objects import ObjectFilter, SightingFilter
 from service.catalog.records import (
     Anchor,
@@ -208,6 +218,8 @@ class ObjectCollection(_Collection):
     """The changed things of a map."""
 
     features: list[ObjectFeature]
+    cursor: str | None = FEED_CURSOR
+    withdrawn: list[WithdrawnDocument] | None = FEED_WITHDRAWN
 
 
 class SightingsRequest(Request):
@@ -245,6 +257,7 @@ class ObjectsRequest(Request):
     min_probability: MinProbability = None
     limit: Limit = 100
     cursor: Cursor = None
+    after: After = None
 
 
 @router.get(
@@ -292,7 +305,7 @@ def get_survey_objects(
     response_model=None,
     responses={
         **features.documented(ObjectCollection),
-        **documented("not_found", "not_ready", "invalid_request", "bad_request"),
+        **documented("not_found", "not_ready", "gone", "invalid_request", "bad_request"),
     },
 )
 def get_objects(
@@ -304,6 +317,9 @@ def get_objects(
     """Each changed thing once, with what became of it: those first that were first seen last.
 
     A thing keeps its id from survey to survey. What a version of the map has taken over stays in the list as `accepted`.
+
+    With `after` those that were published since an earlier answer, in the order of publication: each once, whatever the
+    order in which surveys come in.
     """
     catalog = services.catalog
     convert = _converter(catalog.maps.ready(map_id).anchor)
@@ -319,6 +335,12 @@ def get_objects(
         until=until,
         min_probability=asked.min_probability,
     )
+    if asked.after is not None:
+        require_alone(after=asked.after, cursor=asked.cursor)
+        feed = catalog.objects.published(wanted, after=FeedCursor.read(asked.after), limit=asked.limit)
+        links = [*feed_links(request, feed.cursor, MEDIA_TYPE), link(request, f"/maps/{map_id}", "map")]
+        found = [_object(one, convert) for one in feed.items]
+        return _answer(found, feed.matched, links, feed_members(feed.cursor, feed.withdrawn))
     page = catalog.objects.page(wanted, after=_position(asked.cursor), limit=asked.limit)
     links = _links(request, None if page.following is None else _cursor(page.following))
     links.append(link(request, f"/maps/{map_id}", "map"))
@@ -350,9 +372,14 @@ def get_object(
     return FeatureResponse(to_json(document, inf_nan_mode="null"))
 
 
-def _answer(found: Iterable[dict[str, Any]], matched: int, links: Sequence[Link]) -> FeatureResponse:
+def _answer(
+    found: Iterable[dict[str, Any]],
+    matched: int,
+    links: Sequence[Link],
+    members: Mapping[str, Any] | None = None,
+) -> FeatureResponse:
     collection = object_collection(found, matched=matched)
-    collection |= {"timeStamp": rfc3339(now()), "links": list(links)}
+    collection |= {"timeStamp": rfc3339(now()), "links": list(links), **(members or {})}
     return FeatureResponse(to_json(collection, inf_nan_mode="null"))
 
 

@@ -9,6 +9,7 @@ from service.catalog.blobs import Blobs
 from service.catalog.changes import Changes
 from service.catalog.database import Database
 from service.catalog.disk import BALLAST_BYTES, Disk
+from service.catalog.events import Events
 from service.catalog.jobs import Jobs
 from service.catalog.keys import Keys
 from service.catalog.maps import Maps
@@ -35,6 +36,7 @@ class Catalog:
     models: Models
     changes: Changes
     objects: Objects
+    events: Events
     jobs: Jobs
     keys: Keys
 
@@ -67,6 +69,7 @@ def open_catalog(settings: Settings, *, migrate: bool = True, patience: Patience
         models=Models(database),
         changes=Changes(database),
         objects=Objects(database),
+        events=Events(database),
         jobs=Jobs(database),
         keys=Keys(database),
     )

@@ -12,6 +12,7 @@ from service.catalog import blob_keys, tables
 from service.catalog.blobs import Blobs
 from service.catalog.database import Database
 from service.catalog.jobs import new_job
+from service.catalog.publication import tell
 from service.catalog.records import Anchor, Built, JobRecord, MapRecord, Page, Position, ScanOutcome
 from service.catalog.scans import checked_scan_ids, scans_in_order
 from service.catalog.tables import new_id, now
@@ -103,6 +104,7 @@ class Maps:
             folders += [blob_keys.survey_folder(survey_id) for survey_id in session.scalars(surveys)]
             folders += [blob_keys.model_folder(job_id) for job_id in session.scalars(models)]
             session.delete(row)
+            tell(session, "map.deleted", map_id, map_id=map_id)
         for folder in folders:
             self._blobs.delete_prefix(folder)
 

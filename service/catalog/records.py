@@ -47,6 +47,27 @@ ScanReason = Literal[
 ScanFormat = Literal["ply", "pcd"]
 #: What an API key may do; `admin` is everything.
 Scope = Literal["scans:write", "surveys:write", "maps:write", "changes:read", "admin"]
+#: What is told; docs/events.md says when, and what an event of each type carries.
+EventType = Literal[
+    "scan.uploaded",
+    "scan.deleted",
+    "job.ended",
+    "map.deleted",
+    "version.ready",
+    "version.failed",
+    "survey.ready",
+    "survey.failed",
+    "survey.deleted",
+    "model.ready",
+    "model.failed",
+    "change.told",
+    "change.withdrawn",
+    "object.told",
+    "object.gone_again",
+    "object.seen_again",
+    "object.accepted",
+    "object.withdrawn",
+]
 Vector2 = tuple[float, float]
 Vector3 = tuple[float, float, float]
 Row4 = tuple[float, float, float, float]
@@ -440,6 +461,19 @@ class ChangeRecord(Record):
     )
     last_seen: Utc | None = None  #: when one last saw it, before it was gone
     max_score: float | None = None  #: over the surveys that saw it
+    change_id: str | None = None  #: the same for as long as the change is told
+
+
+class EventRecord(Record):
+    """Something that happened."""
+
+    sequence: int  #: in the order of publication, from 1 on, with no gap
+    event_id: str
+    type: EventType
+    map_id: str | None  #: None of scans, which belong to no map
+    subject: str  #: id of what it is about
+    data: dict[str, Any]
+    created: Utc
 
 
 class SightingRecord(Record):
