@@ -63,6 +63,9 @@ class Settings(BaseSettings):
         2, ge=0, description="that requests have to end, uploads above all, once the service is told to stop"
     )
     max_connections: int = Field(400, gt=0, description="open connections to the API at a time")
+    max_listeners: int = Field(
+        200, gt=0, description="of these, that may wait for events (`GET /events`) at a time"
+    )
     max_scan_points: int = Field(50_000_000, gt=0, description="most points that one scan may declare")
     step_memory_bytes: int | None = Field(
         None,

@@ -31,6 +31,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "service.tile_features": (),
     "service.object_features": ("service.tile_features",),
     "service.catalog": ("service.errors", "service.settings"),
+    "service.cloud_events": ("service.catalog",),
     "service.queue": ("service.catalog.steps", "service.errors"),
     "service.dispatch": ("service.catalog", "service.queue", "service.errors"),
     "service.api.http": (
@@ -45,6 +46,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "service.api": (
         "service.api.http",
         "service.catalog",
+        "service.cloud_events",
         "service.tile_features",
         "service.object_features",
         "service.dispatch",

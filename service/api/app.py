@@ -15,7 +15,7 @@ from pydantic import BaseModel
 from pydantic.json_schema import JsonSchemaMode, models_json_schema
 from starlette.types import ASGIApp
 
-from service.api import changes, health, jobs, maps, models, objects, scans, surveys, versions
+from service.api import changes, events, health, jobs, maps, models, objects, scans, surveys, versions
 from service.api.features import TileCollection
 from service.api.housekeeping import housekeeping
 from service.api.http import problems
@@ -26,6 +26,7 @@ from service.api.http.cross_site import add_cross_site_checks
 from service.api.http.dependencies import Queue, Services
 from service.api.http.docs_pages import add_pages
 from service.api.http.lanes import UPLOAD_TURN_S, Lane
+from service.api.http.listeners import Listeners
 from service.api.http.metrics import Metrics, MetricsMiddleware
 from service.api.http.monitor import HealthMonitor
 from service.api.http.requests import RequestLog
@@ -66,6 +67,7 @@ UNSEEN: dict[JsonSchemaMode, tuple[type[BaseModel], ...]] = {
         objects.SightingCollection,
         objects.ObjectCollection,
         objects.ObjectHistory,
+        events.EventList,
     ),
 }
 
@@ -118,7 +120,7 @@ def create_app(settings: Settings, *, queue: Queue | None = None) -> FastAPI:
     app.add_middleware(MetricsMiddleware, metrics=app.state.metrics)
     problems.add_handlers(app)
     add_pages(app)
-    for part in (scans, maps, versions, surveys, changes, objects, jobs, models, health):
+    for part in (scans, maps, versions, surveys, changes, objects, events, jobs, models, health):
         app.include_router(part.router, responses=None if part is health else problems.OUTAGES)
     return app
 
@@ -141,6 +143,7 @@ def _lifespan(settings: Settings, queue: Queue | None) -> Any:
             dispatcher=dispatcher,
             cards=Cards(settings.model_store, catalog.models),
             writes=Lane(),
+            listeners=Listeners(catalog.events, most=settings.max_listeners),
             uploads=Lane(turn_s=UPLOAD_TURN_S),
         )
         app.state.monitor = HealthMonitor(health.parts(app.state.services))
@@ -151,6 +154,7 @@ def _lifespan(settings: Settings, queue: Queue | None) -> Any:
             async with housekeeping(app.state.services):
                 yield
         finally:
+            app.state.services.listeners.end()
             await run_in_threadpool(ticker.__exit__)
             sweeping.cancel()
             app.state.monitor.stop()

@@ -61,6 +61,7 @@ SCOPES: Mapping[tuple[str, str], Scopes] = {
     ("GET", "/maps/{map_id}/changes"): _READ,
     ("GET", "/maps/{map_id}/objects"): _READ,
     ("GET", "/maps/{map_id}/objects/{object_id}"): _READ,
+    ("GET", "/events"): _READ,  # of the key's maps, where it is bound to some
     ("GET", "/jobs"): _READ,
     ("GET", "/jobs/{job_id}"): _READ | _SURVEYS | _MAPS,
     ("DELETE", "/jobs/{job_id}"): _SURVEYS | _MAPS,  # of which one, by the kind of the job

@@ -250,11 +250,12 @@ def test_a_database_of_another_revision_that_has_keys_is_not_mixed_with_the_copy
     fill(catalog)
     backup(settings, tmp_path / "copy")
     manifest = tmp_path / "copy/backup.json"
-    manifest.write_text(manifest.read_text().replace('"0008"', '"0007"'))
+    revision = catalog.database.revision()
+    manifest.write_text(manifest.read_text().replace(f'"{revision}"', '"0007"'))
     other = Settings(data_dir=tmp_path / "other")
     with open_keys(other) as keys:
         keys.add("first", scopes=["admin"])
-    with pytest.raises(BackupFailed, match="at revision 0008 and those of the copy at 0007"):
+    with pytest.raises(BackupFailed, match=f"at revision {revision} and those of the copy at 0007"):
         restore(other, tmp_path / "copy")
 
 
