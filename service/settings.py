@@ -101,6 +101,11 @@ class Settings(BaseSettings):
     keep_surveys_days: float = Field(
         0, ge=0, description="days that surveys are kept which no version of a map took over; 0: for ever"
     )
+    webhook_allowed_networks: str | None = Field(
+        None,
+        description="networks that webhooks may reach though they are private, there also without TLS, with commas "
+        "between: `10.1.0.0/16`",
+    )
     keep_events_days: float = Field(
         30,
         gt=0,
@@ -120,6 +125,17 @@ class Settings(BaseSettings):
                     f"{origin!r} is no origin; name each as scheme://host[:port], `*` is not taken"
                 )
         return value
+
+    @field_validator("webhook_allowed_networks")
+    @classmethod
+    def _networks_are_cidr(cls, value: str | None) -> str | None:
+        for network in _names(value):
+            ipaddress.ip_network(network)
+        return value
+
+    def webhook_networks(self) -> tuple[ipaddress.IPv4Network | ipaddress.IPv6Network, ...]:
+        """Return the networks that `webhook_allowed_networks` lists."""
+        return tuple(ipaddress.ip_network(name) for name in _names(self.webhook_allowed_networks))
 
     def requires_key(self) -> bool:
         """Tell whether requests need an API key: as soon as another machine can reach the API, unless told."""

@@ -32,6 +32,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "service.object_features": ("service.tile_features",),
     "service.catalog": ("service.errors", "service.settings"),
     "service.cloud_events": ("service.catalog",),
+    "service.webhooks": ("service.cloud_events", "service.catalog", "service.errors"),
     "service.queue": ("service.catalog.steps", "service.errors"),
     "service.dispatch": ("service.catalog", "service.queue", "service.errors"),
     "service.api.http": (
@@ -47,6 +48,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
         "service.api.http",
         "service.catalog",
         "service.cloud_events",
+        "service.webhooks",
         "service.tile_features",
         "service.object_features",
         "service.dispatch",
@@ -236,6 +238,8 @@ ONLY_IN = {
     "obstore": ("service.catalog",),
     "fastapi": ("service.api", "service.up"),
     "opentelemetry": ("service.tracing",),
+    "httpcore": ("service.webhooks",),
+    "standardwebhooks": ("service.webhooks",),
 }
 
 #: The files of the worker that know the service; the demo and the rest are in ROOMS.

@@ -15,7 +15,19 @@ from pydantic import BaseModel
 from pydantic.json_schema import JsonSchemaMode, models_json_schema
 from starlette.types import ASGIApp
 
-from service.api import changes, events, health, jobs, maps, models, objects, scans, surveys, versions
+from service.api import (
+    changes,
+    events,
+    health,
+    jobs,
+    maps,
+    models,
+    objects,
+    scans,
+    surveys,
+    versions,
+    webhooks,
+)
 from service.api.features import TileCollection
 from service.api.housekeeping import housekeeping
 from service.api.http import problems
@@ -38,6 +50,8 @@ from service.catalog.patience import REQUESTS
 from service.dispatch import Dispatcher
 from service.queue import JobQueue
 from service.settings import Settings
+from service.webhooks.deliverer import Deliverer
+from service.webhooks.sending import Sender
 
 DESCRIPTION = """\
 Upload LiDAR scans of a building, build a reference map of them, and ask, tile by tile and \
@@ -60,6 +74,8 @@ UNSEEN: dict[JsonSchemaMode, tuple[type[BaseModel], ...]] = {
         maps.AnchorRequest,
         surveys.SurveyRequest,
         models.TrainingRequest,
+        webhooks.WebhookRequest,
+        webhooks.WebhookChange,
     ),
     "serialization": (
         problems.ProblemDocument,
@@ -120,7 +136,7 @@ def create_app(settings: Settings, *, queue: Queue | None = None) -> FastAPI:
     app.add_middleware(MetricsMiddleware, metrics=app.state.metrics)
     problems.add_handlers(app)
     add_pages(app)
-    for part in (scans, maps, versions, surveys, changes, objects, events, jobs, models, health):
+    for part in (scans, maps, versions, surveys, changes, objects, events, webhooks, jobs, models, health):
         app.include_router(part.router, responses=None if part is health else problems.OUTAGES)
     return app
 
@@ -150,11 +166,15 @@ def _lifespan(settings: Settings, queue: Queue | None) -> Any:
         await run_in_threadpool(app.state.monitor.start)
         ticker = Ticker(dispatcher)
         await run_in_threadpool(ticker.__enter__)
+        sender = Sender(allowed=settings.webhook_networks())
+        deliverer = Deliverer(catalog.deliveries, sender)
+        await run_in_threadpool(deliverer.__enter__)
         try:
             async with housekeeping(app.state.services):
                 yield
         finally:
             app.state.services.listeners.end()
+            await run_in_threadpool(deliverer.__exit__)
             await run_in_threadpool(ticker.__exit__)
             sweeping.cancel()
             app.state.monitor.stop()

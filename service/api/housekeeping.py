@@ -44,8 +44,9 @@ async def _repeat(services: Services) -> None:
 
 def sweep(services: Services) -> None:
     """Remove old events, and what retention lets go; nothing of that where more files have no row than kills leave."""
-    kept = timedelta(days=services.settings.keep_events_days)
-    if events := services.catalog.events.sweep(now() - kept):
+    before = now() - timedelta(days=services.settings.keep_events_days)
+    services.catalog.webhooks.sweep(before)
+    if events := services.catalog.events.sweep(before):
         log.info("swept %d events", events)
     policy = retention.policy_of(services.settings, now())
     found = retention.find(services.catalog, policy)

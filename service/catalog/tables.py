@@ -450,3 +450,48 @@ class EventLog(Base):
     swept: Mapped[int] = mapped_column(
         BigInteger, server_default="0"
     )  #: the latest that is not kept any more
+
+
+class Webhook(Base):
+    """An address that events are sent to, and how far they were."""
+
+    __tablename__ = "webhooks"
+
+    webhook_id: Mapped[str] = mapped_column("id", primary_key=True)
+    url: Mapped[str]
+    types: Mapped[list[str] | None]  #: None: all
+    map_id: Mapped[str | None]  #: None: all; no foreign key: that the map was deleted is sent as well
+    secret: Mapped[str]  #: as it was shown: a signature needs it
+    previous_secret: Mapped[str | None]
+    previous_until: Mapped[datetime | None]  #: how long that signs as well
+    status: Mapped[str]
+    reason: Mapped[str | None]  #: why it is disabled, or what it missed
+    position: Mapped[int] = mapped_column(BigInteger)  #: number of the last event that it needs no more
+    attempts: Mapped[int]  #: that failed, at the event behind it
+    next_attempt: Mapped[datetime]
+    claim: Mapped[str | None]  #: of the process that sends to it now
+    claimed_until: Mapped[datetime | None]
+    created: Mapped[datetime]
+    updated: Mapped[datetime]
+
+    __table_args__ = (Index(None, "created", "id"),)
+
+
+class WebhookDelivery(Base):
+    """An event that was sent to a webhook, or is to be."""
+
+    __tablename__ = "webhook_deliveries"
+
+    delivery_id: Mapped[str] = mapped_column("id", primary_key=True)
+    webhook_id: Mapped[str] = mapped_column(ForeignKey("webhooks.id", ondelete="CASCADE"))
+    kind: Mapped[str]
+    event_id: Mapped[str]
+    type: Mapped[str]
+    status: Mapped[str]
+    attempts: Mapped[int]
+    answered: Mapped[int | None]  #: HTTP status of the last answer
+    error: Mapped[str | None]  #: why the last attempt failed
+    created: Mapped[datetime]
+    updated: Mapped[datetime]
+
+    __table_args__ = (Index(None, "webhook_id", "created", "id"), Index(None, "status"))
