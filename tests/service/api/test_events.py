@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import re
 import threading
 from collections.abc import Iterator
 from datetime import timedelta
+from pathlib import Path
 from typing import Any
 
 import httpx
@@ -21,6 +23,7 @@ from service.settings import Settings
 from tests.support.live import Live, live
 from tests.support.processes import until
 from tests.support.samples import NOON, add_map, add_scan, add_survey, catalog_of, running, tile
+from tests.support.servers import free_port
 
 SSE = {"Accept": "text/event-stream"}
 
@@ -271,3 +274,46 @@ def test_a_key_that_is_bound_to_a_map_sees_the_events_of_that_map(settings: Sett
         assert client.get("/events", params={"map": "lobby"}, headers=headers).status_code == 403
         assert client.get("/events", headers={"Authorization": f"Bearer {writer}"}).status_code == 403
         assert client.get("/events").status_code == 401
+
+
+# the page
+
+
+def on_the_page() -> dict[str, Any]:
+    """What the Python of docs/events.md defines."""
+    page = (Path(__file__).parents[3] / "docs/events.md").read_text()
+    names: dict[str, Any] = {}
+    for code in re.findall(r"^```python\n(.*?)^```", page, re.MULTILINE | re.DOTALL):
+        exec(code, names)
+    return names
+
+
+def test_the_loop_of_the_page_follows_changes_and_goes_on_where_it_was(service: Live, tmp_path: Path) -> None:
+    catalog, follow = service.services.catalog, on_the_page()["follow"]
+    add_map(catalog)
+    kept = {"kept": tmp_path / "cursor", "pause_s": 0.05}
+    seen = []
+    for day in (5, 4):  # the earlier visit is uploaded later
+        add_survey(catalog, [tile(0, 0), tile(day, 1)], captured_at=NOON + timedelta(days=day))
+        changes = follow(service.url, "lobby", **kept)
+        seen += [next(changes)["properties"]["tile_id"][5:8] for _ in range(2 if day == 5 else 1)]
+        add_survey(catalog, [tile(9, day)], captured_at=NOON + timedelta(days=day, hours=1))
+        seen.append(next(changes)["properties"]["tile_id"][5:8])  # which has the cursor of before written
+    assert sorted(seen) == ["000", "004", "005", "009", "009"]
+
+
+def test_the_receiver_of_the_page_takes_what_was_signed(settings: Settings) -> None:
+    taken: list[Told] = []
+    allowed = settings.model_copy(update={"webhook_allowed_networks": "127.0.0.0/8"})
+    with live(allowed) as served:
+        port = free_port()
+        webhook = served.http.post("/webhooks", json={"url": f"http://127.0.0.1:{port}/"}).json()
+        receiver = on_the_page()["receiver"](webhook["secret"], taken.append, port)
+        threading.Thread(target=receiver.serve_forever, daemon=True).start()
+        scan = add_scan(served.services.catalog, "hall")
+        until(lambda: taken)
+        refused = httpx.post(f"http://127.0.0.1:{port}/", content=b"{}", timeout=20)
+        receiver.shutdown()
+        receiver.server_close()
+    assert (taken[0]["type"], taken[0]["subject"]) == ("scan.uploaded", scan.scan_id)
+    assert refused.status_code == 401
