@@ -234,7 +234,7 @@ def _tell_change(session: Session, row: TileChange) -> None:
 
 
 def _withdraw_change(session: Session, row: TileChange, merged_into: str | None) -> None:
-    told = {"change_id": row.change_id, "tile_id": row.tile_id, "merged_into": merged_into}
+    told: dict[str, Any] = {"change_id": row.change_id, "tile_id": row.tile_id, "merged_into": merged_into}
     tell(session, "change.withdrawn", row.change_id, map_id=row.map_id, **told)
     session.delete(row)
 

@@ -355,7 +355,8 @@ def _tell_end(
 
 def _tell_subject(session: Session, subject: tables.MapVersion | tables.Survey | tables.Model) -> None:
     """Tell that a version, a survey or a model is ready, or failed."""
-    ready, about = subject.status == "ready", {"map_id": subject.map_id, "job_id": subject.job_id}
+    ready = subject.status == "ready"
+    about: dict[str, Any] = {"map_id": subject.map_id, "job_id": subject.job_id}
     if isinstance(subject, tables.Survey):
         event: EventType = "survey.ready" if ready else "survey.failed"
         about |= {"survey_id": subject.survey_id, "device_id": subject.device_id}

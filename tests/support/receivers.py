@@ -36,7 +36,7 @@ class Receiver:
 
     answers: list[int] = field(default_factory=list)
     headers: dict[str, str] = field(default_factory=dict)
-    before_answer: Callable[[], None] = lambda: None
+    before_answer: Callable[[], object] = lambda: None
     received: list[Received] = field(default_factory=list)
     most_at_once: int = 0
 

@@ -20,6 +20,8 @@ from service.catalog.catalog import Catalog
 from service.catalog.tables import now
 from service.errors import DatabaseUnavailable
 from service.settings import Settings
+from service.up import launcher
+from service.up.connections import Limits
 from tests.support.live import Live, live
 from tests.support.processes import until
 from tests.support.samples import NOON, add_map, add_scan, add_survey, catalog_of, running, tile
@@ -72,7 +74,7 @@ def test_a_stream_tells_what_happens_while_it_is_open(service: Live) -> None:
         told = [next(entries) for _ in range(4)]
     types = [event["type"] for _, event in told if event is not None]
     assert types == ["scan.uploaded", "job.ended", "survey.ready", "change.told"]
-    assert [int(number or 0) for number, _ in told] == list(range(int(begin) + 1, int(begin) + 5))
+    assert [int(number or 0) for number, _ in told] == list(range(int(begin or 0) + 1, int(begin or 0) + 5))
     until(lambda: service.listeners() == 0, 20)
 
 
@@ -134,6 +136,19 @@ def test_a_stream_ends_after_its_time_and_the_key_is_asked_for_again(
     monkeypatch.setattr(events, "KEEP_ALIVE_S", 0.1)
     with service.http.stream("GET", "/events", headers=SSE) as answer:
         assert list(answer.iter_lines())  # it ends by itself, as an answer ends
+
+
+def test_no_limit_on_connections_cuts_a_stream_that_is_quiet(
+    settings: Settings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    brief = Limits(header_s=0.2, body_window_s=0.2, linger_s=0.2, write_s=0.2, close_s=0.2)
+    monkeypatch.setattr(launcher, "limits_of", lambda _: brief)
+    monkeypatch.setattr(events, "KEEP_ALIVE_S", 0.5)
+    with live(settings) as served, served.http.stream("GET", "/events", headers=SSE) as answer:
+        entries = stream(answer.iter_lines())
+        assert [next(entries)[1] for _ in range(4)] == [None] * 4  # longer than any of the limits
+        add_scan(served.services.catalog, "hall")
+        assert next(told for _, told in entries if told is not None)["type"] == "scan.uploaded"
 
 
 def test_the_service_ends_within_its_grace_while_others_listen(settings: Settings) -> None:

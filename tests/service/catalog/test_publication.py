@@ -14,7 +14,7 @@ from service.catalog.catalog import Catalog, open_catalog
 from service.catalog.changes import ChangeFilter
 from service.catalog.events import EventFilter, FeedCursor
 from service.catalog.publication import tell
-from service.catalog.records import EventRecord, Problem
+from service.catalog.records import EventRecord, ObjectRecord, Problem
 from service.catalog.tables import Event, TileChange, now
 from service.errors import Gone
 from service.settings import Settings
@@ -31,6 +31,7 @@ from tests.support.samples import (
 )
 from tests.support.servers import postgresql
 
+READY = EventFilter(types=("version.ready",))
 LOBBY = ChangeFilter(map_id="lobby")
 BEGINNING = FeedCursor(0, 0)
 
@@ -109,11 +110,11 @@ def test_a_page_is_of_the_types_and_maps_that_are_asked_for(catalog: Catalog) ->
     add_map(catalog)
     add_map(catalog, "hall")
     add_survey(catalog, [tile(0, 0)], map_id="hall")
-    page = catalog.events.after(0, EventFilter(types=("version.ready",)), limit=1)
+    page = catalog.events.after(0, READY, limit=1)
     assert [event.map_id for event in page.items] == ["lobby"]
-    page = catalog.events.after(page.cursor, EventFilter(types=("version.ready",)), limit=1)
+    page = catalog.events.after(page.cursor, READY, limit=1)
     assert [event.map_id for event in page.items] == ["hall"]
-    page = catalog.events.after(page.cursor, EventFilter(types=("version.ready",)), limit=1)
+    page = catalog.events.after(page.cursor, READY, limit=1)
     assert (page.items, page.cursor) == (
         (),
         catalog.events.last(),
@@ -310,9 +311,9 @@ def test_what_becomes_of_an_object_is_told(catalog: Catalog) -> None:
     looked = [tile(i, j, "unchanged", 0.1, observed_share=0.9) for i in range(3) for j in range(3)]
     box = [thing(1, now=place(1, 1))]
 
-    def visit(day: int, objects: list[object]) -> str:
+    def visit(day: int, objects: list[ObjectRecord]) -> str:
         when = NOON + timedelta(days=day)
-        return add_survey(catalog, looked, captured_at=when, objects=objects, moving=0)[0]  # type: ignore[arg-type]
+        return add_survey(catalog, looked, captured_at=when, objects=objects, moving=0)[0]
 
     add_map(catalog)
     visit(1, box)

@@ -246,7 +246,7 @@ def test_several_hosts_send_each_event_once_in_order_and_one_at_a_time(
 
 def test_one_receiver_that_is_slow_holds_up_no_other(catalog: Catalog, receiver: Receiver) -> None:
     release = threading.Event()
-    with Receiver(before_answer=lambda: release.wait(20) and None) as slow:
+    with Receiver(before_answer=lambda: release.wait(20)) as slow:
         catalog.webhooks.add(slow.url)
         catalog.webhooks.add(receiver.url)
         with Deliverer(catalog.deliveries, Sender(allowed=LOOPBACK), every_s=0.02):
