@@ -42,8 +42,8 @@ def add_cross_site_checks(app: FastAPI, settings: Settings) -> None:
         app.add_middleware(
             CORSMiddleware,
             allow_origins=origins,
-            allow_methods=("GET", "POST", "PUT", "DELETE"),
-            allow_headers=("Authorization", "Content-Type", "X-Request-ID"),
+            allow_methods=("GET", "POST", "PUT", "PATCH", "DELETE"),
+            allow_headers=("Authorization", "Content-Type", "Last-Event-ID", "X-Request-ID"),
             expose_headers=EXPOSED_HEADERS,
         )
     app.add_middleware(CrossSiteMiddleware, hosts=allowed_hosts(settings), origins=frozenset(origins))

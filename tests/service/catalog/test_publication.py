@@ -14,7 +14,7 @@ from service.catalog.catalog import Catalog, open_catalog
 from service.catalog.changes import ChangeFilter
 from service.catalog.events import EventFilter, FeedCursor
 from service.catalog.publication import tell
-from service.catalog.records import EventRecord, ObjectRecord, Problem
+from service.catalog.records import EventRecord, EventType, ObjectRecord, Problem
 from service.catalog.tables import Event, TileChange, now
 from service.errors import Gone
 from service.settings import Settings
@@ -31,7 +31,8 @@ from tests.support.samples import (
 )
 from tests.support.servers import postgresql
 
-READY = EventFilter(types=("version.ready",))
+READY_TYPES: tuple[EventType, ...] = ("version.ready",)
+READY = EventFilter(types=READY_TYPES)
 LOBBY = ChangeFilter(map_id="lobby")
 BEGINNING = FeedCursor(0, 0)
 
