@@ -25,6 +25,7 @@ ServiceError
 ├── TooManyUploads       too_many_uploads     as many uploads are begun as may be
 ├── TusVersion           tus_version          a request of another version of the protocol
 ├── TusMalformed         tus_malformed        a header of the protocol that is missing or cannot be read
+├── Gone                 gone                 a cursor behind which something is not kept any more
 ├── DiskFull             disk_full            less space than the reserve is left, or none
 ├── QueueFull            queue_full           as many jobs wait as may
 ├── Unauthorized         unauthorized         no API key, or one that is not known
@@ -150,6 +151,10 @@ class TusVersion(ServiceError):
 
 class TusMalformed(ServiceError):
     code = "tus_malformed"
+
+
+class Gone(ServiceError):
+    code = "gone"
 
 
 class DiskFull(ServiceError):

@@ -72,6 +72,9 @@ class Settings(BaseSettings):
         2, ge=0, description="that requests have to end, uploads above all, once the service is told to stop"
     )
     max_connections: int = Field(400, gt=0, description="open connections to the API at a time")
+    max_listeners: int = Field(
+        200, gt=0, description="of these, that may wait for events (`GET /events`) at a time"
+    )
     max_scan_points: int = Field(50_000_000, gt=0, description="most points that one scan may declare")
     step_memory_bytes: int | None = Field(
         None,
@@ -110,6 +113,16 @@ class Settings(BaseSettings):
     keep_idempotency_keys_hours: float = Field(
         24, ge=24, description="hours that an `Idempotency-Key` is kept with the answer to its request"
     )
+    webhook_allowed_networks: str | None = Field(
+        None,
+        description="networks that webhooks may reach though they are private, there also without TLS, with commas "
+        "between: `10.1.0.0/16`",
+    )
+    keep_events_days: float = Field(
+        30,
+        gt=0,
+        description="days that events are kept; who follows them and was away for longer begins anew",
+    )
     log_level: Literal["debug", "info", "warning", "error"] = Field("info", description="of every process")
     log_format: Literal["text", "json"] = Field(
         "text", description="lines for people, or a JSON object a line"
@@ -132,6 +145,17 @@ class Settings(BaseSettings):
                     f"{origin!r} is no origin; name each as scheme://host[:port], `*` is not taken"
                 )
         return value
+
+    @field_validator("webhook_allowed_networks")
+    @classmethod
+    def _networks_are_cidr(cls, value: str | None) -> str | None:
+        for network in _names(value):
+            ipaddress.ip_network(network)
+        return value
+
+    def webhook_networks(self) -> tuple[ipaddress.IPv4Network | ipaddress.IPv6Network, ...]:
+        """Return the networks that `webhook_allowed_networks` lists."""
+        return tuple(ipaddress.ip_network(name) for name in _names(self.webhook_allowed_networks))
 
     def requires_key(self) -> bool:
         """Tell whether requests need an API key: as soon as another machine can reach the API, unless told."""

@@ -36,6 +36,8 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "service.tile_features": (),
     "service.object_features": ("service.tile_features",),
     "service.catalog": ("service.errors", "service.settings"),
+    "service.cloud_events": ("service.catalog",),
+    "service.webhooks": ("service.cloud_events", "service.catalog", "service.errors"),
     "service.queue": ("service.catalog.steps", "service.errors"),
     "service.dispatch": ("service.catalog", "service.queue", "service.errors"),
     "service.api.http": (
@@ -51,6 +53,8 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "service.api": (
         "service.api.http",
         "service.catalog",
+        "service.cloud_events",
+        "service.webhooks",
         "service.tile_features",
         "service.object_features",
         "service.dispatch",
@@ -248,6 +252,8 @@ ONLY_IN = {
     "fastapi": ("service.api", "service.up"),
     "opentelemetry": ("service.tracing",),
     "rosbags": ("service.bags",),
+    "httpcore": ("service.webhooks",),
+    "standardwebhooks": ("service.webhooks",),
 }
 
 #: The files of the worker that know the service; the demo and the rest are in ROOMS.

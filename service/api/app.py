@@ -17,6 +17,7 @@ from starlette.types import ASGIApp
 
 from service.api import (
     changes,
+    events,
     health,
     jobs,
     landing,
@@ -29,6 +30,7 @@ from service.api import (
     tiles,
     tus,
     versions,
+    webhooks,
 )
 from service.api.housekeeping import housekeeping
 from service.api.http import idempotency, problems
@@ -41,6 +43,7 @@ from service.api.http.description import mended, operation_id
 from service.api.http.docs_pages import add_pages
 from service.api.http.known_query import refuse_unknown
 from service.api.http.lanes import UPLOAD_TURN_S, Lane
+from service.api.http.listeners import Listeners
 from service.api.http.methods import MethodsMiddleware
 from service.api.http.metrics import Metrics, MetricsMiddleware
 from service.api.http.monitor import HealthMonitor
@@ -56,6 +59,8 @@ from service.catalog.patience import REQUESTS
 from service.dispatch import Dispatcher
 from service.queue import JobQueue
 from service.settings import Settings
+from service.webhooks.deliverer import Deliverer
+from service.webhooks.sending import Sender
 
 DESCRIPTION = """\
 Upload LiDAR scans of a building, build a reference map of them, and ask, tile by tile and \
@@ -78,12 +83,15 @@ UNSEEN: dict[JsonSchemaMode, tuple[type[BaseModel], ...]] = {
         maps.AnchorRequest,
         surveys.SurveyRequest,
         models.TrainingRequest,
+        webhooks.WebhookRequest,
+        webhooks.WebhookChange,
     ),
     "serialization": (
         problems.ProblemDocument,
         tiles.TileCollection,
         tiles.FgTileCollection,
         *objects.DOCUMENTS,
+        events.EventList,
     ),
 }
 
@@ -156,6 +164,8 @@ def create_app(settings: Settings, *, queue: Queue | None = None) -> FastAPI:
         tiles,
         changes,
         objects,
+        events,
+        webhooks,
         jobs,
         processes,
         models,
@@ -183,6 +193,7 @@ def _lifespan(settings: Settings, queue: Queue | None) -> Any:
             dispatcher=dispatcher,
             cards=Cards(settings.model_store, catalog.models),
             writes=Lane(),
+            listeners=Listeners(catalog.events, most=settings.max_listeners),
             uploads=Lane(turn_s=UPLOAD_TURN_S),
         )
         app.state.receiver = tus.Receiver(settings)
@@ -190,10 +201,15 @@ def _lifespan(settings: Settings, queue: Queue | None) -> Any:
         await run_in_threadpool(app.state.monitor.start)
         ticker = Ticker(dispatcher)
         await run_in_threadpool(ticker.__enter__)
+        sender = Sender(allowed=settings.webhook_networks())
+        deliverer = Deliverer(catalog.deliveries, sender)
+        await run_in_threadpool(deliverer.__enter__)
         try:
             async with housekeeping(app.state.services):
                 yield
         finally:
+            app.state.services.listeners.end()
+            await run_in_threadpool(deliverer.__exit__)
             await run_in_threadpool(ticker.__exit__)
             sweeping.cancel()
             app.state.monitor.stop()

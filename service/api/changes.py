@@ -13,6 +13,7 @@ from pydantic import Field
 from service.api import features
 from service.api.boxes import bounds_of
 from service.api.features import FeatureResponse, FeaturesRequest, collection_response, form_of
+from service.api.feeds import After, feed_members, feed_next, require_alone
 from service.api.http.dependencies import Provided
 from service.api.http.documents import link
 from service.api.http.fields import DeviceId, Id, instant, readable
@@ -29,6 +30,7 @@ from service.api.tiles import (
 )
 from service.catalog.catalog import Catalog
 from service.catalog.changes import ChangeFilter, ChangeSort, change_order
+from service.catalog.events import FeedCursor
 from service.catalog.records import Anchor, TileState
 from service.errors import NotFound
 
@@ -98,6 +100,7 @@ class ChangesRequest(FeaturesRequest):
     ] = None
     limit: Annotated[int, Field(ge=1, le=10000, description="most features in one answer")] = 100
     cursor: Cursor = None
+    after: After = None
 
 
 @router.get(
@@ -107,7 +110,7 @@ class ChangesRequest(FeaturesRequest):
     response_model=None,
     responses={
         **features.documented(TileCollection, FgTileCollection),
-        **documented("not_found", "not_ready", "invalid_request", "bad_request"),
+        **documented("not_found", "not_ready", "gone", "invalid_request", "bad_request"),
     },
 )
 def get_changes(
@@ -122,6 +125,9 @@ def get_changes(
     `last_seen` and `max_score` over all of them. It ends where a visit sees the tile unchanged, or a version of the map
     takes it over; a change after that is another one.
 
+    With `after` those that were published since an earlier answer, in the order of publication: each once, whatever the
+    order in which surveys come in, so that a visit which is uploaded late is not missed.
+
     A survey that still runs or failed has no say here; asked for by name it answers 409 and not an empty list,
     for nothing found is not the same as no change.
     """
@@ -130,6 +136,27 @@ def get_changes(
     if asked.survey is not None:
         _require_survey(catalog, asked.survey, map_id)
     form, wanted = form_of(request, asked, anchor), _filter(map_id, asked, anchor)
+    of_map = link(request, f"/maps/{map_id}", "map")
+    if asked.after is not None:
+        require_alone(
+            after=asked.after,
+            cursor=asked.cursor,
+            survey=asked.survey,
+            repeats=asked.repeats,
+            sortby=asked.sortby,
+            state=asked.state != "changed",
+        )
+        feed = catalog.changes.published(wanted, after=FeedCursor.read(asked.after), limit=asked.limit)
+        return collection_response(
+            request,
+            form,
+            TILES,
+            [feature(change, form) for change in feed.items],
+            matched=feed.matched,
+            following=feed_next(request, feed.cursor, form.media_type),
+            links=[of_map],
+            members=feed_members(feed.cursor, feed.withdrawn),
+        )
     sort, order = asked.sortby, change_order(wanted, asked.sortby)
     after = decoded_values(asked.cursor, sort or "", [key.type for key in order])
     page = catalog.changes.page(wanted, sort=sort, after=after, limit=asked.limit)
@@ -140,7 +167,7 @@ def get_changes(
         [feature(change, form) for change in page.items],
         matched=page.matched,
         cursor=encoded_values(sort or "", page.following),
-        links=[link(request, f"/maps/{map_id}", "map")],
+        links=[of_map],
     )
 
 

@@ -227,15 +227,19 @@ def collection_response(
     *,
     matched: int,
     cursor: str | None = None,
+    following: Link | None = None,
     links: Iterable[Link] = (),
+    members: Mapping[str, Any] | None = None,
 ) -> Response:
     """Answer with features, JSON-FG ones as `service.tile_features` makes them; `matched` counts those of every page.
 
-    `cursor` is that of the next page. How many there are, and where to go on, stands in headers too, for a table has no
+    `cursor` is that of the next page; or `following` leads there. `members` stand beside the features. How many there are, and where to go on, stands in headers too, for a table has no
     other place for it.
     """
-    following = [] if cursor is None else [next_link(request, cursor, form.media_type)]
-    headers = _headers(form, following)
+    if cursor is not None:
+        following = next_link(request, cursor, form.media_type)
+    further = [] if following is None else [following]
+    headers = _headers(form, further)
     headers |= {"OGC-NumberMatched": str(matched), "OGC-NumberReturned": str(len(features))}
     if form.media_type == CSV:
         return _table(kind, features, headers)
@@ -243,7 +247,8 @@ def collection_response(
         collection = feature_collection((dict(one) for one in features), kind.feature_type, matched=matched)
     else:
         collection = geojson_collection(features, matched=matched, in_map_frame=form.in_map_frame)
-    collection |= {"timeStamp": rfc3339(now()), "links": [*_about(request, form), *following, *links]}
+    collection |= {"timeStamp": rfc3339(now()), "links": [*_about(request, form), *further, *links]}
+    collection |= members or {}
     return _json_response(collection, form, headers)
 
 

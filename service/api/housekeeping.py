@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import logging
 from collections.abc import AsyncIterator
+from datetime import timedelta
 
 from fastapi.concurrency import run_in_threadpool
 
@@ -42,7 +43,11 @@ async def _repeat(services: Services) -> None:
 
 
 def sweep(services: Services) -> None:
-    """Remove what retention lets go; nothing where more files have no row than kills leave."""
+    """Remove old events, and what retention lets go; nothing of that where more files have no row than kills leave."""
+    before = now() - timedelta(days=services.settings.keep_events_days)
+    services.catalog.webhooks.sweep(before)
+    if events := services.catalog.events.sweep(before):
+        log.info("swept %d events", events)
     policy = retention.policy_of(services.settings, now())
     found = retention.find(services.catalog, policy)
     if found.doubtful:

@@ -31,12 +31,22 @@ from service.api.features import (
     form_of,
     plain,
 )
+from service.api.feeds import (
+    FEED_CURSOR,
+    FEED_WITHDRAWN,
+    After,
+    WithdrawnDocument,
+    feed_members,
+    feed_next,
+    require_alone,
+)
 from service.api.http.dependencies import Provided
 from service.api.http.documents import Document, Link, link
 from service.api.http.fields import DeviceId, Id, readable
 from service.api.http.paging import Cursor, decoded_values, encoded_values
 from service.api.http.problems import MADE, documented
 from service.api.tiles import Bbox, BboxCrs
+from service.catalog.events import FeedCursor
 from service.catalog.objects import (
     ObjectFilter,
     ObjectSort,
@@ -209,6 +219,8 @@ class ObjectCollection(GeoJsonCollection):
     """The changed things of a map."""
 
     features: list[ObjectFeature]
+    cursor: str | None = FEED_CURSOR
+    withdrawn: list[WithdrawnDocument] | None = FEED_WITHDRAWN
 
 
 class FgSightingFeature(SightingFeature):
@@ -242,6 +254,8 @@ class FgObjectCollection(FgCollection):
     """The changed things of a map, in JSON-FG."""
 
     features: list[FgObjectFeature]
+    cursor: str | None = FEED_CURSOR
+    withdrawn: list[WithdrawnDocument] | None = FEED_WITHDRAWN
 
 
 #: What the routes below answer with, which FastAPI does not see.
@@ -305,6 +319,7 @@ class ObjectsRequest(FeaturesRequest):
     ] = "-first_seen"
     limit: Limit = 100
     cursor: Cursor = None
+    after: After = None
 
 
 @router.get(
@@ -367,7 +382,7 @@ def _why_none(survey: SurveyRecord) -> str:
     response_model=None,
     responses={
         **features.documented(ObjectCollection, FgObjectCollection),
-        **documented("not_found", "not_ready", "invalid_request", "bad_request"),
+        **documented("not_found", "not_ready", "gone", "invalid_request", "bad_request"),
     },
 )
 def get_objects(
@@ -379,12 +394,30 @@ def get_objects(
     """Each changed thing once, with what became of it: those first that were first seen last.
 
     A thing keeps its id from survey to survey. What a version of the map has taken over stays in the list as `accepted`.
+
+    With `after` those that were published since an earlier answer, in the order of publication: each once, whatever the
+    order in which surveys come in.
     """
     anchor = services.catalog.maps.ready(map_id).anchor
     form = form_of(request, asked, anchor)
+    wanted = _filter(map_id, asked, anchor)
+    if asked.after is not None:
+        require_alone(after=asked.after, cursor=asked.cursor, sortby="sortby" in asked.model_fields_set)
+        feed = services.catalog.objects.published(
+            wanted, after=FeedCursor.read(asked.after), limit=asked.limit
+        )
+        return collection_response(
+            request,
+            form,
+            OBJECTS,
+            [_object(one, form) for one in feed.items],
+            matched=feed.matched,
+            following=feed_next(request, feed.cursor, form.media_type),
+            links=[link(request, f"/maps/{map_id}", "map")],
+            members=feed_members(feed.cursor, feed.withdrawn),
+        )
     order = object_order(asked.sortby)
     after = decoded_values(asked.cursor, asked.sortby, [key.type for key in order])
-    wanted = _filter(map_id, asked, anchor)
     page = services.catalog.objects.page(wanted, sort=asked.sortby, after=after, limit=asked.limit)
     return collection_response(
         request,

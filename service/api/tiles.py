@@ -25,6 +25,7 @@ from service.api.features import (
     form_of,
     plain,
 )
+from service.api.feeds import FEED_CURSOR, FEED_WITHDRAWN, WithdrawnDocument
 from service.api.http.dependencies import Provided
 from service.api.http.documents import Document, link
 from service.api.http.fields import Id, readable
@@ -104,6 +105,10 @@ class TileProperties(Document):
         description="likewise, before it was gone again or taken over", examples=["2026-03-08T12:00:00Z"]
     )
     max_score: float | None = Field(description="over those visits", examples=[0.97])
+    change_id: str | None = Field(
+        description="of the change, the same for as long as it is told; null where the tile is not changed",
+        examples=["change-5c02"],
+    )
 
 
 class TileFeature(GeoJsonFeature):
@@ -124,12 +129,16 @@ class TileCollection(GeoJsonCollection):
     """Tiles."""
 
     features: list[TileFeature]
+    cursor: str | None = FEED_CURSOR
+    withdrawn: list[WithdrawnDocument] | None = FEED_WITHDRAWN
 
 
 class FgTileCollection(FgCollection):
     """Tiles in JSON-FG."""
 
     features: list[FgTileFeature]
+    cursor: str | None = FEED_CURSOR
+    withdrawn: list[WithdrawnDocument] | None = FEED_WITHDRAWN
 
 
 _NESTED = {"tile_index", "center", "probabilities"}

@@ -115,7 +115,7 @@ def _takes(*headers: dict[str, Any], piece: bool | None = None) -> dict[str, Any
 
 
 @router.options("/uploads", status_code=204, summary="Which parts of tus are spoken", response_class=Response)
-def describe_uploads(services: Provided) -> Response:
+def get_upload_options(services: Provided) -> Response:
     """Versions, extensions, checksums and the largest file, as headers (tus 1.0.0, OPTIONS)."""
     headers = {
         "Tus-Version": tus.VERSION,
@@ -169,7 +169,7 @@ async def create_upload(request: HttpRequest, services: Provided, receiver: Rece
     responses=_ONE | documented("scan_unreadable", "bad_request", "disk_full"),
     openapi_extra=_takes(piece=False),
 )
-async def upload_offset(
+async def get_upload_offset(
     request: HttpRequest, services: Provided, receiver: Received, upload_id: UploadId
 ) -> Response:
     """`Upload-Offset`: so many bytes are on the disk, and the next piece begins there.

@@ -8,7 +8,9 @@ from service.catalog import history
 from service.catalog.blobs import Blobs
 from service.catalog.changes import Changes
 from service.catalog.database import Database
+from service.catalog.deliveries import Deliveries
 from service.catalog.disk import BALLAST_BYTES, Disk
+from service.catalog.events import Events
 from service.catalog.jobs import Jobs
 from service.catalog.keys import Keys
 from service.catalog.maps import Maps
@@ -18,6 +20,7 @@ from service.catalog.patience import JOBS, REQUESTS, Patience
 from service.catalog.scans import Scans
 from service.catalog.surveys import Surveys
 from service.catalog.versions import Versions
+from service.catalog.webhooks import Webhooks
 from service.settings import Settings
 
 
@@ -35,6 +38,9 @@ class Catalog:
     models: Models
     changes: Changes
     objects: Objects
+    events: Events
+    webhooks: Webhooks
+    deliveries: Deliveries
     jobs: Jobs
     keys: Keys
 
@@ -67,6 +73,9 @@ def open_catalog(settings: Settings, *, migrate: bool = True, patience: Patience
         models=Models(database),
         changes=Changes(database),
         objects=Objects(database),
+        events=Events(database),
+        webhooks=Webhooks(database),
+        deliveries=Deliveries(database),
         jobs=Jobs(database),
         keys=Keys(database),
     )

@@ -11,6 +11,7 @@ from sqlalchemy.orm import InstrumentedAttribute, aliased
 
 from service.catalog import tables
 from service.catalog.database import Database
+from service.catalog.events import FeedCursor, Withdrawn, check_cursor, withdrawn
 from service.catalog.keyset import Key, Order, Values, behind, order_by
 from service.catalog.records import Bounds, ChangeRecord, TileRecord, TileState
 
@@ -73,6 +74,16 @@ class TileFilter:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
+class PublishedChanges:
+    """Some changes in the order in which they were first told."""
+
+    items: tuple[ChangeRecord, ...]
+    withdrawn: tuple[Withdrawn, ...]  #: since the cursor, of this map, whether or not a filter took it
+    matched: int  #: behind the cursor, those of later answers among them
+    cursor: FeedCursor  #: where to go on, also where nothing was told
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
 class ChangePage:
     """Some tiles of a longer list."""
 
@@ -117,6 +128,22 @@ class Changes:
             query = query.where(_TILE.score >= wanted.min_score)
         query = _with_voxels(query, wanted.kind)
         return self._page(_meeting(query, wanted.bounds), tile_order(sort), after, limit)
+
+    def published(self, wanted: ChangeFilter, *, after: FeedCursor, limit: int = 100) -> PublishedChanges:
+        """Return changes behind a cursor in the order of publication, each once. Raises Gone."""
+        query = _matching(wanted).where(_TOLD.published > after.told)
+        with self._database.snapshot() as session:
+            last = check_cursor(session, after.withdrawn)
+            matched = session.scalar(select(func.count()).select_from(query.subquery())) or 0
+            rows = session.execute(query.order_by(_TOLD.published).limit(limit)).all()
+            gone = withdrawn(session, "change.withdrawn", wanted.map_id, after)
+        told = rows[-1][2].published if matched > len(rows) else last
+        return PublishedChanges(
+            items=tuple(_record(*row) for row in rows),
+            withdrawn=gone,
+            matched=matched,
+            cursor=FeedCursor(told, last),
+        )
 
     def of_survey(self, survey_id: str) -> tuple[ChangeRecord, ...]:
         """Return every tile of a survey, unobserved ones too, in the order of the grid."""
@@ -232,4 +259,5 @@ def _record(tile: tables.SurveyTile, survey: tables.Survey, told: tables.TileCha
         first_seen=None if told is None else told.first_seen,
         last_seen=None if told is None else told.last_seen,
         max_score=None if told is None else told.max_score,
+        change_id=None if told is None else told.change_id,
     )

@@ -10,13 +10,14 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any, get_args
 
-from sqlalchemy import ColumnElement, Row, Select, and_, delete, exists, select, tuple_, update
+from sqlalchemy import ColumnElement, Row, Select, and_, exists, select, update
 from sqlalchemy.orm import Session
 
 from service.catalog import tables
 from service.catalog.database import Database
-from service.catalog.records import ObjectStatus, Place
-from service.catalog.stays import Look, Stay, stays
+from service.catalog.publication import tell
+from service.catalog.records import EventType, ObjectStatus, Place, rfc3339
+from service.catalog.stays import Known, Look, Stay, heir, recognized, stays
 from service.catalog.tables import (
     Acceptance,
     MapObject,
@@ -105,32 +106,45 @@ def _rewrite_tiles(session: Session, map_id: str, accepted: Sequence[Acceptance]
     for taken in accepted:
         for tile_id in taken.tiles:
             accepted_in.setdefault(tile_id, []).append(taken.version)
-    before = {(row.survey_id, row.tile_id): row for row in session.scalars(_changes_of(map_id))}
-    told_by: dict[str, set[str]] = {}
-    for survey_id, tile_id in before:
-        told_by.setdefault(tile_id, set()).add(survey_id)
     looks, told = _looks(session, map_id)
-    after: dict[tuple[str, str], Stay] = {}
+    seen_by: dict[tuple[str | None, str], set[str]] = {}
+    for (survey_id, tile_id), teller in told.items():
+        seen_by.setdefault((teller, tile_id), set()).add(survey_id)
+    rows: dict[str, list[TileChange]] = {}
+    for row in session.scalars(_changes_of(map_id)):
+        rows.setdefault(row.tile_id, []).append(row)
     links: list[dict[str, Any]] = []
-    for tile_id, of_tile in looks.items():
-        found = stays(of_tile, accepted_in=accepted_in.get(tile_id, ()), told_by=told_by.get(tile_id, ()))
-        for stay in found:
-            after[stay.told_by, tile_id] = stay
-            links += [
-                {"survey_id": survey_id, "tile_id": tile_id, "told_by": stay.told_by}
-                for survey_id in stay.survey_ids
-                if told[survey_id, tile_id] != stay.told_by
-            ]
+    new: list[TileChange] = []
+    for tile_id in sorted(looks.keys() | rows.keys()):
+        before = rows.get(tile_id, [])
+        told_by = {row.survey_id for row in before}
+        found = stays(looks.get(tile_id, ()), accepted_in=accepted_in.get(tile_id, ()), told_by=told_by)
+        known = [
+            (
+                row,
+                Known(
+                    change_id=row.change_id,
+                    told_by=row.survey_id,
+                    survey_ids=frozenset(seen_by.get((row.survey_id, tile_id), ())),
+                ),
+            )
+            for row in before
+        ]
+        after = _write_changes(session, map_id, tile_id, found, known)
+        links += _links(after, told)
+        new += [row for row, _ in after if row not in before]
     if links:
         session.execute(update(SurveyTile), links)
-    _write_changes(session, before, after)
+    for row in sorted(new, key=lambda row: (-row.max_score, row.tile_id, row.first_seen)):
+        _tell_change(session, row)
 
 
 def _changes_of(map_id: str) -> Select[TileChange]:
+    """Return a query for what was told of a map, oldest first."""
     return (
         select(TileChange)
-        .join(Survey, Survey.survey_id == TileChange.survey_id)
-        .where(Survey.map_id == map_id)
+        .where(TileChange.map_id == map_id)
+        .order_by(TileChange.published, TileChange.change_id)
     )
 
 
@@ -163,18 +177,66 @@ def _looks(session: Session, map_id: str) -> tuple[dict[str, list[Look]], dict[t
 
 def _write_changes(
     session: Session,
-    before: Mapping[tuple[str, str], TileChange],
-    after: Mapping[tuple[str, str], Stay],
-) -> None:
-    gone = [key for key in before if key not in after]
-    if gone:
-        session.execute(delete(TileChange).where(tuple_(TileChange.survey_id, TileChange.tile_id).in_(gone)))
-    for (survey_id, tile_id), stay in after.items():
-        row = before.get((survey_id, tile_id))
+    map_id: str,
+    tile_id: str,
+    found: Sequence[Stay],
+    known: Sequence[tuple[TileChange, Known]],
+) -> list[tuple[TileChange, Stay]]:
+    """Write the changes of one tile: those that go on keep their ids, and those that nobody sees are withdrawn."""
+    rows = {one.change_id: row for row, one in known}
+    named = recognized(found, [one for _, one in known])
+    after: list[tuple[TileChange, Stay]] = []
+    for n, stay in enumerate(found):
+        row = rows[named[n].change_id] if n in named else None
         if row is None:
-            row = TileChange(survey_id=survey_id, tile_id=tile_id)
+            row = TileChange(
+                change_id=new_id("change"), map_id=map_id, tile_id=tile_id, survey_id=stay.told_by
+            )
             session.add(row)
+        if row.survey_id not in stay.survey_ids:
+            row.survey_id = stay.told_by
         row.first_seen, row.last_seen, row.max_score = stay.first_seen, stay.last_seen, stay.max_score
+        after.append((row, stay))
+    going_on = {one.change_id for one in named.values()}
+    for row, one in known:
+        if one.change_id not in going_on:
+            into = heir(found, one)
+            _withdraw_change(session, row, None if into is None else after[into][0].change_id)
+    return after
+
+
+def _links(
+    after: Sequence[tuple[TileChange, Stay]], told: Mapping[tuple[str, str], str | None]
+) -> list[dict[str, Any]]:
+    """Return what has to be written on the tiles of surveys that belong to another change by now."""
+    return [
+        {"survey_id": survey_id, "tile_id": row.tile_id, "told_by": row.survey_id}
+        for row, stay in after
+        for survey_id in stay.survey_ids
+        if told[survey_id, row.tile_id] != row.survey_id
+    ]
+
+
+def _tell_change(session: Session, row: TileChange) -> None:
+    tell(
+        session,
+        "change.told",
+        row.change_id,
+        map_id=row.map_id,
+        publishes=TileChange,
+        change_id=row.change_id,
+        tile_id=row.tile_id,
+        survey_id=row.survey_id,
+        first_seen=rfc3339(row.first_seen),
+        last_seen=rfc3339(row.last_seen),
+        max_score=row.max_score,
+    )
+
+
+def _withdraw_change(session: Session, row: TileChange, merged_into: str | None) -> None:
+    told: dict[str, Any] = {"change_id": row.change_id, "tile_id": row.tile_id, "merged_into": merged_into}
+    tell(session, "change.withdrawn", row.change_id, map_id=row.map_id, **told)
+    session.delete(row)
 
 
 # objects
@@ -194,15 +256,48 @@ def _rewrite_objects(session: Session, map_id: str, accepted: Sequence[Acceptanc
     named = {track.object_id or new_id("object"): track for track in tracks}
     for object_id, track in named.items():
         row = rows.get(object_id)
+        before = None if row is None else (row.last_known, row.accepted_in_version)
         if row is None:
             row = MapObject(object_id=object_id, map_id=map_id, created=now())
             session.add(row)
         _write_track(row, track, sightings)
+        _tell_object(session, row, before)
     for object_id, row in rows.items():
         if object_id not in named:
+            tell(session, "object.withdrawn", object_id, map_id=map_id, object_id=object_id)
             session.delete(row)
     _link(session, named)
     return tracks
+
+
+def _tell_object(session: Session, row: MapObject, before: tuple[str, int | None] | None) -> None:
+    """Tell an object that is new, or what became of one that was known: `before` has its last_known and version."""
+    event = _event_of(row, before)
+    if event is None:
+        return
+    tell(
+        session,
+        event,
+        row.object_id,
+        map_id=row.map_id,
+        publishes=MapObject if before is None else None,
+        object_id=row.object_id,
+        kind=row.kind,
+        status=row.status,
+        survey_id=row.survey_id,
+        probability=row.probability,
+    )
+
+
+def _event_of(row: MapObject, before: tuple[str, int | None] | None) -> EventType | None:
+    if before is None:
+        return "object.told"
+    last_known, accepted_in = before
+    if row.accepted_in_version is not None and accepted_in is None:
+        return "object.accepted"
+    if row.accepted_in_version is None and (row.last_known == "gone_again") != (last_known == "gone_again"):
+        return "object.gone_again" if row.last_known == "gone_again" else "object.seen_again"
+    return None
 
 
 def _link(session: Session, named: Mapping[str, Track]) -> None:

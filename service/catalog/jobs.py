@@ -12,7 +12,7 @@ costs no attempt, and is borne twenty times, with a growing wait.
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from typing import Any, cast
@@ -23,7 +23,8 @@ from sqlalchemy.orm import Session
 from service.catalog import history, tables, tallies
 from service.catalog.database import Database
 from service.catalog.idempotency import ANY_TIMES, Once
-from service.catalog.records import JobRecord, JobStatus, Page, Position, Problem
+from service.catalog.publication import tell
+from service.catalog.records import EventType, JobRecord, JobStatus, Page, Position, Problem, rfc3339
 from service.catalog.steps import STEPS, JobKind, Step, first_step, step_after, step_of
 from service.catalog.steps import Queue as QueueName
 from service.catalog.tables import new_id, now
@@ -330,13 +331,51 @@ class Jobs:
             if not _changed(session, job_id, {**values, **ended}, *where, ran=ran, outcome=outcome):
                 return False
             tallies.tally_job(session, kind=job.kind, outcome=outcome)
+            _tell_end(session, job, status, problem)
             subject = _subject(session, job)
             if subject is not None:
                 subject.status = "ready" if status == "successful" else "failed"
                 subject.updated = instant
+                _tell_subject(session, subject)
                 if subject.status == "ready":
                     history.note(session, subject)
             return True
+
+
+def _tell_end(
+    session: Session, job: tables.Job, status: JobStatus, problem: Mapping[str, Any] | None
+) -> None:
+    tell(
+        session,
+        "job.ended",
+        job.job_id,
+        map_id=job.map_id,
+        job_id=job.job_id,
+        kind=job.kind,
+        status=status,
+        problem=None if problem is None else problem["code"],
+        survey_id=job.survey_id,
+        model=job.model,
+    )
+
+
+def _tell_subject(session: Session, subject: tables.MapVersion | tables.Survey | tables.Model) -> None:
+    """Tell that a version, a survey or a model is ready, or failed."""
+    ready = subject.status == "ready"
+    about: dict[str, Any] = {"map_id": subject.map_id, "job_id": subject.job_id}
+    if isinstance(subject, tables.Survey):
+        event: EventType = "survey.ready" if ready else "survey.failed"
+        about |= {"survey_id": subject.survey_id, "device_id": subject.device_id}
+        about |= {"captured_at": rfc3339(subject.captured_at), "counts": subject.counts}
+        about |= {"objects": subject.objects}
+        tell(session, event, subject.survey_id, **about)
+    elif isinstance(subject, tables.Model):
+        event = "model.ready" if ready else "model.failed"
+        model = f"{subject.name}/{subject.version}"
+        tell(session, event, model, model=model, **about)
+    else:
+        event = "version.ready" if ready else "version.failed"
+        tell(session, event, subject.job_id, version=subject.version, **about)
 
 
 def new_job(

@@ -13,6 +13,7 @@ from service.catalog.blobs import Blobs
 from service.catalog.database import Database
 from service.catalog.idempotency import ANY_TIMES, Once
 from service.catalog.jobs import new_job
+from service.catalog.publication import tell
 from service.catalog.records import (
     Anchor,
     Built,
@@ -127,6 +128,7 @@ class Maps:
             folders += [blob_keys.survey_folder(survey_id) for survey_id in session.scalars(surveys)]
             folders += [blob_keys.model_folder(job_id) for job_id in session.scalars(models)]
             session.delete(row)
+            tell(session, "map.deleted", map_id, map_id=map_id)
         for folder in folders:
             self._blobs.delete_prefix(folder)
 

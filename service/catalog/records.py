@@ -55,6 +55,30 @@ ScanReason = Literal[
 ScanFormat = Literal["ply", "pcd"]
 #: What an API key may do; `admin` is everything.
 Scope = Literal["scans:write", "surveys:write", "maps:write", "changes:read", "admin"]
+WebhookStatus = Literal["active", "disabled"]
+DeliveryKind = Literal["event", "ping", "repeat"]
+DeliveryStatus = Literal["pending", "delivered", "failed"]
+#: What is told; docs/events.md says when, and what an event of each type carries.
+EventType = Literal[
+    "scan.uploaded",
+    "scan.deleted",
+    "job.ended",
+    "map.deleted",
+    "version.ready",
+    "version.failed",
+    "survey.ready",
+    "survey.failed",
+    "survey.deleted",
+    "model.ready",
+    "model.failed",
+    "change.told",
+    "change.withdrawn",
+    "object.told",
+    "object.gone_again",
+    "object.seen_again",
+    "object.accepted",
+    "object.withdrawn",
+]
 Vector2 = tuple[float, float]
 Vector3 = tuple[float, float, float]
 Row4 = tuple[float, float, float, float]
@@ -490,6 +514,55 @@ class ChangeRecord(Record):
     )
     last_seen: Utc | None = None  #: when one last saw it, before it was gone
     max_score: float | None = None  #: over the surveys that saw it
+    change_id: str | None = None  #: the same for as long as the change is told
+
+
+class WebhookRecord(Record):
+    """An address that events are sent to, without its secret."""
+
+    webhook_id: str = Field(examples=["webhook-2d7e"])
+    url: str = Field(examples=["https://example.org/hooks/spicd"])
+    types: tuple[EventType, ...] | None = Field(description="null: all", examples=[["change.told"]])
+    map_id: str | None = Field(description="null: events of all maps, and of none", examples=["lobby"])
+    status: WebhookStatus
+    reason: str | None = Field(
+        description="why it is disabled, or what it missed",
+        examples=["the receiver answered 410 Gone"],
+    )
+    position: int = Field(description="`sequence` of the last event that it needs no more", examples=[1042])
+    attempts: int = Field(description="that failed, at the event behind that", examples=[0])
+    next_attempt: Utc
+    previous_until: Utc | None = Field(description="until when the earlier secret signs as well")
+    created: Utc
+    updated: Utc
+
+
+class DeliveryRecord(Record):
+    """An event that was sent to a webhook, or is to be."""
+
+    delivery_id: str = Field(examples=["delivery-88a0"])
+    webhook_id: str = Field(examples=["webhook-2d7e"])
+    kind: DeliveryKind = Field(description="`ping` and `repeat` are sent once, because somebody asked")
+    event_id: str = Field(description="the `webhook-id` that it is sent under", examples=["event-6b1f0c"])
+    type: str = Field(examples=["change.told"])
+    status: DeliveryStatus
+    attempts: int = Field(examples=[1])
+    answered: int | None = Field(description="HTTP status of the last answer", examples=[204])
+    error: str | None = Field(description="why the last attempt failed", examples=["no answer within 15 s"])
+    created: Utc
+    updated: Utc
+
+
+class EventRecord(Record):
+    """Something that happened."""
+
+    sequence: int  #: in the order of publication, from 1 on, with no gap
+    event_id: str
+    type: EventType
+    map_id: str | None  #: None of scans, which belong to no map
+    subject: str  #: id of what it is about
+    data: dict[str, Any]
+    created: Utc
 
 
 class SightingRecord(Record):

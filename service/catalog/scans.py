@@ -19,6 +19,7 @@ from service.catalog import blob_keys, tables
 from service.catalog.blobs import Blobs
 from service.catalog.clock import clock_warnings
 from service.catalog.database import Database
+from service.catalog.publication import tell
 from service.catalog.records import (
     Matrix,
     Page,
@@ -166,6 +167,7 @@ class Scans:
             with self._database.write() as session:
                 session.add(row)
                 session.flush()
+                tell(session, "scan.uploaded", scan_id, scan_id=scan_id, device_id=row.device_id)
                 return ScanRecord.of_row(row), True
         except DiskFull:  # which says for sure that no row was kept, as a lost connection does not
             self._blobs.delete_prefix(blob_keys.folder_of(key))
@@ -181,10 +183,12 @@ class Scans:
     def _forget(self, *which: ColumnElement[bool]) -> bool:
         """Delete one scan, then the very file that its row named: another of the same bytes may just be coming."""
         with self._database.write() as session:
-            key = session.scalar(delete(tables.Scan).where(*which).returning(tables.Scan.key))
-        if key is None:
-            return False
-        self._blobs.delete_prefix(blob_keys.folder_of(key))
+            columns = (tables.Scan.scan_id, tables.Scan.device_id, tables.Scan.key)
+            gone = session.execute(delete(tables.Scan).where(*which).returning(*columns)).one_or_none()
+            if gone is None:
+                return False
+            tell(session, "scan.deleted", gone.scan_id, scan_id=gone.scan_id, device_id=gone.device_id)
+        self._blobs.delete_prefix(blob_keys.folder_of(gone.key))
         return True
 
     def _sent_again(self, scan_id: str) -> ScanRecord | None:

@@ -33,6 +33,42 @@ class Stay:
     max_score: float
 
 
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Known:
+    """A change of the same tile as it was told so far."""
+
+    change_id: str
+    told_by: str  #: the survey whose tile stood for it
+    survey_ids: frozenset[str]  #: that saw it and are still there
+
+
+def recognized(found: Sequence[Stay], known: Iterable[Known]) -> dict[int, Known]:
+    """Return which of `found` goes on as which change of `known`, by its place; both are of one tile.
+
+    The changes come oldest first. Each goes on as the stay of the visit that stood for it, and where that does not see
+    it any more as the one that shares most visits with it, unless an older change goes on as that.
+    """
+    named: dict[int, Known] = {}
+    for one in known:
+        shares = {n: _shared(stay, one) for n, stay in enumerate(found) if n not in named}
+        best = max(shares, key=lambda n: (shares[n], -n), default=None)
+        if best is not None and shares[best] > (False, 0):
+            named[best] = one
+    return named
+
+
+def heir(found: Sequence[Stay], lost: Known) -> int | None:
+    """Return the place of the stay that a change went up in which is told no more; None where no visit sees it."""
+    shares = {n: _shared(stay, lost) for n, stay in enumerate(found)}
+    best = max(shares, key=lambda n: (shares[n], -n), default=None)
+    return best if best is not None and shares[best] > (False, 0) else None
+
+
+def _shared(stay: Stay, known: Known) -> tuple[bool, int]:
+    """Return whether a stay has the visit that stood for a change, and how many of its visits."""
+    return known.told_by in stay.survey_ids, len(known.survey_ids.intersection(stay.survey_ids))
+
+
 def stays(
     looks: Iterable[Look], *, accepted_in: Collection[int] = (), told_by: Collection[str] = ()
 ) -> list[Stay]:

@@ -16,6 +16,7 @@ from service.catalog.clock import clock_warnings
 from service.catalog.database import Database
 from service.catalog.idempotency import ANY_TIMES, Once
 from service.catalog.jobs import new_job
+from service.catalog.publication import tell
 from service.catalog.records import (
     JobRecord,
     Matrix,
@@ -191,6 +192,7 @@ class Surveys:
             row = _locked(session, survey_id)
             _check_unused(session, row)
             session.delete(row)
+            tell(session, "survey.deleted", survey_id, map_id=row.map_id, survey_id=survey_id)
             if row.status == "ready":
                 history.rewrite(session, row.map_id)
         self._blobs.delete_prefix(blob_keys.survey_folder(survey_id))

@@ -292,11 +292,18 @@ class TileChange(Base):
 
     __tablename__ = "tile_changes"
 
-    survey_id: Mapped[str] = mapped_column(ForeignKey("surveys.id", ondelete="CASCADE"), primary_key=True)
-    tile_id: Mapped[str] = mapped_column(primary_key=True)
+    change_id: Mapped[str] = mapped_column("id", primary_key=True)
+    map_id: Mapped[str] = mapped_column(ForeignKey("maps.id", ondelete="CASCADE"))
+    survey_id: Mapped[str]  # whose tile tells it; no foreign key: another one tells it where that is deleted
+    tile_id: Mapped[str]
     first_seen: Mapped[datetime]
     last_seen: Mapped[datetime]
     max_score: Mapped[float]
+    published: Mapped[int] = mapped_column(
+        BigInteger, server_default="0"
+    )  #: number of the event that told it
+
+    __table_args__ = (Index(None, "survey_id", "tile_id"), Index(None, "map_id", "published"))
 
 
 class SurveyObject(Base):
@@ -342,8 +349,11 @@ class MapObject(Base):
     max_y: Mapped[float]
     max_z: Mapped[float]
     created: Mapped[datetime]
+    published: Mapped[int] = mapped_column(
+        BigInteger, server_default="0"
+    )  #: number of the event that told it
 
-    __table_args__ = (Index(None, "map_id", "first_seen", "id"),)
+    __table_args__ = (Index(None, "map_id", "first_seen", "id"), Index(None, "map_id", "published"))
 
 
 class Acceptance(Base):
@@ -451,3 +461,78 @@ class Tally(Base):
     labels: Mapped[str] = mapped_column(primary_key=True)  #: JSON object, keys in order
     count: Mapped[int] = mapped_column(BigInteger)
     total: Mapped[float]
+
+
+class Event(Base):
+    """Something that happened, numbered in the order in which it could be seen."""
+
+    __tablename__ = "events"
+
+    sequence: Mapped[int] = mapped_column(BigInteger, primary_key=True, autoincrement=False)
+    event_id: Mapped[str] = mapped_column("id")
+    type: Mapped[str]
+    map_id: Mapped[str | None]  # no foreign key: that a map was deleted is told after it
+    subject: Mapped[str]  #: id of what it is about
+    data: Mapped[dict[str, Any]]
+    created: Mapped[datetime]
+
+    __table_args__ = (Index(None, "map_id", "sequence"), Index(None, "created"))
+
+
+class EventLog(Base):
+    """One row: how far the events are numbered, and how far they were swept; none before the first event."""
+
+    __tablename__ = "event_log"
+
+    log_id: Mapped[int] = mapped_column("id", primary_key=True, autoincrement=False)
+    last: Mapped[int] = mapped_column(
+        BigInteger
+    )  #: number of the latest event; its row is locked while one is added
+    swept: Mapped[int] = mapped_column(
+        BigInteger, server_default="0"
+    )  #: the latest that is not kept any more
+
+
+class Webhook(Base):
+    """An address that events are sent to, and how far they were."""
+
+    __tablename__ = "webhooks"
+
+    webhook_id: Mapped[str] = mapped_column("id", primary_key=True)
+    url: Mapped[str]
+    types: Mapped[list[str] | None]  #: None: all
+    map_id: Mapped[str | None]  #: None: all; no foreign key: that the map was deleted is sent as well
+    secret: Mapped[str]  #: as it was shown: a signature needs it
+    previous_secret: Mapped[str | None]
+    previous_until: Mapped[datetime | None]  #: how long that signs as well
+    status: Mapped[str]
+    reason: Mapped[str | None]  #: why it is disabled, or what it missed
+    position: Mapped[int] = mapped_column(BigInteger)  #: number of the last event that it needs no more
+    attempts: Mapped[int]  #: that failed, at the event behind it
+    next_attempt: Mapped[datetime]
+    claim: Mapped[str | None]  #: of the process that sends to it now
+    claimed_until: Mapped[datetime | None]
+    created: Mapped[datetime]
+    updated: Mapped[datetime]
+
+    __table_args__ = (Index(None, "created", "id"),)
+
+
+class WebhookDelivery(Base):
+    """An event that was sent to a webhook, or is to be."""
+
+    __tablename__ = "webhook_deliveries"
+
+    delivery_id: Mapped[str] = mapped_column("id", primary_key=True)
+    webhook_id: Mapped[str] = mapped_column(ForeignKey("webhooks.id", ondelete="CASCADE"))
+    kind: Mapped[str]
+    event_id: Mapped[str]
+    type: Mapped[str]
+    status: Mapped[str]
+    attempts: Mapped[int]
+    answered: Mapped[int | None]  #: HTTP status of the last answer
+    error: Mapped[str | None]  #: why the last attempt failed
+    created: Mapped[datetime]
+    updated: Mapped[datetime]
+
+    __table_args__ = (Index(None, "webhook_id", "created", "id"), Index(None, "status"))

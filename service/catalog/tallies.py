@@ -135,13 +135,18 @@ class Sample:
 
 def add(session: Session, name: str, labels: Mapping[str, str], value: float = 1.0) -> None:
     """Count `value` under a name and labels, if the session's transaction commits."""
+    entry = noted_in(session).setdefault((name, _text(labels)), [0, 0.0])
+    entry[0] += 1
+    entry[1] += value
+
+
+def noted_in(session: Session) -> dict[tuple[str, str], list[float]]:
+    """Return what a session has noted so far, by name and labels; from now on it is written when it commits."""
     noted: dict[tuple[str, str], list[float]] | None = session.info.get(_NOTED)
     if noted is None:
         noted = session.info[_NOTED] = {}
         event.listen(session, "before_commit", _write)
-    entry = noted.setdefault((name, _text(labels)), [0, 0.0])
-    entry[0] += 1
-    entry[1] += value
+    return noted
 
 
 def read(session: Session) -> tuple[Sample, ...]:

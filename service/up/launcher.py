@@ -238,6 +238,21 @@ def _each(*calls: Callable[[], None]) -> Callable[[], None]:
     return call_all
 
 
+class _Server(uvicorn.Server):
+    """Ends those who listen for events before it waits for requests: they would listen for minutes."""
+
+    def __init__(self, config: uvicorn.Config, app: FastAPI) -> None:
+        super().__init__(config)
+        self._app = app
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """End the listeners, then the requests, then the app."""
+        services = getattr(self._app.state, "services", None)  # a test may bring an app without
+        if services is not None:
+            services.listeners.end()
+        await super().shutdown(sockets)
+
+
 @contextmanager
 def _serve(app: FastAPI, listening: socket.socket, settings: Settings) -> Iterator[_Api]:
     """Serve the API in a thread, from its first answer on; requests that run at the end have the grace to finish."""
@@ -251,7 +266,7 @@ def _serve(app: FastAPI, listening: socket.socket, settings: Settings) -> Iterat
         timeout_keep_alive=KEEP_ALIVE_S,
         timeout_graceful_shutdown=settings.shutdown_grace_s,
     )
-    server = uvicorn.Server(config)
+    server = _Server(config, app)
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listening]}, name="api", daemon=True)
     thread.start()
     until = time.monotonic() + _API_STARTS_S

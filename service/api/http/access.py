@@ -68,6 +68,16 @@ SCOPES: Mapping[tuple[str, str], Scopes] = {
     ("GET", "/maps/{map_id}/changes"): _READ,
     ("GET", "/maps/{map_id}/objects"): _READ,
     ("GET", "/maps/{map_id}/objects/{object_id}"): _READ,
+    ("GET", "/events"): _READ,  # of the key's maps, where it is bound to some
+    ("POST", "/webhooks"): _MAPS,
+    ("GET", "/webhooks"): _MAPS,
+    ("GET", "/webhooks/{webhook_id}"): _MAPS,
+    ("PATCH", "/webhooks/{webhook_id}"): _MAPS,
+    ("DELETE", "/webhooks/{webhook_id}"): _MAPS,
+    ("POST", "/webhooks/{webhook_id}/ping"): _MAPS,
+    ("POST", "/webhooks/{webhook_id}/rotate"): _MAPS,
+    ("GET", "/webhooks/{webhook_id}/deliveries"): _MAPS,
+    ("POST", "/webhooks/{webhook_id}/deliveries/{delivery_id}/repeat"): _MAPS,
     ("GET", "/jobs"): _READ,
     ("GET", "/jobs/{job_id}"): _READ | _SURVEYS | _MAPS,
     ("GET", "/jobs/{job_id}/results"): _READ | _SURVEYS | _MAPS,
@@ -186,6 +196,8 @@ def _check_maps(
         map_id = catalog.surveys.get(ids["survey_id"]).map_id
     elif "job_id" in ids:
         map_id = catalog.jobs.get(ids["job_id"]).map_id
+    elif "webhook_id" in ids:  # one of no map in particular is none of theirs
+        map_id = catalog.webhooks.get(ids["webhook_id"]).map_id or ""
     if map_id is not None and map_id not in maps:
         raise Forbidden(f"key {key.key_id!r} is bound to {_listed(maps)}, and this is of another map")
 

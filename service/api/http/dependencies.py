@@ -9,6 +9,7 @@ from fastapi import Depends, Request
 
 from service.api.http.cards import Cards
 from service.api.http.lanes import Lane
+from service.api.http.listeners import Listeners
 from service.catalog.catalog import Catalog
 from service.catalog.steps import JobKind
 from service.dispatch import Dispatcher, Hands
@@ -35,6 +36,7 @@ class Services:
     dispatcher: Dispatcher
     cards: Cards
     writes: Lane  #: threads of what changes something; reads have the framework's
+    listeners: Listeners  #: for events
     uploads: Lane  #: and of what takes files into the blob store besides, which lasts longer
 
 

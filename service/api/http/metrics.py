@@ -215,7 +215,9 @@ class MetricsMiddleware:
             route = getattr(scope.get("route"), "path", "none")
             method = scope["method"] if scope["method"] in _METHODS else "other"
             self._metrics.requests.labels(method, route, str(status)).inc()
-            self._metrics.seconds.labels(method, route).observe(time.perf_counter() - started)
+            if route not in _WAITING:
+                self._metrics.seconds.labels(method, route).observe(time.perf_counter() - started)
 
 
+_WAITING = frozenset({"/events"})  #: answered when something happens: how long that took says nothing
 _METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"})

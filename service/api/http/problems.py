@@ -35,6 +35,7 @@ PROBLEMS: dict[str, tuple[int | None, str]] = {
     "bad_request": (422, "A value cannot be used"),
     "invalid_request": (422, "The request does not match the API"),
     "scan_unreadable": (422, "The file is no sound scan"),
+    "gone": (410, "It is not kept any more"),
     "too_large": (413, "The body is too large"),
     "too_slow": (408, "The body took too long"),
     "wrong_media_type": (415, "The media type is not taken here"),

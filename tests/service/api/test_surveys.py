@@ -143,7 +143,9 @@ def test_the_tiles_are_features_in_the_frame_of_the_map(client: TestClient, cata
         "first_seen": "2026-03-01T12:00:00Z",
         "last_seen": "2026-03-01T12:00:00Z",
         "max_score": 0.93,
+        "change_id": changed["properties"]["change_id"],
     }
+    assert changed["properties"]["change_id"].startswith("change-")
     assert unobserved["properties"]["first_seen"] is None
     assert unobserved["properties"]["state"] == "unobserved"
     assert unobserved["properties"]["score"] is None

@@ -7,7 +7,7 @@ from datetime import timedelta
 
 import pytest
 
-from service.catalog.stays import Look, stays
+from service.catalog.stays import Known, Look, Stay, heir, recognized, stays
 from tests.support.samples import NOON
 
 
@@ -67,3 +67,42 @@ def test_a_visit_compared_with_the_new_map_does_not_end_a_change_against_the_old
 
 def test_a_tile_that_never_changed_has_no_stay() -> None:
     assert stays([look(1, None), look(2, None)]) == []
+
+
+# which change goes on as which
+
+
+def known(change: str, told_by: int, *days: int) -> Known:
+    """A change that the survey of `told_by` stood for, and the surveys of some days saw."""
+    return Known(
+        change_id=change,
+        told_by=f"survey-{told_by}",
+        survey_ids=frozenset(f"survey-{day}" for day in days),
+    )
+
+
+def names(found: list[Stay], *before: Known) -> dict[int, str]:
+    return {n: one.change_id for n, one in recognized(found, before).items()}
+
+
+def test_a_change_goes_on_as_the_stay_that_has_the_visit_which_stood_for_it() -> None:
+    found = stays([look(1, 0.6), look(2, 0.6), look(3, None), look(4, 0.6)])
+    assert names(found, known("a", 4, 1, 2, 4)) == {1: "a"}
+
+
+def test_where_that_visit_is_gone_it_goes_on_as_the_one_that_shares_most() -> None:
+    found = stays([look(1, 0.6), look(2, None), look(3, 0.6), look(4, 0.6)])
+    assert names(found, known("a", 9, 1, 3, 4)) == {1: "a"}
+
+
+def test_of_two_that_are_one_the_older_goes_on_and_the_other_has_an_heir() -> None:
+    found = stays([look(1, 0.6), look(3, 0.6)])
+    newer = known("newer", 1, 1)
+    assert names(found, known("older", 3, 3), newer) == {0: "older"}
+    assert heir(found, newer) == 0
+
+
+def test_a_change_of_which_no_visit_is_left_goes_on_as_none() -> None:
+    found = stays([look(5, 0.6)])
+    assert names(found, known("a", 1, 1, 2)) == {}
+    assert heir(found, known("a", 1, 1, 2)) is None

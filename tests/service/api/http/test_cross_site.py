@@ -105,6 +105,17 @@ def test_the_names_of_the_service_are_those_set_or_those_that_are_safe(
     assert (names is None or answers_to(name, names)) is answered
 
 
+@pytest.mark.parametrize(
+    ("path", "method", "header"),
+    [("/events", "GET", "last-event-id"), ("/webhooks/webhook-1", "PATCH", "content-type")],
+)
+def test_a_named_dashboard_may_follow_a_stream_and_change_a_webhook(
+    named: TestClient, path: str, method: str, header: str
+) -> None:
+    asked = {"Access-Control-Request-Method": method, "Access-Control-Request-Headers": header}
+    assert named.options(path, headers={"Origin": DASHBOARD, **asked}).status_code == 200
+
+
 def test_a_named_dashboard_may_read_and_change(named: TestClient) -> None:
     preflight = named.options(
         "/scans",

@@ -65,6 +65,13 @@ def test_tallies_are_counters_and_sums(client: TestClient, catalog: Catalog) -> 
     assert found["spicd_step_wait_seconds_sum", "map", "lost", "encode"] == 1.5
 
 
+def test_a_request_that_waits_for_events_is_counted_and_is_not_slow(client: TestClient) -> None:
+    assert client.get("/events").status_code == 200
+    found = scraped(client)
+    assert found["spicd_requests_total", "GET", "/events", "200"] == 1
+    assert ("spicd_request_seconds_count", "GET", "/events") not in found
+
+
 def test_every_measure_is_told_of_before_anything_is_counted(client: TestClient) -> None:
     told = client.get("/metrics").text
     for measure in tallies.MEASURES:

@@ -1,0 +1,62 @@
+"""Lists in the order of publication: a reader gives the cursor of the last answer, and misses and repeats nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Annotated, Any
+
+from fastapi import Request as HttpRequest
+from pydantic import AfterValidator, Field
+
+from service.api.http.documents import Document, Link, link
+from service.catalog.events import FeedCursor, Withdrawn
+from service.errors import BadRequest
+
+
+def _checked(text: str) -> str:
+    FeedCursor.read(text)
+    return text
+
+
+After = Annotated[
+    Annotated[str, AfterValidator(_checked)] | None,
+    Field(
+        description="what was published since: the `cursor` of an earlier answer, or 0 for the beginning; the order is "
+        "then that of publication",
+        examples=["0"],
+    ),
+]
+
+FEED_CURSOR = Field(
+    None, description="with `after` alone: what to give as `after` next time, also where nothing was found"
+)
+FEED_WITHDRAWN = Field(None, description="with `after` alone: what was told before, and is not any more")
+
+
+class WithdrawnDocument(Document):
+    """Something that is told no more: a survey was deleted, or a late visit joined two into one."""
+
+    id: str = Field(examples=["change-5c02"])
+    merged_into: str | None = Field(
+        description="the change that it turned out to be", examples=["change-11fe"]
+    )
+
+
+def require_alone(**asked: object) -> None:
+    """Raise BadRequest where `after` comes with a parameter that has another order or another identity."""
+    others = [name for name, value in asked.items() if name != "after" and value]
+    if others:
+        raise BadRequest(f"after goes in the order of publication, and not together with {others[0]}")
+
+
+def feed_next(request: HttpRequest, cursor: FeedCursor, media_type: str) -> Link:
+    """Return the link to what comes behind an answer, which is there also where nothing is yet."""
+    path = request.url.path.removeprefix(request.scope.get("root_path", ""))
+    following = request.url.include_query_params(after=str(cursor))
+    return link(request, f"{path}?{following.query}", "next", media_type)
+
+
+def feed_members(cursor: FeedCursor, withdrawn: Iterable[Withdrawn]) -> dict[str, Any]:
+    """Return the members of an answer that a reader goes on by."""
+    gone = [{"id": one.subject, "merged_into": one.merged_into} for one in withdrawn]
+    return {"cursor": str(cursor), "withdrawn": gone}
