@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Annotated
 
 import typer
@@ -41,7 +42,7 @@ def jobs(
         terminal.ask(lambda client: client.job(job_id), _whole)
 
 
-def _table(jobs: list[Document]) -> Table:
+def _table(jobs: Sequence[Document]) -> Table:
     table = columns("job", "kind", "status", "progress", "message", "created")
     for job in jobs:
         status = Text(job["status"], style=_STYLES.get(job["status"], ""))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Annotated
 
 import typer
@@ -55,7 +56,7 @@ def delete(ctx: typer.Context, map_id: str) -> None:
     terminal.delete(lambda client: client.delete_map(map_id), f"map {map_id}", map_id=map_id)
 
 
-def _table(maps: list[Document]) -> Table:
+def _table(maps: Sequence[Document]) -> Table:
     table = columns("map", "name", "status", "scans", "counts", "created")
     for one in maps:
         scans = str(len(one.get("scans", [])))
@@ -69,5 +70,6 @@ def _whole(document: Document) -> Group:
     about = {"map": document["map_id"]}
     rows = {"counts": counts(document), "objects": counts(document, "objects"), "bounds (m)": corners}
     return Group(
-        facts(about | document, "map", "name", "version", "status", "model", **rows), scan_table(document)
+        facts({**about, **document}, "map", "name", "version", "status", "model", **rows),
+        scan_table(document),
     )

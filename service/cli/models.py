@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Annotated
 
 import typer
@@ -40,7 +41,7 @@ def train(
         terminal.accepted(client, f"model {model}", accepted, wait, lambda: client.model(model), _whole)
 
 
-def _table(cards: list[Document]) -> Table:
+def _table(cards: Sequence[Document]) -> Table:
     table = columns("model", "detector", "threshold", "summary")
     for card in cards:
         table.add_row(_name(card), *(str(card.get(key, "")) for key in ("detector", "threshold", "summary")))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Annotated
 
 import typer
@@ -71,7 +71,7 @@ def changes(
     terminal.ask(lambda client: client.changes(map_id, **filters), _change_table)
 
 
-def _table(surveys: list[Document]) -> Table:
+def _table(surveys: Sequence[Document]) -> Table:
     table = columns("survey", "status", "captured", "scans", "placement", "counts")
     for one in surveys:
         scans = str(len(one.get("scans", [])))
@@ -108,7 +108,7 @@ def _whole(url: str) -> Callable[[Document], Group]:
         elif (survey.get("placement") or {}).get("state") == "refused":
             rows["picture"] = f"{here}/picture.png"
         names = ("survey", "map", "status", "captured", "model", "threshold")
-        return Group(facts(survey | about, *names, **rows), scan_table(survey))
+        return Group(facts({**survey, **about}, *names, **rows), scan_table(survey))
 
     return draw
 

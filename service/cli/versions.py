@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Annotated
 
 import typer
@@ -64,7 +65,7 @@ def _made_from(one: Document) -> str:
     return f"version {base} and {f'survey {survey_id}' if survey_id else 'further scans'}"
 
 
-def _table(versions: list[Document]) -> Table:
+def _table(versions: Sequence[Document]) -> Table:
     table = columns("version", "status", "made from", "scans", "counts", "created")
     for one in versions:
         scans = str(len(one.get("scans", [])))

@@ -107,7 +107,7 @@ def service(monkeypatch: pytest.MonkeyPatch) -> Service:
     monkeypatch.delenv("SPICD_URL", raising=False)
     monkeypatch.setenv("COLUMNS", "200")
     monkeypatch.setattr(terminal, "Client", lambda url: Client(url, transport=httpx.MockTransport(service)))
-    monkeypatch.setattr("service.client.time.sleep", lambda seconds: None)
+    monkeypatch.setattr("time.sleep", lambda seconds: None)
     return service
 
 

@@ -1,0 +1,107 @@
+"""Following what happens: changes by cursor, events by SSE, and webhooks that have them sent."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator, Sequence
+from typing import Any
+
+import anyio
+import httpx
+from httpx_sse import EventSource
+
+from service.client.asynchronous.connection import AsyncConnection
+from service.client.documents import TileCollection
+from service.client.feeds import (
+    FROM_THE_START,
+    ChangesPage,
+    Delivery,
+    Event,
+    NewWebhook,
+    Webhook,
+    cursor_of,
+    event_of,
+)
+from service.client.requests import given, quoted
+
+
+class AsyncFeeds(AsyncConnection):
+    """The calls of a dashboard."""
+
+    async def follow_changes(
+        self, map_id: str, *, after: str | None = None, every_s: float = 5.0, **filters: Any
+    ) -> AsyncIterator[ChangesPage]:
+        """Yield the changes of a map as they are published, page by page, and wait for more without end.
+
+        Whoever keeps `after` of each page once it is dealt with, and gives it back later, misses no change and sees
+        none twice. Left out: all changes from the first on. Filters are those of the API.
+        """
+        path = f"/maps/{quoted(map_id)}/changes"
+        cursor = FROM_THE_START if after is None else after
+        while True:
+            query = given(**filters, after=cursor)
+            page = await self._json(TileCollection, "GET", path, params=query)
+            cursor = cursor_of(page)
+            if page["features"]:
+                yield ChangesPage(features=page["features"], after=cursor)
+            else:
+                await anyio.sleep(every_s)
+
+    async def events(
+        self, *, types: Sequence[str] = (), map_id: str | None = None, after: str | None = None
+    ) -> AsyncIterator[Event]:
+        """Yield what happens as it happens, without end; a connection that breaks is taken up behind the last event.
+
+        `after` is the id of the last event that was dealt with; left out: from now on. Raises `Unreachable` once
+        the service is away for longer than `retries` says.
+        """
+        last, fruitless = after, 0
+        while True:
+            async for event in self._listen(given(type=list(types) or None, map_id=map_id), last):
+                last, fruitless = event["id"], 0
+                yield event
+            fruitless += 1
+            await anyio.sleep(self.retries.pause_s(fruitless))
+
+    async def _listen(self, query: dict[str, Any], last: str | None) -> AsyncIterator[Event]:
+        """Yield the events of one connection until it ends or breaks."""
+        headers = {"Accept": "text/event-stream", **given(**{"Last-Event-ID": last})}
+        answer = await self._send("GET", "/events", params=query, headers=headers, stream=True)
+        try:
+            async for told in EventSource(answer).aiter_sse():
+                if told.data:
+                    yield event_of(told)
+        except httpx.TransportError:
+            return  # taken up by who listens
+        finally:
+            await answer.aclose()
+
+    async def create_webhook(
+        self, url: str, *, types: Sequence[str] | None = None, map_id: str | None = None
+    ) -> NewWebhook:
+        """Have events sent to an address; the answer tells the secret of the signatures, now and never again."""
+        body = given(url=url, types=None if types is None else list(types), map_id=map_id)
+        return await self._json(NewWebhook, "POST", "/webhooks", json=body)
+
+    async def webhooks(self) -> list[Webhook]:
+        """Return every webhook."""
+        return await self._all(Webhook, "/webhooks", "webhooks")
+
+    async def webhook(self, webhook_id: str) -> Webhook:
+        """Return one webhook."""
+        return await self._json(Webhook, "GET", f"/webhooks/{quoted(webhook_id)}")
+
+    async def delete_webhook(self, webhook_id: str) -> None:
+        """Have no more events sent."""
+        await self._delete(f"/webhooks/{quoted(webhook_id)}")
+
+    async def ping_webhook(self, webhook_id: str) -> None:
+        """Have an event sent that says nothing but that it arrives."""
+        await self._send("POST", f"/webhooks/{quoted(webhook_id)}/ping")
+
+    async def rotate_webhook(self, webhook_id: str) -> NewWebhook:
+        """Change the secret; for a day what is sent bears the signatures of both."""
+        return await self._json(NewWebhook, "POST", f"/webhooks/{quoted(webhook_id)}/rotate")
+
+    async def deliveries(self, webhook_id: str) -> list[Delivery]:
+        """Return what was sent to a webhook, and what is still to be, newest first."""
+        return await self._all(Delivery, f"/webhooks/{quoted(webhook_id)}/deliveries", "deliveries")

@@ -1,0 +1,81 @@
+"""What the service tells as it happens: pages of changes, events and webhooks."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from typing import Any, Literal, NotRequired, TypedDict, cast
+from urllib.parse import parse_qs, urlsplit
+
+from httpx_sse import ServerSentEvent
+
+from service.client.documents import TileFeature
+from service.client.errors import ClientError, Document
+
+FROM_THE_START = "0"  #: the cursor before everything that was ever published
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ChangesPage:
+    """Changes that were published since the page before it."""
+
+    features: list[TileFeature]  #: in the order of their publication, each once; one at least
+    after: str  #: behind the last of them: what `follow_changes` takes to go on from here
+
+
+class Event(TypedDict):
+    """What happened, a CloudEvents 1.0 document."""
+
+    specversion: Literal["1.0"]
+    id: str  #: the same however often it is delivered; what `events(after=)` takes
+    type: str  #: such as `survey.ready`
+    source: str
+    time: str  #: RFC 3339
+    subject: NotRequired[str]
+    data: dict[str, Any]  #: ids and links; the things themselves are asked for
+
+
+class Webhook(TypedDict):
+    """An address that events are sent to."""
+
+    webhook_id: str
+    url: str
+    types: list[str] | None  #: None: all
+    map_id: str | None  #: None: of all maps
+
+
+class NewWebhook(Webhook):
+    """The same, as it is told once: when it is made, and when its secret is changed."""
+
+    secret: str  #: what the signatures are made with, `whsec_...` (Standard Webhooks)
+
+
+class Delivery(TypedDict):
+    """One event on its way to a webhook."""
+
+    event_id: str
+    type: str
+    status: str
+    attempts: int
+
+
+def event_of(told: ServerSentEvent) -> Event:
+    """Return the event of a server-sent one. Raises ClientError where its data is no JSON object."""
+    try:
+        document = json.loads(told.data)
+    except ValueError:
+        document = None
+    if not isinstance(document, dict):
+        raise ClientError("an event came that is no JSON object; is this the service?")
+    return cast(Event, {"id": told.id, "type": told.event, **document})
+
+
+def cursor_of(page: Document) -> str:
+    """Return the cursor behind a page of changes, from its link `next`. Raises ClientError where it has none."""
+    links = (link["href"] for link in page.get("links", ()) if link.get("rel") == "next")
+    after = parse_qs(urlsplit(next(links, "")).query).get("after")
+    if after is None:
+        raise ClientError(
+            "the service does not tell changes in the order of their publication; is it 0.2 or later?"
+        )
+    return after[0]
