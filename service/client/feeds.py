@@ -9,7 +9,7 @@ from urllib.parse import parse_qs, urlsplit
 
 from httpx_sse import ServerSentEvent
 
-from service.client.documents import TileFeature
+from service.client.documents import TileCollection, TileFeature
 from service.client.errors import ClientError, Document
 
 FROM_THE_START = "0"  #: the cursor before everything that was ever published
@@ -19,7 +19,8 @@ FROM_THE_START = "0"  #: the cursor before everything that was ever published
 class ChangesPage:
     """Changes that were published since the page before it."""
 
-    features: list[TileFeature]  #: in the order of their publication, each once; one at least
+    features: list[TileFeature]  #: in the order of their publication, each once
+    withdrawn: list[Document]  #: what was told before and holds no more
     after: str  #: behind the last of them: what `follow_changes` takes to go on from here
 
 
@@ -27,9 +28,10 @@ class Event(TypedDict):
     """What happened, a CloudEvents 1.0 document."""
 
     specversion: Literal["1.0"]
-    id: str  #: the same however often it is delivered; what `events(after=)` takes
+    id: str  #: the same on every way, and however often it is delivered
+    sequence: str  #: in the order of publication; what `events(after=)` takes
     type: str  #: such as `survey.ready`
-    source: str
+    source: str  #: such as `/maps/lobby`
     time: str  #: RFC 3339
     subject: NotRequired[str]
     data: dict[str, Any]  #: ids and links; the things themselves are asked for
@@ -67,15 +69,16 @@ def event_of(told: ServerSentEvent) -> Event:
         document = None
     if not isinstance(document, dict):
         raise ClientError("an event came that is no JSON object; is this the service?")
-    return cast(Event, {"id": told.id, "type": told.event, **document})
+    return cast(Event, document)
 
 
-def cursor_of(page: Document) -> str:
-    """Return the cursor behind a page of changes, from its link `next`. Raises ClientError where it has none."""
+def changes_page(page: TileCollection) -> ChangesPage:
+    """Return a page with the cursor behind it, from its link `next`. Raises ClientError where it has none."""
     links = (link["href"] for link in page.get("links", ()) if link.get("rel") == "next")
     after = parse_qs(urlsplit(next(links, "")).query).get("after")
     if after is None:
         raise ClientError(
             "the service does not tell changes in the order of their publication; is it 0.2 or later?"
         )
-    return after[0]
+    withdrawn = cast(Document, page).get("withdrawn", [])
+    return ChangesPage(features=page["features"], withdrawn=withdrawn, after=after[0])

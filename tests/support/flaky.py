@@ -24,7 +24,9 @@ FEATURES = [
     }
     for number in range(25)
 ]
-EVENTS = [{"id": f"event-{number}", "type": "survey.ready"} for number in range(12)]
+EVENTS = [
+    {"id": f"event-{number:x}", "sequence": str(number), "type": "survey.ready"} for number in range(100, 112)
+]
 
 
 class Flaky:
@@ -95,10 +97,7 @@ class Flaky:
                 done = {"jobID": job_id, "status": "successful", "progress": 100, "message": ""}
                 return document(200, done)
             case ["events"]:
-                last = headers.get("last-event-id")
-                start = 0 if last is None else int(last.partition("-")[2]) + 1
-                told = "".join(f"id: {one['id']}\ndata: {json.dumps(one)}\n\n" for one in EVENTS[start:])
-                return 200, {"Content-Type": "text/event-stream"}, told.encode()
+                return stream(int(headers.get("last-event-id", "99")))
         return not_found("/".join(parts))
 
     def _make(self, kind: str, said: Any) -> Answer:
@@ -113,6 +112,15 @@ def not_found(path: str) -> Answer:
 
 def document(status: int, content: Any) -> Answer:
     return status, {"Content-Type": "application/json"}, json.dumps(content).encode()
+
+
+def stream(last: int) -> Answer:
+    """Tell where the stream stands, the next five events, and give a sign of life."""
+    rest = [one for one in EVENTS if int(one["sequence"]) > last][:5]
+    told = "".join(f"id: {one['sequence']}\ndata: {json.dumps(one)}\n\n" for one in rest)
+    alive = f": \nid: {rest[-1]['sequence'] if rest else last}\n\n"
+    content = f"retry: 2000\nid: {last}\n\n{told}{alive}"
+    return 200, {"Content-Type": "text/event-stream"}, content.encode()
 
 
 def ranged(content: bytes, headers: dict[str, str]) -> Answer:

@@ -49,9 +49,12 @@ class AsyncClient(AsyncFeeds):
         device_id: str | None = None,
         captured_at: str | None = None,
         pose: Pose | None = None,
+        frame: str | None = None,
         on_sent: OnSent | None = None,
     ) -> ScanDocument:
         """Send one PLY or PCD, streamed from disk; `captured_at` is RFC 3339, `pose` map_from_sensor in metres.
+
+        `frame` is the name of the frame that the pose leads to, such as `map` or `odom`.
 
         Raises OSError where the file cannot be read.
         """
@@ -60,6 +63,7 @@ class AsyncClient(AsyncFeeds):
             device_id=device_id,
             captured_at=captured_at,
             pose=None if pose is None else json.dumps([list(row) for row in pose]),
+            frame=frame,
         )
         body = AsyncBody(source, on_sent)
         headers = {"Content-Type": "application/octet-stream", "Content-Length": str(body.size)}

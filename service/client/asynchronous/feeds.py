@@ -7,7 +7,7 @@ from typing import Any
 
 import anyio
 import httpx
-from httpx_sse import EventSource
+from httpx_sse import EventSource, ServerSentEvent
 
 from service.client.asynchronous.connection import AsyncConnection
 from service.client.documents import TileCollection
@@ -18,7 +18,7 @@ from service.client.feeds import (
     Event,
     NewWebhook,
     Webhook,
-    cursor_of,
+    changes_page,
     event_of,
 )
 from service.client.requests import given, quoted
@@ -40,36 +40,39 @@ class AsyncFeeds(AsyncConnection):
         while True:
             query = given(**filters, after=cursor)
             page = await self._json(TileCollection, "GET", path, params=query)
-            cursor = cursor_of(page)
-            if page["features"]:
-                yield ChangesPage(features=page["features"], after=cursor)
+            told = changes_page(page)
+            if told.features or told.withdrawn:
+                yield told
             else:
                 await anyio.sleep(every_s)
+            cursor = told.after
 
     async def events(
         self, *, types: Sequence[str] = (), map_id: str | None = None, after: str | None = None
     ) -> AsyncIterator[Event]:
         """Yield what happens as it happens, without end; a connection that breaks is taken up behind the last event.
 
-        `after` is the id of the last event that was dealt with; left out: from now on. Raises `Unreachable` once
-        the service is away for longer than `retries` says.
+        `after` is the `sequence` of the last event that was dealt with, or "0" for the first that is kept; left out:
+        from now on. Raises `Unreachable` once the service is away for longer than `retries` says, and
+        `RequestRefused` (410) where what comes after `after` is not kept any more.
         """
+        query = given(type=list(types) or None, map=map_id)
         last, fruitless = after, 0
         while True:
-            async for event in self._listen(given(type=list(types) or None, map_id=map_id), last):
-                last, fruitless = event["id"], 0
-                yield event
+            async for told in self._listen(query, last):
+                last, fruitless = told.id or last, 0
+                if told.data:  # a sign of life has none, and moves the cursor as well
+                    yield event_of(told)
             fruitless += 1
             await anyio.sleep(self.retries.pause_s(fruitless))
 
-    async def _listen(self, query: dict[str, Any], last: str | None) -> AsyncIterator[Event]:
-        """Yield the events of one connection until it ends or breaks."""
+    async def _listen(self, query: dict[str, Any], last: str | None) -> AsyncIterator[ServerSentEvent]:
+        """Yield what one connection tells until it ends or breaks."""
         headers = {"Accept": "text/event-stream", **given(**{"Last-Event-ID": last})}
         answer = await self._send("GET", "/events", params=query, headers=headers, stream=True)
         try:
             async for told in EventSource(answer).aiter_sse():
-                if told.data:
-                    yield event_of(told)
+                yield told
         except httpx.TransportError:
             return  # taken up by who listens
         finally:

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 import httpx
-from httpx_sse import EventSource
+from httpx_sse import EventSource, ServerSentEvent
 
 from service.client.documents import TileCollection
 from service.client.feeds import (
@@ -18,7 +18,7 @@ from service.client.feeds import (
     Event,
     NewWebhook,
     Webhook,
-    cursor_of,
+    changes_page,
     event_of,
 )
 from service.client.requests import given, quoted
@@ -41,36 +41,39 @@ class Feeds(Connection):
         while True:
             query = given(**filters, after=cursor)
             page = self._json(TileCollection, "GET", path, params=query)
-            cursor = cursor_of(page)
-            if page["features"]:
-                yield ChangesPage(features=page["features"], after=cursor)
+            told = changes_page(page)
+            if told.features or told.withdrawn:
+                yield told
             else:
                 time.sleep(every_s)
+            cursor = told.after
 
     def events(
         self, *, types: Sequence[str] = (), map_id: str | None = None, after: str | None = None
     ) -> Iterator[Event]:
         """Yield what happens as it happens, without end; a connection that breaks is taken up behind the last event.
 
-        `after` is the id of the last event that was dealt with; left out: from now on. Raises `Unreachable` once
-        the service is away for longer than `retries` says.
+        `after` is the `sequence` of the last event that was dealt with, or "0" for the first that is kept; left out:
+        from now on. Raises `Unreachable` once the service is away for longer than `retries` says, and
+        `RequestRefused` (410) where what comes after `after` is not kept any more.
         """
+        query = given(type=list(types) or None, map=map_id)
         last, fruitless = after, 0
         while True:
-            for event in self._listen(given(type=list(types) or None, map_id=map_id), last):
-                last, fruitless = event["id"], 0
-                yield event
+            for told in self._listen(query, last):
+                last, fruitless = told.id or last, 0
+                if told.data:  # a sign of life has none, and moves the cursor as well
+                    yield event_of(told)
             fruitless += 1
             time.sleep(self.retries.pause_s(fruitless))
 
-    def _listen(self, query: dict[str, Any], last: str | None) -> Iterator[Event]:
-        """Yield the events of one connection until it ends or breaks."""
+    def _listen(self, query: dict[str, Any], last: str | None) -> Iterator[ServerSentEvent]:
+        """Yield what one connection tells until it ends or breaks."""
         headers = {"Accept": "text/event-stream", **given(**{"Last-Event-ID": last})}
         answer = self._send("GET", "/events", params=query, headers=headers, stream=True)
         try:
             for told in EventSource(answer).iter_sse():
-                if told.data:
-                    yield event_of(told)
+                yield told
         except httpx.TransportError:
             return  # taken up by who listens
         finally:

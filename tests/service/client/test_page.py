@@ -56,6 +56,6 @@ def test_the_dashboard_follows(service: tuple[Flaky, Path], capsys: pytest.Captu
     run(PROGRAMS[2], service[0])
     assert capsys.readouterr().out.split() == [
         *(f"change-{number}" for number in range(4)),
-        "event-0",
+        "event-64",
         "survey.ready",
     ]

@@ -73,7 +73,7 @@ METHODS = {
     "surveys": "map_id",
     "tiles": "survey_id",
     "train_model": "map_id name base minutes epochs",
-    "upload_scan": "source filename device_id captured_at pose on_sent",
+    "upload_scan": "source filename device_id captured_at pose frame on_sent",
     "version": "map_id version",
     "versions": "map_id",
     "wait": "job_id on_progress every_s",
