@@ -9,6 +9,7 @@ import typer
 from rich.console import Group
 from rich.table import Table
 
+from service.cli.completion import MapId
 from service.cli.tables import columns, facts, number
 from service.cli.terminal import Terminal, Wait
 from service.client import Document
@@ -24,7 +25,7 @@ def list_(ctx: typer.Context) -> None:
 
 def train(
     ctx: typer.Context,
-    map_id: str,
+    map_id: MapId,
     name: Annotated[str | None, typer.Option(help="Left out: the map's id and `-net`.")] = None,
     base: Annotated[
         str | None, typer.Option(help="`name/version` to train further; left out: from nothing.")

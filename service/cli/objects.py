@@ -7,6 +7,7 @@ from typing import Annotated, Any
 import typer
 from rich.console import Group
 
+from service.cli.completion import MapId
 from service.cli.tables import columns, facts, number, point
 from service.cli.terminal import Terminal
 from service.client import Client, ClientError, Document
@@ -14,7 +15,7 @@ from service.client import Client, ClientError, Document
 
 def objects(
     ctx: typer.Context,
-    map_id: str,
+    map_id: MapId,
     object_id: Annotated[str | None, typer.Argument(help="Only this one, with each sighting of it.")] = None,
     survey: Annotated[str | None, typer.Option(help="As this survey saw them.")] = None,
     kind: Annotated[str | None, typer.Option(help="appeared, disappeared or moved.")] = None,

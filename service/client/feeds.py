@@ -11,6 +11,7 @@ from httpx_sse import ServerSentEvent
 
 from service.client.documents import TileCollection, TileFeature
 from service.client.errors import ClientError, Document
+from service.client.requests import next_href
 
 FROM_THE_START = "0"  #: the cursor before everything that was ever published
 
@@ -74,8 +75,7 @@ def event_of(told: ServerSentEvent) -> Event:
 
 def changes_page(page: TileCollection) -> ChangesPage:
     """Return a page with the cursor behind it, from its link `next`. Raises ClientError where it has none."""
-    links = (link["href"] for link in page.get("links", ()) if link.get("rel") == "next")
-    after = parse_qs(urlsplit(next(links, "")).query).get("after")
+    after = parse_qs(urlsplit(next_href(page) or "").query).get("after")
     if after is None:
         raise ClientError(
             "the service does not tell changes in the order of their publication; is it 0.2 or later?"

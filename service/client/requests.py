@@ -11,7 +11,7 @@ from urllib.parse import quote
 import anyio
 import httpx
 
-from service.client.errors import ClientError
+from service.client.errors import ClientError, Document
 
 DEFAULT_URL = "http://127.0.0.1:8000"
 PIECE = 1 << 20  #: bytes sent at a time
@@ -111,3 +111,8 @@ def csv_lines(answer: httpx.Response) -> list[str]:
             f"{answer.request.url} does not answer with CSV; the service is older than this client"
         )
     return answer.text.splitlines()
+
+
+def next_href(page: Document) -> str | None:
+    """Return where the page after this one is (RFC 8288); None behind the last."""
+    return next((link["href"] for link in page.get("links", ()) if link.get("rel") == "next"), None)

@@ -93,6 +93,8 @@ class Flaky:
                 page = FEATURES[start : start + 4]
                 following = f"/maps/lobby/changes?after={start + len(page)}"
                 return document(200, {"features": page, "links": [{"rel": "next", "href": following}]})
+            case ["maps"]:
+                return document(200, {"maps": [{"map_id": "lobby", "name": None}], "links": []})
             case ["jobs", job_id]:
                 done = {"jobID": job_id, "status": "successful", "progress": 100, "message": ""}
                 return document(200, done)

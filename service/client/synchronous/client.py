@@ -182,7 +182,7 @@ class Client(Feeds):
         answer = self._send("GET", path, params=given(**filters), headers=plain)
         for line in csv_lines(answer):
             yield line
-        while following := self._linked(answer):
+        while following := self._joined(answer.request.url, answer.links.get("next", {}).get("url")):
             answer = self._send("GET", following, headers=plain)
             for line in csv_lines(answer)[1:]:
                 yield line

@@ -19,6 +19,7 @@ from service.client.requests import (
     authorization,
     going_on,
     length_in_all,
+    next_href,
     strong_tag,
 )
 from service.client.retries import Retries, error_of, passes, was_done
@@ -36,14 +37,18 @@ class Connection:
         key: str | None = None,
         transport: httpx.BaseTransport | None = None,
         retries: Retries | None = None,
+        timeout_s: float = 60.0,
     ) -> None:
-        """Take the secret of an API key as `key`; None: that of the environment (SPICD_KEY), "": none."""
+        """Take the secret of an API key as `key`; None: that of the environment (SPICD_KEY), "": none.
+
+        `timeout_s` is how long the service may be silent in the midst of an answer, in seconds.
+        """
         self.url = url.rstrip("/")
         self.retries = retries or Retries()
         self._answered = False
         self._http = httpx.Client(
             base_url=self.url,
-            timeout=httpx.Timeout(60, connect=5),
+            timeout=httpx.Timeout(timeout_s, connect=min(timeout_s, 5.0)),
             transport=transport,
             headers=authorization(key),
         )
@@ -105,7 +110,7 @@ class Connection:
             answer = self._send("GET", following)
             page = self._document(dict[str, Any], answer)
             items += page[name]
-            following = self._next(answer, page)
+            following = self._joined(answer.request.url, next_href(page))
         return items
 
     def _delete(self, path: str) -> None:
@@ -129,20 +134,15 @@ class Connection:
             )
         return cast(T, document)
 
-    def _next(self, answer: httpx.Response, page: Document) -> str | None:
-        """Return the address of the page after this one, from its links."""
-        links = (link["href"] for link in page.get("links", ()) if link.get("rel") == "next")
-        return self._joined(answer, next(links, None))
+    def next_page(self, page: T) -> T | None:
+        """Return the page after one that a method gave; None behind the last."""
+        following = self._joined(httpx.URL(self.url), next_href(cast(Document, page)))
+        return None if following is None else self._json(cast(type[T], dict), "GET", following)
 
-    def _linked(self, answer: httpx.Response) -> str | None:
-        """Return the same from the header `Link` (RFC 8288), of an answer that has no links inside."""
-        return self._joined(answer, answer.links.get("next", {}).get("url"))
-
-    def _joined(self, answer: httpx.Response, href: str | None) -> str | None:
+    def _joined(self, asked: httpx.URL, href: str | None) -> str | None:
         """Return the address of a link. Raises ClientError where it is of another service: the key is not for that."""
         if href is None:
             return None
-        asked = answer.request.url
         following = asked.join(href)
         if (following.scheme, following.host, following.port) != (asked.scheme, asked.host, asked.port):
             raise ClientError(f"{asked} goes on at {following}, which is another service")

@@ -59,6 +59,7 @@ METHODS = {
     "maps": "",
     "model": "model",
     "models": "",
+    "next_page": "page",
     "object": "map_id object_id",
     "objects": "map_id filters",
     "ping_webhook": "webhook_id",
