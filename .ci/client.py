@@ -23,7 +23,7 @@ NAMES = {
     "AsyncFeeds": "Feeds",
     "AsyncRetrying": "Retrying",
     "aclose": "close",
-    "aconnect_sse": "connect_sse",
+    "aclosing": "closing",
     "aiter_bytes": "iter_bytes",
     "aiter_sse": "iter_sse",
     "anyio": "time",  # of which there is `sleep` alone

@@ -50,7 +50,10 @@ def objects(
         _refuse("of one survey there is --kind and --min-probability", **over_time)
         terminal.ask(lambda client: _of_survey(client, map_id, survey, **common, limit=limit), _seen_table)
     else:
-        terminal.ask(lambda client: client.objects(map_id, **common, **over_time, limit=limit), _object_table)
+        # else the Earth's frame, of a map that has an anchor
+        frame = {"bbox-crs": None if bbox is None else "map"}
+        filters = {**common, **over_time, **frame}
+        terminal.ask(lambda client: client.objects(map_id, **filters, limit=limit), _object_table)
 
 
 def _refuse(why: str, **filters: Any) -> None:

@@ -10,7 +10,7 @@ import typer
 from rich.table import Table
 
 from service.cli.completion import ScanId
-from service.cli.tables import columns, facts
+from service.cli.tables import columns, facts, warnings
 from service.cli.terminal import Captured, Device, Terminal, read_pose
 from service.client import ClientError, Document
 
@@ -52,11 +52,11 @@ def delete(ctx: typer.Context, scan_id: ScanId) -> None:
 
 
 def _list_table(scans: Sequence[Document]) -> Table:
-    table = columns("scan", "file", "bytes", "device", "captured", "pose", "created")
+    table = columns("scan", "file", "bytes", "device", "captured", "pose", "warnings")
     for scan in scans:
         posed = "" if scan.get("pose") is None else "yes"
         about = (scan.get(name) for name in ("device_id", "captured_at"))
-        row = (scan["scan_id"], scan["filename"], f"{scan['size']:,}", *about, posed, scan["created"])
+        row = (scan["scan_id"], scan["filename"], f"{scan['size']:,}", *about, posed, warnings(scan))
         table.add_row(*row)
     return table
 
@@ -66,7 +66,7 @@ def _whole(scan: Document) -> Table:
     rows = None if pose is None else "\n".join(" ".join(f"{number:9.4f}" for number in row) for row in pose)
     shown = {"scan": scan["scan_id"], "file": scan["filename"], "bytes": f"{scan['size']:,}", **scan}
     names = ("scan", "file", "format", "bytes", "sha256", "device_id", "captured_at", "frame", "created")
-    return facts(shown, *names, **{"pose (map_from_sensor)": rows})
+    return facts(shown, *names, **{"pose (map_from_sensor)": rows, "warnings": warnings(scan)})
 
 
 def _table(scans: Sequence[Document]) -> Table:

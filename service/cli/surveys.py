@@ -13,7 +13,7 @@ from rich.console import Group
 from rich.table import Table
 
 from service.cli.completion import MapId, SurveyId
-from service.cli.tables import columns, counts, facts, number, placement, point, scan_table
+from service.cli.tables import columns, counts, facts, number, placement, point, scan_table, warnings
 from service.cli.terminal import Captured, Device, Model, Scans, Terminal, Wait
 from service.client import Client, ClientError, Document
 from service.client.documents import SurveyDocument
@@ -33,7 +33,7 @@ def submit(
 ) -> None:
     """Compare scans with a map."""
     terminal: Terminal = ctx.obj
-    about = {"device_id": device_id, "captured_at": captured_at}
+    about: dict[str, Any] = {"device_id": device_id, "captured_at": captured_at}
     with terminal.client() as client:
         ids = terminal.scan_ids(client, scans, **about)
         accepted = client.submit_survey(map_id, ids, model=model, threshold=threshold, **about)
@@ -127,7 +127,14 @@ def changes(
     if csv and terminal.as_json:
         raise ClientError("--csv and --json are two forms of the same; leave one out")
     most = CSV_PAGE if csv else 100
-    filters = {"survey": survey, "bbox": bbox, "datetime": datetime, "min_score": min_score}
+    frame = None if bbox is None else "map"  # else the Earth's, of a map that has an anchor
+    filters = {
+        "survey": survey,
+        "bbox": bbox,
+        "bbox-crs": frame,
+        "datetime": datetime,
+        "min_score": min_score,
+    }
     filters["limit"] = most if limit is None else min(limit, most) if csv else limit
     if repeats:
         filters["repeats"] = True
@@ -165,6 +172,7 @@ def _whole(url: str) -> Callable[[Document], Group]:
             "tiles": counts(survey),
             "objects": counts(survey, "objects"),
             "moving": survey.get("moving"),
+            "warnings": warnings(survey),
         }
         if survey["status"] == "ready":
             rows |= {

@@ -43,7 +43,6 @@ def scan_table(document: Document) -> Table:
         "scan", "accepted", "fitness", "rmse (m)", "sigma (m)", "confidence", "reason", "detail, warnings"
     )
     for scan in document.get("scans", []):
-        warnings = [f"{words(one['reason'])}: {one['detail']}" for one in scan.get("warnings") or ()]
         table.add_row(
             scan["scan_id"],
             _ACCEPTED.get(scan.get("accepted"), Text()),
@@ -52,9 +51,14 @@ def scan_table(document: Document) -> Table:
             number(scan.get("translation_sigma"), 3),
             number(scan.get("confidence"), 2),
             words(scan.get("reason") or ""),
-            "\n".join([*filter(None, [scan.get("detail")]), *warnings]),
+            "\n".join(filter(None, [scan.get("detail"), warnings(scan)])),
         )
     return table
+
+
+def warnings(document: Document) -> str:
+    """Write what is odd about a scan or a survey, each on a line of its own."""
+    return "\n".join(f"{words(one['reason'])}: {one['detail']}" for one in document.get("warnings") or ())
 
 
 def placement(survey: Document) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import AsyncIterator, Callable, Iterator, Sequence
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -37,6 +37,20 @@ def authorization(key: str | None) -> dict[str, str]:
 def given(**values: Any) -> dict[str, Any]:
     """Return what was given, without what was left out."""
     return {name: value for name, value in values.items() if value is not None}
+
+
+def scans_of(scan_ids: Sequence[str], poses: Mapping[str, Pose] | None) -> dict[str, Any]:
+    """Return the members of a request that name its scans, in their order, those of `poses` with a pose of their own.
+
+    Raises ClientError for the pose of a scan that is not among them.
+    """
+    if not poses:
+        return {"scan_ids": list(scan_ids)}
+    strangers = sorted(set(poses) - set(scan_ids))
+    if strangers:
+        raise ClientError(f"{', '.join(strangers)}: poses of scans that are not named")
+    matrices = {scan_id: [list(row) for row in pose] for scan_id, pose in poses.items()}
+    return {"scans": [given(scan_id=scan_id, pose=matrices.get(scan_id)) for scan_id in scan_ids]}
 
 
 def quoted(name: str) -> str:

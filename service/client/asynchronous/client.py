@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import AsyncIterator, Callable, Sequence
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,7 @@ from service.client.documents import (
     VersionDocument,
 )
 from service.client.errors import Document, JobFailed, retry_after_s
-from service.client.requests import AsyncBody, OnSent, Pose, csv_lines, given, quoted
+from service.client.requests import AsyncBody, OnSent, Pose, csv_lines, given, quoted, scans_of
 
 SLOWEST_LOOK_S = 2.0  #: between two looks at a job that takes long
 
@@ -92,10 +92,14 @@ class AsyncClient(AsyncFeeds):
         model: str | None = None,
         settings: Document | None = None,
         anchor: Document | None = None,
+        poses: Mapping[str, Pose] | None = None,
     ) -> AcceptedMap:
-        """Build a reference map; returns `map_id` and `job_id`."""
+        """Build a reference map; returns `map_id` and `job_id`.
+
+        `poses` are map_from_sensor by the id of the scan, and count in this map alone; others are those of the upload.
+        """
         about = given(id=map_id, name=name, model=model, settings=settings, anchor=anchor)
-        return await self._json(AcceptedMap, "POST", "/maps", json={**about, "scan_ids": list(scan_ids)})
+        return await self._json(AcceptedMap, "POST", "/maps", json={**about, **scans_of(scan_ids, poses)})
 
     async def maps(self) -> list[MapDocument]:
         """Return every map."""
@@ -117,10 +121,18 @@ class AsyncClient(AsyncFeeds):
     # versions
 
     async def create_version(
-        self, map_id: str, scan_ids: Sequence[str] = (), *, survey_id: str | None = None
+        self,
+        map_id: str,
+        scan_ids: Sequence[str] = (),
+        *,
+        survey_id: str | None = None,
+        poses: Mapping[str, Pose] | None = None,
     ) -> AcceptedVersion:
-        """Go on from a map's version in use, with further scans or a survey; returns `version` and `job_id`."""
-        body = given(scan_ids=list(scan_ids) or None, survey_id=survey_id)
+        """Go on from a map's version in use, with further scans or a survey; returns `version` and `job_id`.
+
+        `poses` as in `create_map`.
+        """
+        body = {**given(survey_id=survey_id), **(scans_of(scan_ids, poses) if scan_ids else {})}
         return await self._json(AcceptedVersion, "POST", f"/maps/{quoted(map_id)}/versions", json=body)
 
     async def versions(self, map_id: str) -> list[VersionDocument]:
@@ -146,10 +158,11 @@ class AsyncClient(AsyncFeeds):
         device_id: str | None = None,
         model: str | None = None,
         threshold: float | None = None,
+        poses: Mapping[str, Pose] | None = None,
     ) -> AcceptedSurvey:
-        """Compare scans with a map; returns `survey_id` and `job_id`."""
+        """Compare scans with a map; returns `survey_id` and `job_id`. `poses` as in `create_map`."""
         about = given(captured_at=captured_at, device_id=device_id, model=model, threshold=threshold)
-        body = {**about, "scan_ids": list(scan_ids)}
+        body = {**about, **scans_of(scan_ids, poses)}
         return await self._json(AcceptedSurvey, "POST", f"/maps/{quoted(map_id)}/surveys", json=body)
 
     async def surveys(self, map_id: str) -> list[SurveyDocument]:

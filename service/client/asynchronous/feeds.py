@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Sequence
+from collections.abc import AsyncGenerator, AsyncIterator, Sequence
+from contextlib import aclosing
 from typing import Any
 
 import anyio
@@ -59,14 +60,15 @@ class AsyncFeeds(AsyncConnection):
         query = given(type=list(types) or None, map=map_id)
         last, fruitless = after, 0
         while True:
-            async for told in self._listen(query, last):
-                last, fruitless = told.id or last, 0
-                if told.data:  # a sign of life has none, and moves the cursor as well
-                    yield event_of(told)
+            async with aclosing(self._listen(query, last)) as stream:
+                async for told in stream:
+                    last, fruitless = told.id or last, 0
+                    if told.data:  # a sign of life has none, and moves the cursor as well
+                        yield event_of(told)
             fruitless += 1
             await anyio.sleep(self.retries.pause_s(fruitless))
 
-    async def _listen(self, query: dict[str, Any], last: str | None) -> AsyncIterator[ServerSentEvent]:
+    async def _listen(self, query: dict[str, Any], last: str | None) -> AsyncGenerator[ServerSentEvent, None]:
         """Yield what one connection tells until it ends or breaks."""
         headers = {"Accept": "text/event-stream", **given(**{"Last-Event-ID": last})}
         answer = await self._send("GET", "/events", params=query, headers=headers, stream=True)

@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
+from contextlib import closing
 from typing import Any
 
 import httpx
@@ -60,14 +61,15 @@ class Feeds(Connection):
         query = given(type=list(types) or None, map=map_id)
         last, fruitless = after, 0
         while True:
-            for told in self._listen(query, last):
-                last, fruitless = told.id or last, 0
-                if told.data:  # a sign of life has none, and moves the cursor as well
-                    yield event_of(told)
+            with closing(self._listen(query, last)) as stream:
+                for told in stream:
+                    last, fruitless = told.id or last, 0
+                    if told.data:  # a sign of life has none, and moves the cursor as well
+                        yield event_of(told)
             fruitless += 1
             time.sleep(self.retries.pause_s(fruitless))
 
-    def _listen(self, query: dict[str, Any], last: str | None) -> Iterator[ServerSentEvent]:
+    def _listen(self, query: dict[str, Any], last: str | None) -> Generator[ServerSentEvent, None]:
         """Yield what one connection tells until it ends or breaks."""
         headers = {"Accept": "text/event-stream", **given(**{"Last-Event-ID": last})}
         answer = self._send("GET", "/events", params=query, headers=headers, stream=True)

@@ -34,6 +34,7 @@ SCAN = {
     "captured_at": "2026-03-02T12:00:00Z",
     "pose": [[1, 0, 0, 2.5], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]],
     "created": "2026-03-02T12:00:09Z",
+    "warnings": [{"reason": "wrong_scale", "detail": "its scale is 1.012"}],
 }
 SURVEY: dict[str, Any] = {
     "survey_id": "survey-1",
@@ -92,7 +93,7 @@ def test_scans_are_listed_shown_and_deleted(service: Service, capsys: pytest.Cap
     }
     assert spicd("scans", "list") == 0
     listed = capsys.readouterr().out
-    for part in ("scan-1", "hall.pcd", "123,456", "robot-7", "yes"):
+    for part in ("scan-1", "hall.pcd", "123,456", "robot-7", "yes", "wrong scale: its scale is 1.012"):
         assert part in listed
     assert spicd("scans", "show", "scan-1") == 0
     assert "2.5000" in capsys.readouterr().out
@@ -308,6 +309,7 @@ def test_the_example_of_each_command_is_in_its_help_and_names_what_it_takes(
     assert {word for word in words if word.startswith("--")} <= taken
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("typed", "offered"),
     [("spicd sur", "surveys"), ("spicd surveys down", "download"), ("spicd maps show lo", "lobby")],
@@ -333,6 +335,7 @@ def test_the_shell_completes_commands_and_ids(typed: str, offered: str, tmp_path
     assert offered in ended.stdout.split(), ended.stderr
 
 
+@pytest.mark.slow
 def test_completion_says_nothing_where_the_service_does_not_answer() -> None:
     environment = {**os.environ, "_SPICD_COMPLETE": "complete_bash", "COMP_WORDS": "spicd maps show lo"}
     environment |= {"COMP_CWORD": "3", "SPICD_URL": "http://127.0.0.1:9"}

@@ -40,8 +40,8 @@ NAMES = {
 METHODS = {
     "changes": "map_id filters",
     "changes_csv": "map_id filters",
-    "create_map": "scan_ids map_id name model settings anchor",
-    "create_version": "map_id scan_ids survey_id",
+    "create_map": "scan_ids map_id name model settings anchor poses",
+    "create_version": "map_id scan_ids survey_id poses",
     "create_webhook": "url types map_id",
     "delete_map": "map_id",
     "delete_scan": "scan_id",
@@ -68,7 +68,7 @@ METHODS = {
     "scan": "scan_id",
     "scans": "",
     "set_anchor": "map_id anchor",
-    "submit_survey": "map_id scan_ids captured_at device_id model threshold",
+    "submit_survey": "map_id scan_ids captured_at device_id model threshold poses",
     "survey": "survey_id",
     "survey_objects": "survey_id filters",
     "surveys": "map_id",
@@ -117,10 +117,12 @@ def test_every_method_of_the_asynchronous_client_is_asynchronous() -> None:
         assert inspect.iscoroutinefunction(method) or inspect.isasyncgenfunction(method), name
 
 
+@pytest.mark.slow
 def test_what_is_made_of_the_asynchronous_source_is_current(making: ModuleType) -> None:
     assert [name for name in making.outdated() if "documents" not in name] == []
 
 
+@pytest.mark.slow
 @needs_tools
 def test_the_documents_are_those_of_the_api(making: ModuleType) -> None:
     assert (TOOLS / "bin" / "datamodel-codegen").exists()

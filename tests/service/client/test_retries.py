@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import json
 from datetime import UTC, datetime, timedelta
 from email.utils import format_datetime
 
@@ -143,3 +144,33 @@ def test_links_are_followed_behind_a_path_prefix() -> None:
 
     with Client("http://here/spicd", transport=httpx.MockTransport(serve)) as client:
         assert [one["map_id"] for one in client.maps()] == ["lobby", "hall"]
+
+
+POSE: list[list[float]] = [[1, 0, 0, 2.5], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+
+
+def test_a_pose_of_one_map_alone_goes_with_its_scan_and_the_order_stays() -> None:
+    transport, requests = counting(httpx.Response(202, json={"map_id": "lobby", "job_id": "job-1"}))
+    with Client(transport=transport) as client:
+        client.create_map(["scan-1", "scan-2"], poses={"scan-2": POSE})
+        with pytest.raises(ClientError, match="scan-3"):
+            client.submit_survey("lobby", ["scan-1"], poses={"scan-3": POSE})
+    (request,) = requests
+    assert json.loads(request.content) == {
+        "scans": [{"scan_id": "scan-1"}, {"scan_id": "scan-2", "pose": POSE}]
+    }
+
+
+def test_waiting_looks_less_and_less_often_and_heeds_retry_after(monkeypatch: pytest.MonkeyPatch) -> None:
+    pauses: list[float] = []
+    monkeypatch.setattr("time.sleep", pauses.append)
+    running = httpx.Response(200, json={"status": "running"})
+    asked = httpx.Response(200, json={"status": "running"}, headers={"Retry-After": "7"})
+    answers = [asked, *[running] * 20, httpx.Response(200, json={"status": "successful"})]
+    transport = httpx.MockTransport(lambda request: answers.pop(0))
+    with Client(transport=transport) as client:
+        assert client.wait("job-1")["status"] == "successful"
+    assert pauses[0] == 7
+    assert pauses[1:] == sorted(pauses[1:])
+    assert pauses[1] < 0.4
+    assert pauses[-1] == 2
