@@ -6,7 +6,7 @@ Section 9.2.2), and every POST carries an `Idempotency-Key` of its own, the same
 
 from __future__ import annotations
 
-import random
+import secrets
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -20,6 +20,8 @@ PASSING = frozenset({429, 502, 503, 504})
 CONFLICT = 409  #: passes where it names a time: the first request of the same key is still under way
 WRONG = (httpx.UnsupportedProtocol, httpx.LocalProtocolError)  #: of the caller's making, and so for good
 FIRST_CONTACT_S = 2.0  #: where nobody has answered yet, the address is more likely wrong than the network bad
+
+_chance = secrets.SystemRandom()
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -37,9 +39,9 @@ class Retries:
         Chance keeps twenty robots, which lost the service in the same instant, from coming back in the same instant.
         """
         longest = min(self.longest_pause_s, self.first_pause_s * 2.0 ** min(attempt - 1, 30))
-        pause = longest * random.uniform(0.5, 1.0)  # noqa: S311  # no secret
+        pause = longest * _chance.uniform(0.5, 1.0)
         asked = error.retry_after_s if isinstance(error, RequestRefused) else None
-        return pause if asked is None else asked + self.first_pause_s * random.random()  # noqa: S311
+        return pause if asked is None else asked + self.first_pause_s * _chance.random()
 
     def wait(self, state: RetryCallState) -> float:
         """Return the same as `pause_s`, of a call in the hands of tenacity."""
