@@ -9,6 +9,7 @@ ServiceError
 ├── TooLarge             too_large            a body over the limit
 ├── TooSlow              too_slow             a body that takes too long
 ├── WrongMediaType       wrong_media_type     neither a scan nor JSON
+├── NotAcceptable        not_acceptable       the request accepts no media type that there is
 ├── DiskFull             disk_full            less space than the reserve is left, or none
 ├── QueueFull            queue_full           as many jobs wait as may
 ├── Unauthorized         unauthorized         no API key, or one that is not known
@@ -67,6 +68,10 @@ class TooSlow(ServiceError):
 
 class WrongMediaType(ServiceError):
     code = "wrong_media_type"
+
+
+class NotAcceptable(ServiceError):
+    code = "not_acceptable"
 
 
 class DiskFull(ServiceError):

@@ -73,6 +73,7 @@ def _feature(
             "now": _box(thing["now"]),
             "before": _box(thing["before"]),
             "motion": _motion(thing["motion"]),
+            **_flat(place, thing["motion"]),
             "probability": thing["probability"],
             "observed_share": thing["observed_share"],
             "scans_seen_through": thing["scans_seen_through"],
@@ -107,6 +108,24 @@ def _box(place: Mapping[str, Any] | None) -> dict[str, Any] | None:
         "footprint": [list(corner) for corner in _closed(place)],
         **{name: place[name] for name in ("height_over_floor", "volume", "voxels", "points")},
         "tiles": list(place["tiles"]),
+    }
+
+
+def _flat(place: Mapping[str, Any], motion: Mapping[str, Any] | None) -> dict[str, float | None]:
+    """Return where a thing is shown and how it was moved in flat numbers, of which table programs make columns."""
+    z_min, z_max = _heights(place)
+    size, translation = place["size"], (None, None, None) if motion is None else motion["translation"]
+    return {
+        "center_x": place["center"][0],
+        "center_y": place["center"][1],
+        "z_min": z_min,
+        "z_max": z_max,
+        **dict(zip(("size_x", "size_y", "size_z"), size, strict=True)),
+        "yaw_degrees": _degrees(place["yaw"]),
+        "height_over_floor": place["height_over_floor"],
+        "volume": place["volume"],
+        **dict(zip(("moved_x", "moved_y", "moved_z"), translation, strict=True)),
+        "moved_yaw_degrees": None if motion is None or motion["yaw"] is None else _degrees(motion["yaw"]),
     }
 
 

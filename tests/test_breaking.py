@@ -9,10 +9,13 @@ import random
 import signal
 import subprocess
 import sys
+import threading
 import time
+from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 from typing import Any
 
+import httpx
 import numpy as np
 import pytest
 
@@ -20,6 +23,7 @@ from tests.breaking import fuzz_api, fuzz_readers, load, soak
 from tests.breaking.fuzz_readers import Fuzz, declared_points, run_batch, what_is_wrong
 from tests.breaking.requests import Request, Requests
 from tests.breaking.scan_mutations import N, samples
+from tests.support.flaky_link import flaky_links
 from tests.support.footprints import Footprint, footprints, peak_resident
 from tests.support.traffic import throttled
 from worker.cloud.formats.scan import read_scan
@@ -144,6 +148,30 @@ def test_a_client_is_throttled_to_its_rate() -> None:
     begun = time.monotonic()
     assert b"".join(throttled(b"a" * 50_000, 100_000)) == b"a" * 50_000
     assert 0.3 < time.monotonic() - begun < 2
+
+
+def test_a_flaky_link_carries_what_fits_in_its_time_and_breaks_off_the_rest() -> None:
+    arrived: list[int] = []
+
+    class Server(BaseHTTPRequestHandler):
+        def do_POST(self) -> None:
+            arrived.append(len(self.rfile.read(int(self.headers["Content-Length"]))))
+            self.send_response(204)
+            self.end_headers()
+
+        def log_message(self, *_: object) -> None: ...
+
+    with HTTPServer(("127.0.0.1", 0), Server) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        address = f"http://127.0.0.1:{server.server_port}"
+        with flaky_links(2, address, bytes_a_second=400_000, drops_after_s=1.0) as (first, second):
+            assert httpx.post(first.url, content=bytes(100_000)).status_code == 204
+            with pytest.raises(httpx.TransportError):
+                httpx.post(second.url, content=bytes(4_000_000))
+        server.shutdown()
+    assert arrived[0] == 100_000
+    assert (first.dropped, second.dropped) == (0, 1)
+    assert 100_000 < second.sent < 800_000
 
 
 def test_the_footprint_of_a_process_is_that_of_the_system() -> None:

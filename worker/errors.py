@@ -3,7 +3,8 @@
 PipelineError
 ├── ScanError                scan_unreadable        a file that is not a sound PLY or PCD
 │   ├── ScanTooLarge         scan_too_large         more points than the limit
-│   └── ScanUnits            scan_units             an extent that says millimetres
+│   ├── ScanUnits            scan_units             an extent that says millimetres
+│   └── ScanFarAway          scan_far_away          an origin many kilometres away
 ├── RegistrationFailed       registration_failed    no scan could be placed
 ├── MapFailed                map_failed             nothing to tile, no point left
 ├── TrainingFailed           training_failed        a map too small to train on, a loss that is no number
@@ -34,6 +35,10 @@ class ScanTooLarge(ScanError):
 
 class ScanUnits(ScanError):
     code = "scan_units"
+
+
+class ScanFarAway(ScanError):
+    code = "scan_far_away"
 
 
 class RegistrationFailed(PipelineError):

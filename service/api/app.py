@@ -15,8 +15,7 @@ from pydantic import BaseModel
 from pydantic.json_schema import JsonSchemaMode, models_json_schema
 from starlette.types import ASGIApp
 
-from service.api import changes, health, jobs, maps, models, objects, scans, surveys, versions
-from service.api.features import TileCollection
+from service.api import changes, health, jobs, maps, models, objects, scans, surveys, tiles, versions
 from service.api.housekeeping import housekeeping
 from service.api.http import problems
 from service.api.http.access import authorize, secured
@@ -25,6 +24,7 @@ from service.api.http.cards import Cards
 from service.api.http.cross_site import add_cross_site_checks
 from service.api.http.dependencies import Queue, Services
 from service.api.http.docs_pages import add_pages
+from service.api.http.known_query import refuse_unknown
 from service.api.http.lanes import UPLOAD_TURN_S, Lane
 from service.api.http.metrics import Metrics, MetricsMiddleware
 from service.api.http.monitor import HealthMonitor
@@ -62,10 +62,9 @@ UNSEEN: dict[JsonSchemaMode, tuple[type[BaseModel], ...]] = {
     ),
     "serialization": (
         problems.ProblemDocument,
-        TileCollection,
-        objects.SightingCollection,
-        objects.ObjectCollection,
-        objects.ObjectHistory,
+        tiles.TileCollection,
+        tiles.FgTileCollection,
+        *objects.DOCUMENTS,
     ),
 }
 
@@ -111,14 +110,14 @@ def create_app(settings: Settings, *, queue: Queue | None = None) -> FastAPI:
         docs_url=None,
         redoc_url=None,
         redirect_slashes=False,  # it would be asked before any key and host, and name a host of the client's choice
-        dependencies=[Depends(authorize)],
+        dependencies=[Depends(authorize), Depends(refuse_unknown)],
     )
     app.state.metrics = Metrics()
     add_cross_site_checks(app, settings)
     app.add_middleware(MetricsMiddleware, metrics=app.state.metrics)
     problems.add_handlers(app)
     add_pages(app)
-    for part in (scans, maps, versions, surveys, changes, objects, jobs, models, health):
+    for part in (scans, maps, versions, surveys, tiles, changes, objects, jobs, models, health):
         app.include_router(part.router, responses=None if part is health else problems.OUTAGES)
     return app
 

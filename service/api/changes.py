@@ -2,48 +2,39 @@
 
 from __future__ import annotations
 
-import math
-import sys
-from collections.abc import Callable
 from datetime import datetime
 from typing import Annotated
 
 from fastapi import APIRouter, Path, Query
 from fastapi import Request as HttpRequest
-from pydantic import AfterValidator, Field
+from fastapi.responses import Response
+from pydantic import Field
 
 from service.api import features
-from service.api.features import FeatureResponse, feature_response
+from service.api.boxes import bounds_of
+from service.api.features import FeatureResponse, FeaturesRequest, collection_response, form_of
 from service.api.http.dependencies import Provided
-from service.api.http.documents import Link, Request, link
-from service.api.http.fields import Id, instant
-from service.api.http.paging import Cursor, decoded, encoded, finite, next_link
+from service.api.http.documents import link
+from service.api.http.fields import DeviceId, Id, instant, readable
+from service.api.http.paging import Cursor, decoded_values, encoded_values
 from service.api.http.problems import documented
+from service.api.tiles import (
+    TILES,
+    Bbox,
+    BboxCrs,
+    FgTileCollection,
+    TileCollection,
+    VoxelKinds,
+    feature,
+)
 from service.catalog.catalog import Catalog
-from service.catalog.changes import ChangeFilter, ChangePosition
-from service.catalog.records import Bounds, rfc3339
+from service.catalog.changes import ChangeFilter, ChangeSort, change_order
+from service.catalog.records import Anchor, TileState
 from service.errors import NotFound
 
 router = APIRouter(tags=["changes"])
 
 Span = tuple[datetime | None, datetime | None]  #: first and last instant, None where open
-
-
-def bounds_of(bbox: str) -> Bounds:
-    """Read four numbers (x and y) or six (x, y and z): the minimum corner, then the maximum. Raises ValueError."""
-    try:
-        numbers = [float(part) for part in bbox.split(",")]
-    except ValueError:
-        numbers = []
-    if len(numbers) not in (4, 6) or not all(math.isfinite(number) for number in numbers):
-        raise ValueError("give four or six numbers: minimum x,y[,z] then maximum x,y[,z], in metres")
-    half = len(numbers) // 2
-    low, high = numbers[:half], numbers[half:]
-    if any(a > b for a, b in zip(low, high, strict=True)):
-        raise ValueError("the minimum corner comes first, then the maximum")
-    if half == 2:
-        low, high = [*low, -sys.float_info.max], [*high, sys.float_info.max]
-    return Bounds(min=(low[0], low[1], low[2]), max=(high[0], high[1], high[2]))
 
 
 def span_of(interval: str) -> Span:
@@ -64,17 +55,7 @@ def span_of(interval: str) -> Span:
     return since, until
 
 
-def readable(read: Callable[[str], object]) -> AfterValidator:
-    """Check a text with `read`, and leave it a text: a query parameter of many parts is taken for a list."""
-
-    def check(text: str) -> str:
-        read(text)
-        return text
-
-    return AfterValidator(check)
-
-
-class ChangesRequest(Request):
+class ChangesRequest(FeaturesRequest):
     """Which changed tiles."""
 
     survey: Annotated[
@@ -83,10 +64,19 @@ class ChangesRequest(Request):
     repeats: Annotated[
         bool, Field(description="a feature for each visit that saw a change, and not one for each change")
     ] = False
-    bbox: Annotated[
-        Annotated[str, readable(bounds_of)] | None,
-        Field(description="map frame, metres; tiles whose box meets it", examples=["0,0,7.5,4.5"]),
+    state: Annotated[
+        TileState,
+        Field(
+            description="of the tiles; another one than `changed` is told for each visit, as with `repeats`"
+        ),
+    ] = "changed"
+    kind: VoxelKinds = None
+    device_id: Annotated[
+        DeviceId | None,
+        Field(description="of the visit; of a change that is told once: of one of the visits that saw it"),
     ] = None
+    bbox: Bbox = None
+    bbox_crs: BboxCrs = None
     datetime: Annotated[
         Annotated[str, readable(span_of)] | None,
         Field(
@@ -99,6 +89,13 @@ class ChangesRequest(Request):
         float | None,
         Field(ge=0, le=1, description="probability of change, in one at least of the visits that saw it"),
     ] = None
+    sortby: Annotated[
+        ChangeSort | None,
+        Field(
+            description="left out: newest first, by `first_seen`, or with `survey`, `repeats` or another `state` by "
+            "`captured_at`, and the most certain first within a visit; with a minus downwards"
+        ),
+    ] = None
     limit: Annotated[int, Field(ge=1, le=10000, description="most features in one answer")] = 100
     cursor: Cursor = None
 
@@ -109,7 +106,7 @@ class ChangesRequest(Request):
     response_class=FeatureResponse,
     response_model=None,
     responses={
-        **features.documented(),
+        **features.documented(TileCollection, FgTileCollection),
         **documented("not_found", "not_ready", "invalid_request", "bad_request"),
     },
 )
@@ -118,7 +115,7 @@ def get_changes(
     services: Provided,
     map_id: Annotated[Id, Path()],
     asked: Annotated[ChangesRequest, Query()],
-) -> FeatureResponse:
+) -> Response:
     """The changed tiles of every finished survey, each change once: newest first, most certain first within a visit.
 
     A change that stays over several visits is one feature, that of the visit which told it first, with `first_seen`,
@@ -132,27 +129,36 @@ def get_changes(
     anchor = catalog.maps.ready(map_id).anchor
     if asked.survey is not None:
         _require_survey(catalog, asked.survey, map_id)
-    since, until = (None, None) if asked.datetime is None else span_of(asked.datetime)
-    page = catalog.changes.page(
-        ChangeFilter(
-            map_id=map_id,
-            survey_id=asked.survey,
-            repeats=asked.repeats,
-            bounds=None if asked.bbox is None else bounds_of(asked.bbox),
-            since=since,
-            until=until,
-            min_score=asked.min_score,
-        ),
-        after=position_of(asked.cursor),
-        limit=asked.limit,
+    form, wanted = form_of(request, asked, anchor), _filter(map_id, asked, anchor)
+    sort, order = asked.sortby, change_order(wanted, asked.sortby)
+    after = decoded_values(asked.cursor, sort or "", [key.type for key in order])
+    page = catalog.changes.page(wanted, sort=sort, after=after, limit=asked.limit)
+    return collection_response(
+        request,
+        form,
+        TILES,
+        [feature(change, form) for change in page.items],
+        matched=page.matched,
+        cursor=encoded_values(sort or "", page.following),
+        links=[link(request, f"/maps/{map_id}", "map")],
     )
-    links = [
-        Link(href=str(request.url.replace(scheme="", netloc="")), rel="self", type=features.MEDIA_TYPE),
-        link(request, f"/maps/{map_id}", "map"),
-    ]
-    if page.following is not None:
-        links.append(next_link(request, cursor_of(page.following), features.MEDIA_TYPE))
-    return feature_response(page.items, matched=page.matched, links=links, anchor=anchor)
+
+
+def _filter(map_id: str, asked: ChangesRequest, anchor: Anchor | None) -> ChangeFilter:
+    """Return which tiles are asked for, of a map that lies at `anchor`. Raises BadRequest."""
+    since, until = (None, None) if asked.datetime is None else span_of(asked.datetime)
+    return ChangeFilter(
+        map_id=map_id,
+        survey_id=asked.survey,
+        repeats=asked.repeats,
+        state=asked.state,
+        kind=asked.kind,
+        device_id=asked.device_id,
+        bounds=bounds_of(asked.bbox, asked.bbox_crs, anchor),
+        since=since,
+        until=until,
+        min_score=asked.min_score,
+    )
 
 
 def _require_survey(catalog: Catalog, survey_id: str, map_id: str) -> None:
@@ -164,15 +170,3 @@ def _require_survey(catalog: Catalog, survey_id: str, map_id: str) -> None:
     if not is_of_map:
         raise NotFound(f"no survey {survey_id!r} of map {map_id!r}")
     catalog.surveys.ready(survey_id)
-
-
-def cursor_of(position: ChangePosition) -> str:
-    """Return the cursor behind a change."""
-    return encoded(rfc3339(position.instant), position.survey_id, position.score.hex(), position.tile_id)
-
-
-def position_of(cursor: str | None) -> ChangePosition | None:
-    """Return where to go on. Raises BadRequest."""
-    if cursor is None:
-        return None
-    return ChangePosition(*decoded(cursor, instant, str, finite, str))

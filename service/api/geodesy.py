@@ -20,6 +20,7 @@ _ROUNDS = 6  #: of the fixed point; each divides the error by 100 or more, and t
 ToWgs84 = Callable[
     [Vector3], Vector3
 ]  #: map frame (metres) to longitude, latitude (degrees), height (metres)
+FromWgs84 = Callable[[Vector3], Vector3]  #: and back
 
 
 def to_wgs84(anchor: Anchor) -> ToWgs84:
@@ -46,6 +47,27 @@ def to_wgs84(anchor: Anchor) -> ToWgs84:
         )
         turned = math.degrees(math.remainder(lon - longitude, math.tau))
         return anchor.longitude + turned, math.degrees(lat), height
+
+    return convert
+
+
+def from_wgs84(anchor: Anchor) -> FromWgs84:
+    """Return the function from WGS 84 to the frame of a map that lies at `anchor`, the inverse of `to_wgs84`."""
+    longitude, latitude, heading = (
+        math.radians(angle) for angle in (anchor.longitude, anchor.latitude, anchor.heading)
+    )
+    sin_lon, cos_lon = math.sin(longitude), math.cos(longitude)
+    sin_lat, cos_lat = math.sin(latitude), math.cos(latitude)
+    sin_h, cos_h = math.sin(heading), math.cos(heading)
+    x0, y0, z0 = to_ecef(longitude, latitude, anchor.height)
+
+    def convert(point: Vector3) -> Vector3:
+        lon, lat, height = point
+        x, y, z = to_ecef(math.radians(lon), math.radians(lat), height)
+        dx, dy, dz = x - x0, y - y0, z - z0
+        out = cos_lon * dx + sin_lon * dy
+        east, north = cos_lon * dy - sin_lon * dx, cos_lat * dz - sin_lat * out
+        return east * sin_h + north * cos_h, north * sin_h - east * cos_h, cos_lat * out + sin_lat * dz
 
     return convert
 

@@ -29,7 +29,7 @@ from service.api.http.submission import (
     submit,
 )
 from service.catalog import blob_keys
-from service.catalog.records import Anchor, Built, JobRecord, MapRecord, MapStatus
+from service.catalog.records import Anchor, Built, JobRecord, MapRecord, MapStatus, MapSummary
 
 router = APIRouter(tags=["maps"])
 MapId = Annotated[Id, Path()]
@@ -139,6 +139,13 @@ class MapDocument(MapRecord, BuiltDocument):
     problem: JobProblem  # type: ignore[assignment]  # as RFC 9457 has it
 
 
+class MapSummaryDocument(MapSummary, Document):
+    """A reference map in short; the map itself tells its settings and what became of each scan."""
+
+    problem: JobProblem  # type: ignore[assignment]  # as RFC 9457 has it
+    links: list[Link]
+
+
 class AcceptedMap(Document):
     """A map that is going to be built."""
 
@@ -151,7 +158,7 @@ class AcceptedMap(Document):
 class MapList(Document):
     """Maps, newest first."""
 
-    maps: list[MapDocument]
+    maps: list[MapSummaryDocument]
     links: list[Link]
 
 
@@ -177,10 +184,11 @@ async def create_map(request: HttpRequest, response: Response, services: Provide
 
 @router.get("/maps", summary="List maps", responses=LISTED)
 def list_maps(request: HttpRequest, services: Provided, asked: Annotated[PageRequest, Query()]) -> MapList:
-    """Newest first; a key that is bound to maps sees those."""
+    """In short, newest first; a key that is bound to maps sees those."""
     page = services.catalog.maps.page(only=maps_of_key(request), after=asked.after(), limit=asked.limit)
     links = list_links(request, page, lambda record: (record.created, record.map_id))
-    return MapList(maps=[map_document(record, request) for record in page.items], links=links)
+    maps = [MapSummaryDocument(**dict(record), links=_links(record, request)) for record in page.items]
+    return MapList(maps=maps, links=links)
 
 
 @router.get("/maps/{map_id}", summary="Look at a map", responses=NAMED)
@@ -267,6 +275,10 @@ def _delete(services: Services, map_id: str) -> None:
 
 def map_document(record: MapRecord, request: HttpRequest) -> MapDocument:
     """Return a map with its links."""
+    return MapDocument(**dict(record), links=_links(record, request))
+
+
+def _links(record: MapSummary, request: HttpRequest) -> list[Link]:
     here = f"/maps/{record.map_id}"
     links = [
         link(request, here, "self"),
@@ -279,7 +291,7 @@ def map_document(record: MapRecord, request: HttpRequest) -> MapDocument:
             link(request, f"{here}/changes", "changes", "application/geo+json"),
             link(request, f"{here}/objects", "objects", "application/geo+json"),
         ]
-    return MapDocument(**dict(record), links=links)
+    return links
 
 
 def file_links(request: HttpRequest, here: str) -> list[Link]:

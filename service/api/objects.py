@@ -5,53 +5,57 @@ Answers are written as they are built, like those of `service.api.features`; a t
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from fastapi import APIRouter, Path, Query
 from fastapi import Request as HttpRequest
+from fastapi.responses import Response
 from pydantic import Field
-from pydantic_core import to_json
 
 from service.api import features
-from service.api.changes import bounds_of, readable, span_of
+from service.api.boxes import bounds_of
+from service.api.changes import span_of
 from service.api.features import (
-    MEDIA_TYPE,
     FeatureResponse,
-    Footprint,
+    FeaturesRequest,
+    FgCollection,
+    Form,
+    GeoJsonCollection,
+    GeoJsonFeature,
+    Kind,
     Position2,
     Prism,
     Time,
-    on_earth,
+    collection_response,
+    feature_response,
+    form_of,
     plain,
 )
-from service.api.geodesy import ToWgs84, to_wgs84
 from service.api.http.dependencies import Provided
-from service.api.http.documents import Document, Link, Request, link
-from service.api.http.fields import Id, instant
-from service.api.http.paging import Cursor, count, decoded, encoded, next_link
+from service.api.http.documents import Document, Link, link
+from service.api.http.fields import DeviceId, Id, readable
+from service.api.http.paging import Cursor, decoded_values, encoded_values
 from service.api.http.problems import MADE, documented
-from service.catalog.objects import ObjectFilter, SightingFilter
+from service.api.tiles import Bbox, BboxCrs
+from service.catalog.objects import (
+    ObjectFilter,
+    ObjectSort,
+    SightingFilter,
+    SightingSort,
+    object_order,
+    sighting_order,
+)
 from service.catalog.records import (
     Anchor,
     MapObjectRecord,
     ObjectKind,
     ObjectStatus,
-    Position,
     SightingRecord,
+    SurveyRecord,
     Vector3,
-    rfc3339,
 )
-from service.catalog.tables import now
 from service.errors import NotFound
-from service.object_features import (
-    FEATURE_TYPE,
-    object_collection,
-    object_feature,
-    ring_of,
-    sighting_feature,
-)
-from service.tile_features import CONFORMS_TO, MAP_FRAME
+from service.object_features import FEATURE_TYPE, object_feature, ring_of, sighting_feature
 
 router = APIRouter(tags=["objects"])
 Limit = Annotated[int, Field(ge=1, le=10000, description="most features in one answer")]
@@ -108,6 +112,24 @@ class SightingProperties(Document):
     now: Box | None = Field(description="where it is; null where it disappeared")
     before: Box | None = Field(description="where the map has it; null where it appeared")
     motion: Move | None = Field(description="of what moved")
+    center_x: float = Field(
+        description="where it is, or was before: this and the next numbers say again what `now`, `before` and `motion` "
+        "say, each by itself (metres, map frame)",
+        examples=[6.75],
+    )
+    center_y: float = Field(examples=[3.75])
+    z_min: float = Field(examples=[0.0])
+    z_max: float = Field(examples=[0.9])
+    size_x: float = Field(description="along the axes of the box, not of the map", examples=[0.5])
+    size_y: float = Field(examples=[0.5])
+    size_z: float = Field(examples=[0.9])
+    yaw_degrees: float = Field(examples=[30.0])
+    height_over_floor: float | None = Field(examples=[0.0])
+    volume: float = Field(description="cubic metres", examples=[0.06])
+    moved_x: float | None = Field(description="of what moved, like the next three", examples=[None])
+    moved_y: float | None = Field(examples=[None])
+    moved_z: float | None = Field(examples=[None])
+    moved_yaw_degrees: float | None = Field(examples=[None])
     probability: float = Field(description="of change, mean over its voxels", examples=[0.96])
     observed_share: float = Field(description="of it, that both visits could judge", examples=[0.8])
     scans_seen_through: int = Field(
@@ -116,6 +138,7 @@ class SightingProperties(Document):
     map_id: str = Field(examples=["lobby"])
     map_version: int = Field(description="that the survey was compared with", examples=[1])
     survey_id: str = Field(examples=["survey-91c4"])
+    device_id: str | None = Field(description="of the survey", examples=["robot-7"])
     model: str = Field(examples=["voxel-net/1"])
     captured_at: str = Field(examples=["2026-03-01T12:00:00Z"])
     first_seen: str | None = Field(
@@ -154,72 +177,103 @@ class Interval(Document):
     interval: tuple[str, str] = Field(examples=[["2026-03-01T12:00:00Z", "2026-03-08T12:00:00Z"]])
 
 
-class _Feature(Document):
-    """What features of things have in common."""
-
-    type: Literal["Feature"] = "Feature"
-    geometry: Footprint | None = Field(description="WGS 84; null where the map has no geo-anchor")
-    place: Prism = Field(description="where it is now, or was before where it disappeared")
-
-
-class SightingFeature(_Feature):
-    """A thing as one survey saw it."""
+class SightingFeature(GeoJsonFeature):
+    """A thing as one survey saw it; its footprint is where it is now, or was before where it disappeared."""
 
     id: str = Field(examples=["survey-91c4.object_1"])
-    time: Time
     properties: SightingProperties
 
 
-class ObjectFeature(_Feature):
-    """A thing over all surveys of a map."""
+class ObjectFeature(GeoJsonFeature):
+    """A thing over all surveys of a map; its footprint is as in its latest sighting."""
 
     id: str = Field(examples=["object-7d21"])
-    time: Interval
     properties: ObjectProperties
 
 
 class ObjectHistory(ObjectFeature):
     """A thing over all surveys of a map, with each sighting of it."""
 
+    crs: features.NamedCrs | None = Field(None, description="with `crs=map` alone")
     sightings: list[SightingFeature] = Field(description="in order of time")
     links: list[Link]
 
 
-class _Collection(Document):
-    """The members that hold for all stand on the root, as the standard has it."""
-
-    type: Literal["FeatureCollection"] = "FeatureCollection"
-    conformsTo: tuple[str, ...] = CONFORMS_TO  # noqa: N815 - the standard's name
-    featureType: str = FEATURE_TYPE  # noqa: N815
-    coordRefSys: str = MAP_FRAME  # noqa: N815
-    timeStamp: str = Field(examples=["2026-03-01T12:05:00Z"])  # noqa: N815
-    numberMatched: int = Field(examples=[1])  # noqa: N815
-    numberReturned: int = Field(examples=[1])  # noqa: N815
-    links: list[Link]
-
-
-class SightingCollection(_Collection):
+class SightingCollection(GeoJsonCollection):
     """The things that one survey found changed."""
 
     features: list[SightingFeature]
 
 
-class ObjectCollection(_Collection):
+class ObjectCollection(GeoJsonCollection):
     """The changed things of a map."""
 
     features: list[ObjectFeature]
 
 
-class SightingsRequest(Request):
+class FgSightingFeature(SightingFeature):
+    """A thing as one survey saw it, in JSON-FG."""
+
+    place: Prism
+    time: Time
+
+
+class FgObjectFeature(ObjectFeature):
+    """A thing over all surveys of a map, in JSON-FG."""
+
+    place: Prism
+    time: Interval
+
+
+class FgObjectHistory(FgObjectFeature):
+    """A thing over all surveys of a map, with each sighting of it, in JSON-FG."""
+
+    sightings: list[FgSightingFeature] = Field(description="in order of time")
+    links: list[Link]
+
+
+class FgSightingCollection(FgCollection):
+    """The things that one survey found changed, in JSON-FG."""
+
+    features: list[FgSightingFeature]
+
+
+class FgObjectCollection(FgCollection):
+    """The changed things of a map, in JSON-FG."""
+
+    features: list[FgObjectFeature]
+
+
+#: What the routes below answer with, which FastAPI does not see.
+DOCUMENTS: tuple[type[Document], ...] = (
+    SightingCollection,
+    ObjectCollection,
+    ObjectHistory,
+    FgSightingCollection,
+    FgObjectCollection,
+    FgObjectHistory,
+)
+
+_NESTED = {"now", "before", "motion"}
+SIGHTINGS, OBJECTS = (
+    Kind(feature_type=FEATURE_TYPE, columns=tuple(name for name in shown.model_fields if name not in _NESTED))
+    for shown in (SightingProperties, ObjectProperties)
+)
+
+
+class SightingsRequest(FeaturesRequest):
     """Which objects of a survey."""
 
     kind: ObjectKind | None = None
     min_probability: MinProbability = None
+    bbox: Bbox = None
+    bbox_crs: BboxCrs = None
+    sortby: Annotated[SightingSort, Field(description="with a minus downwards")] = "number"
     limit: Limit = 100
     cursor: Cursor = None
 
 
-class ObjectsRequest(Request):
+class ObjectsRequest(FeaturesRequest):
     """Which objects of a map."""
 
     kind: Annotated[ObjectKind | None, Field(description="as its latest sighting tells it")] = None
@@ -230,10 +284,12 @@ class ObjectsRequest(Request):
     transient: Annotated[
         bool | None, Field(description="true: what comes and goes; false: what does not")
     ] = None
-    bbox: Annotated[
-        Annotated[str, readable(bounds_of)] | None,
-        Field(description="map frame, metres; objects whose box meets it", examples=["0,0,7.5,4.5"]),
-    ] = None
+    survey: Annotated[Id | None, Field(description="objects that this survey saw")] = None
+    device_id: Annotated[DeviceId | None, Field(description="objects that a survey of this device saw")] = (
+        None
+    )
+    bbox: Bbox = None
+    bbox_crs: BboxCrs = None
     datetime: Annotated[
         Annotated[str, readable(span_of)] | None,
         Field(
@@ -243,6 +299,10 @@ class ObjectsRequest(Request):
         ),
     ] = None
     min_probability: MinProbability = None
+    sortby: Annotated[
+        ObjectSort,
+        Field(description="with a minus downwards; left out: those first that were first seen last"),
+    ] = "-first_seen"
     limit: Limit = 100
     cursor: Cursor = None
 
@@ -253,7 +313,7 @@ class ObjectsRequest(Request):
     response_class=FeatureResponse,
     response_model=None,
     responses={
-        **features.documented(SightingCollection),
+        **features.documented(SightingCollection, FgSightingCollection),
         **documented("not_found", "not_ready", "invalid_request", "bad_request"),
     },
 )
@@ -262,7 +322,7 @@ def get_survey_objects(
     services: Provided,
     survey_id: Annotated[Id, Path()],
     asked: Annotated[SightingsRequest, Query()],
-) -> FeatureResponse:
+) -> Response:
     """Things that appeared, disappeared or moved, by their number in the coloured cloud.
 
     A survey of a model that tells tiles alone has none to tell, nor has one whose placement is in doubt, which is not
@@ -271,18 +331,33 @@ def get_survey_objects(
     catalog = services.catalog
     survey = catalog.surveys.ready(survey_id)
     if survey.objects is None:
-        in_doubt = survey.placement is not None and survey.placement.state == "in_doubt"
-        why = "its placement is in doubt" if in_doubt else f"{survey.model} tells tiles alone"
-        raise NotFound(
-            f"survey {survey_id!r} tells no objects, for {why}; GET /surveys/{survey_id}/tiles has those"
-        )
-    convert = _converter(catalog.maps.get(survey.map_id).anchor)
-    wanted = SightingFilter(survey_id=survey_id, kind=asked.kind, min_probability=asked.min_probability)
-    after = None if asked.cursor is None else int(decoded(asked.cursor, count)[0])
-    page = catalog.objects.of_survey(wanted, after=after, limit=asked.limit)
-    links = _links(request, None if page.following is None else encoded(str(page.following)))
-    links.append(link(request, f"/surveys/{survey_id}", "survey"))
-    return _answer([_sighting(one, convert) for one in page.items], page.matched, links)
+        raise NotFound(_why_none(survey))
+    anchor = catalog.maps.get(survey.map_id).anchor
+    form = form_of(request, asked, anchor)
+    wanted = SightingFilter(
+        survey_id=survey_id,
+        kind=asked.kind,
+        bounds=bounds_of(asked.bbox, asked.bbox_crs, anchor),
+        min_probability=asked.min_probability,
+    )
+    after = decoded_values(asked.cursor, asked.sortby, sighting_order(asked.sortby))
+    page = catalog.objects.of_survey(wanted, sort=asked.sortby, after=after, limit=asked.limit)
+    return collection_response(
+        request,
+        form,
+        SIGHTINGS,
+        [_sighting(one, form) for one in page.items],
+        matched=page.matched,
+        cursor=encoded_values(asked.sortby, page.following),
+        links=[link(request, f"/surveys/{survey_id}", "survey")],
+    )
+
+
+def _why_none(survey: SurveyRecord) -> str:
+    """Say why a survey tells no objects."""
+    in_doubt = survey.placement is not None and survey.placement.state == "in_doubt"
+    why = "its placement is in doubt" if in_doubt else f"{survey.model} tells tiles alone"
+    return f"survey {survey.survey_id!r} tells no objects, for {why}; GET /surveys/{survey.survey_id}/tiles has those"
 
 
 @router.get(
@@ -291,7 +366,7 @@ def get_survey_objects(
     response_class=FeatureResponse,
     response_model=None,
     responses={
-        **features.documented(ObjectCollection),
+        **features.documented(ObjectCollection, FgObjectCollection),
         **documented("not_found", "not_ready", "invalid_request", "bad_request"),
     },
 )
@@ -300,29 +375,26 @@ def get_objects(
     services: Provided,
     map_id: Annotated[Id, Path()],
     asked: Annotated[ObjectsRequest, Query()],
-) -> FeatureResponse:
+) -> Response:
     """Each changed thing once, with what became of it: those first that were first seen last.
 
     A thing keeps its id from survey to survey. What a version of the map has taken over stays in the list as `accepted`.
     """
-    catalog = services.catalog
-    convert = _converter(catalog.maps.ready(map_id).anchor)
-    since, until = (None, None) if asked.datetime is None else span_of(asked.datetime)
-    wanted = ObjectFilter(
-        map_id=map_id,
-        kind=asked.kind,
-        status=asked.status,
-        last_known=asked.last_known,
-        transient=asked.transient,
-        bounds=None if asked.bbox is None else bounds_of(asked.bbox),
-        since=since,
-        until=until,
-        min_probability=asked.min_probability,
+    anchor = services.catalog.maps.ready(map_id).anchor
+    form = form_of(request, asked, anchor)
+    order = object_order(asked.sortby)
+    after = decoded_values(asked.cursor, asked.sortby, [key.type for key in order])
+    wanted = _filter(map_id, asked, anchor)
+    page = services.catalog.objects.page(wanted, sort=asked.sortby, after=after, limit=asked.limit)
+    return collection_response(
+        request,
+        form,
+        OBJECTS,
+        [_object(one, form) for one in page.items],
+        matched=page.matched,
+        cursor=encoded_values(asked.sortby, page.following),
+        links=[link(request, f"/maps/{map_id}", "map")],
     )
-    page = catalog.objects.page(wanted, after=_position(asked.cursor), limit=asked.limit)
-    links = _links(request, None if page.following is None else _cursor(page.following))
-    links.append(link(request, f"/maps/{map_id}", "map"))
-    return _answer([_object(one, convert) for one in page.items], page.matched, links)
 
 
 @router.get(
@@ -330,71 +402,60 @@ def get_objects(
     summary="One object with its history",
     response_class=FeatureResponse,
     response_model=None,
-    responses=features.documented(ObjectHistory) | MADE,
+    responses=features.documented(ObjectHistory, FgObjectHistory)
+    | MADE
+    | documented("bad_request", "invalid_request"),
 )
 def get_object(
     request: HttpRequest,
     services: Provided,
     map_id: Annotated[Id, Path()],
     object_id: Annotated[Id, Path()],
-) -> FeatureResponse:
+    asked: Annotated[FeaturesRequest, Query()],
+) -> Response:
     """What became of it, and each sighting of it: where it was then, and what spoke for it."""
-    catalog = services.catalog
-    convert = _converter(catalog.maps.ready(map_id).anchor)
-    record, seen = catalog.objects.get(map_id, object_id)
-    here = f"/maps/{map_id}/objects/{object_id}"
-    document = _object(record, convert) | {
-        "sightings": [_sighting(one, convert) for one in seen],
-        "links": [link(request, here, "self", MEDIA_TYPE), link(request, f"/maps/{map_id}", "map")],
-    }
-    return FeatureResponse(to_json(document, inf_nan_mode="null"))
+    form = form_of(request, asked, services.catalog.maps.ready(map_id).anchor)
+    record, seen = services.catalog.objects.get(map_id, object_id)
+    return feature_response(
+        request,
+        form,
+        OBJECTS,
+        _object(record, form),
+        more={"sightings": [_sighting(one, form) for one in seen]},
+        links=[link(request, f"/maps/{map_id}", "map")],
+    )
 
 
-def _answer(found: Iterable[dict[str, Any]], matched: int, links: Sequence[Link]) -> FeatureResponse:
-    collection = object_collection(found, matched=matched)
-    collection |= {"timeStamp": rfc3339(now()), "links": list(links)}
-    return FeatureResponse(to_json(collection, inf_nan_mode="null"))
+def _filter(map_id: str, asked: ObjectsRequest, anchor: Anchor | None) -> ObjectFilter:
+    """Return which objects are asked for, of a map that lies at `anchor`. Raises BadRequest."""
+    since, until = (None, None) if asked.datetime is None else span_of(asked.datetime)
+    return ObjectFilter(
+        map_id=map_id,
+        kind=asked.kind,
+        status=asked.status,
+        last_known=asked.last_known,
+        transient=asked.transient,
+        survey_id=asked.survey,
+        device_id=asked.device_id,
+        bounds=bounds_of(asked.bbox, asked.bbox_crs, anchor),
+        since=since,
+        until=until,
+        min_probability=asked.min_probability,
+    )
 
 
-def _sighting(record: SightingRecord, convert: ToWgs84 | None) -> dict[str, Any]:
-    """Return a sighting; `convert` takes points of the map frame to the Earth."""
+def _sighting(record: SightingRecord, form: Form) -> dict[str, Any]:
+    """Return a sighting, in JSON-FG with the geometry that `form` has."""
     thing = record.thing.model_dump()
-    return sighting_feature(thing, survey=_shared(record), geometry=_geometry(thing, convert))
+    return sighting_feature(thing, survey=_shared(record), geometry=form.geometry(*ring_of(thing)))
 
 
-def _object(record: MapObjectRecord, convert: ToWgs84 | None) -> dict[str, Any]:
-    """Return an object as its latest sighting has it."""
+def _object(record: MapObjectRecord, form: Form) -> dict[str, Any]:
+    """Return an object as its latest sighting has it, likewise."""
     thing = record.latest.thing.model_dump()
     history = _shared(record.latest) | plain(record.model_dump(exclude={"latest"}))
-    return object_feature(thing, history=history, geometry=_geometry(thing, convert))
+    return object_feature(thing, history=history, geometry=form.geometry(*ring_of(thing)))
 
 
 def _shared(record: SightingRecord) -> dict[str, Any]:
     return plain(record.model_dump(exclude={"thing"}))
-
-
-def _geometry(thing: dict[str, Any], convert: ToWgs84 | None) -> dict[str, Any] | None:
-    return None if convert is None else on_earth(*ring_of(thing), convert)
-
-
-def _converter(anchor: Anchor | None) -> ToWgs84 | None:
-    return None if anchor is None else to_wgs84(anchor)
-
-
-def _links(request: HttpRequest, cursor: str | None) -> list[Link]:
-    """Return the links to this answer and, where there is more, to the next page."""
-    here = Link(href=str(request.url.replace(scheme="", netloc="")), rel="self", type=MEDIA_TYPE)
-    return [here] if cursor is None else [here, next_link(request, cursor, MEDIA_TYPE)]
-
-
-def _cursor(position: Position) -> str:
-    first_seen, object_id = position
-    return encoded(rfc3339(first_seen), object_id)
-
-
-def _position(cursor: str | None) -> Position | None:
-    """Return where to go on. Raises BadRequest."""
-    if cursor is None:
-        return None
-    first_seen, object_id = decoded(cursor, instant, str)
-    return first_seen, object_id

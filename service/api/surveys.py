@@ -11,7 +11,6 @@ from fastapi.concurrency import run_in_threadpool
 from pydantic import Field
 
 from service.api import features
-from service.api.features import FeatureResponse, feature_response
 from service.api.http import bodies, files
 from service.api.http.access import maps_of_key
 from service.api.http.bodies import Body
@@ -32,7 +31,7 @@ from service.api.http.submission import (
     submit,
 )
 from service.catalog import blob_keys
-from service.catalog.records import JobRecord, MapRecord, SurveyRecord, SurveyStatus
+from service.catalog.records import JobRecord, MapRecord, SurveyRecord, SurveyStatus, SurveySummary
 
 router = APIRouter(tags=["surveys"])
 MapId = Annotated[Id, Path()]
@@ -57,6 +56,13 @@ class SurveyDocument(SurveyRecord, Document):
     links: list[Link]
 
 
+class SurveySummaryDocument(SurveySummary, Document):
+    """A survey in short; the survey itself tells what became of each scan."""
+
+    problem: JobProblem  # type: ignore[assignment]  # as RFC 9457 has it
+    links: list[Link]
+
+
 class AcceptedSurvey(Document):
     """A survey that is going to be compared."""
 
@@ -70,7 +76,7 @@ class AcceptedSurvey(Document):
 class SurveyList(Document):
     """Surveys, newest first."""
 
-    surveys: list[SurveyDocument]
+    surveys: list[SurveySummaryDocument]
     links: list[Link]
 
 
@@ -111,11 +117,12 @@ async def create_survey(
 def list_surveys(
     request: HttpRequest, services: Provided, map_id: MapId, asked: Annotated[PageRequest, Query()]
 ) -> SurveyList:
-    """Of one map, newest first."""
+    """Of one map in short, newest first."""
     services.catalog.maps.get(map_id)
     page = services.catalog.surveys.page(map_id, after=asked.after(), limit=asked.limit)
     links = list_links(request, page, lambda record: (record.created, record.survey_id))
-    return SurveyList(surveys=[survey_document(record, request) for record in page.items], links=links)
+    surveys = [SurveySummaryDocument(**dict(one), links=_links(one, request)) for one in page.items]
+    return SurveyList(surveys=surveys, links=links)
 
 
 @router.get("/surveys/{survey_id}", summary="Look at a survey", responses=NAMED)
@@ -139,29 +146,13 @@ async def delete_survey(services: Provided, survey_id: SurveyId) -> None:
 
 
 @router.get(
-    "/surveys/{survey_id}/tiles",
-    summary="Every tile of a survey",
-    response_class=FeatureResponse,
-    response_model=None,
-    responses=features.documented() | MADE,
-)
-def get_tiles(request: HttpRequest, services: Provided, survey_id: SurveyId) -> FeatureResponse:
-    """Unchanged, changed, inconsistent and unobserved tiles alike."""
-    survey = services.catalog.surveys.ready(survey_id)
-    anchor = services.catalog.maps.get(survey.map_id).anchor
-    tiles = services.catalog.changes.of_survey(survey_id)
-    here = link(request, f"/surveys/{survey_id}/tiles", "self", features.MEDIA_TYPE)
-    return feature_response(tiles, matched=len(tiles), links=[here], anchor=anchor)
-
-
-@router.get(
     "/surveys/{survey_id}/cloud.ply",
     summary="The coloured cloud of a survey",
     response_class=Response,
     responses=files.documented(bodies.RAW, "The current map coloured by result, PLY") | MADE,
 )
 async def get_survey_cloud(services: Provided, survey_id: SurveyId) -> Response:
-    """With the scalar fields `change_score` and `tile_state` beside the colours."""
+    """With the scalar fields `scalar_change_score` and `scalar_tile_state` beside the colours; its header has the legend."""
     await run_in_threadpool(services.catalog.surveys.ready, survey_id)
     return await blob_response(
         services.catalog.blobs,
@@ -185,7 +176,7 @@ async def get_picture(services: Provided, survey_id: SurveyId) -> Response:
     return await blob_response(services.catalog.blobs, key, media_type="image/png")
 
 
-def _refused(survey: SurveyRecord) -> bool:
+def _refused(survey: SurveySummary) -> bool:
     """Whether a survey failed because no scan of it was accepted, which has a picture."""
     placement = survey.placement
     return survey.status == "failed" and placement is not None and placement.state == "refused"
@@ -225,6 +216,10 @@ def _delete(services: Services, survey_id: str) -> None:
 
 def survey_document(record: SurveyRecord, request: HttpRequest) -> SurveyDocument:
     """Return a survey with its links."""
+    return SurveyDocument(**dict(record), links=_links(record, request))
+
+
+def _links(record: SurveySummary, request: HttpRequest) -> list[Link]:
     here = f"/surveys/{record.survey_id}"
     links = [
         link(request, here, "self"),
@@ -241,4 +236,4 @@ def survey_document(record: SurveyRecord, request: HttpRequest) -> SurveyDocumen
         links.append(link(request, f"{here}/picture.png", "preview", "image/png"))
     if record.status == "ready" and record.objects is not None:
         links.append(link(request, f"{here}/objects", "objects", features.MEDIA_TYPE))
-    return SurveyDocument(**dict(record), links=links)
+    return links

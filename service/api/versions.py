@@ -18,7 +18,7 @@ from service.api.http.paging import PageRequest, list_links
 from service.api.http.problems import BODY, MADE, NAMED, JobProblem, documented
 from service.api.http.submission import ScansRequest, admit, delete, kept_scans, lane, monitor, submit
 from service.api.maps import BuiltDocument, MapId, cloud_response, file_links, manifest_response
-from service.catalog.records import JobRecord, MapStatus, VersionRecord
+from service.catalog.records import JobRecord, MapStatus, VersionRecord, VersionSummary
 
 router = APIRouter(tags=["versions"])
 Number = Annotated[int, Path(ge=1, lt=1 << 31, examples=[1])]
@@ -38,6 +38,13 @@ class VersionDocument(VersionRecord, BuiltDocument):
     problem: JobProblem  # type: ignore[assignment]  # as RFC 9457 has it
 
 
+class VersionSummaryDocument(VersionSummary, Document):
+    """One state of a map in short; the version itself tells what became of each scan."""
+
+    problem: JobProblem  # type: ignore[assignment]  # as RFC 9457 has it
+    links: list[Link]
+
+
 class AcceptedVersion(Document):
     """A version of a map that is going to be built; the one in use stays in use until then."""
 
@@ -51,7 +58,7 @@ class AcceptedVersion(Document):
 class VersionList(Document):
     """Versions of one map, newest first."""
 
-    versions: list[VersionDocument]
+    versions: list[VersionSummaryDocument]
     links: list[Link]
 
 
@@ -95,10 +102,11 @@ async def create_version(
 def list_versions(
     request: HttpRequest, services: Provided, map_id: MapId, asked: Annotated[PageRequest, Query()]
 ) -> VersionList:
-    """Newest first; the first in the list that is `ready` is the one in use."""
+    """In short, newest first; the first in the list that is `ready` is the one in use."""
     page = services.catalog.versions.page(map_id, after=asked.after(), limit=asked.limit)
     links = list_links(request, page, lambda record: (record.created, record.job_id))
-    return VersionList(versions=[version_document(record, request) for record in page.items], links=links)
+    versions = [VersionSummaryDocument(**dict(one), links=_links(one, request)) for one in page.items]
+    return VersionList(versions=versions, links=links)
 
 
 @router.get("/maps/{map_id}/versions/{number}", summary="Look at a version of a map", responses=NAMED)
@@ -157,6 +165,10 @@ def _create(
 
 def version_document(record: VersionRecord, request: HttpRequest) -> VersionDocument:
     """Return a version of a map with its links."""
+    return VersionDocument(**dict(record), links=_links(record, request))
+
+
+def _links(record: VersionSummary, request: HttpRequest) -> list[Link]:
     here = f"/maps/{record.map_id}/versions/{record.version}"
     links = [
         link(request, here, "self"),
@@ -167,4 +179,4 @@ def version_document(record: VersionRecord, request: HttpRequest) -> VersionDocu
         links.append(link(request, f"/surveys/{record.survey_id}", "survey"))
     if record.status == "ready":
         links += file_links(request, here)
-    return VersionDocument(**dict(record), links=links)
+    return links

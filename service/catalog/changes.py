@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from datetime import datetime
-from typing import Any, NamedTuple
+from typing import Any, Literal
 
-from sqlalchemy import Select, and_, func, or_, select
-from sqlalchemy.orm import InstrumentedAttribute
+from sqlalchemy import ColumnElement, Select, and_, exists, func, select
+from sqlalchemy.orm import InstrumentedAttribute, aliased
 
 from service.catalog import tables
 from service.catalog.database import Database
-from service.catalog.records import Bounds, ChangeRecord, TileRecord
+from service.catalog.keyset import Key, Order, Values, behind, order_by
+from service.catalog.records import Bounds, ChangeRecord, TileRecord, TileState
 
 _TILE, _SURVEY, _TOLD = tables.SurveyTile, tables.Survey, tables.TileChange
 #: Every tile of every survey, with the change that it belongs to.
@@ -22,13 +23,17 @@ _TILES = (
 )
 
 
-class ChangePosition(NamedTuple):
-    """Where a page ended."""
+#: What changes may be ordered by; with a minus: downwards.
+ChangeSort = Literal[
+    "first_seen", "-first_seen", "last_seen", "-last_seen", "captured_at", "-captured_at",
+    "score", "-score", "max_score", "-max_score",
+]  # fmt: skip
+#: Likewise the tiles of one survey; `tile_index` is the order of the grid.
+TileSort = Literal["tile_index", "-tile_index", "score", "-score"]
+VoxelKind = Literal["appeared", "disappeared"]  #: what voxels of a tile did
 
-    instant: datetime  #: by which the list is ordered
-    survey_id: str
-    score: float
-    tile_id: str
+_Tiles = Select[tables.SurveyTile, tables.Survey, tables.TileChange]
+_SCORE = func.coalesce(_TILE.score, -1.0)  #: tiles without a score are below all others
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -38,6 +43,11 @@ class ChangeFilter:
     map_id: str
     survey_id: str | None = None
     repeats: bool = False  #: each visit's, and not each change once; so it is too where a survey is named
+    state: TileState = "changed"  #: another one than `changed` is each visit's as well
+    kind: VoxelKind | None = None  #: with voxels that did so; None of detectors of tiles alone
+    device_id: str | None = (
+        None  #: of the visit; of a change that is told once: of one of its visits at least
+    )
     bounds: Bounds | None = None  #: map frame; a tile is in when its box meets this one
     since: datetime | None = None  #: first seen, or with `repeats` captured, at or after
     until: datetime | None = None  #: likewise, at or before
@@ -48,16 +58,27 @@ class ChangeFilter:
     @property
     def once(self) -> bool:
         """Whether a change that stays over several surveys is told once."""
-        return not self.repeats and self.survey_id is None
+        return not self.repeats and self.survey_id is None and self.state == "changed"
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class TileFilter:
+    """Which tiles of a survey are asked for; None takes all."""
+
+    survey_id: str
+    state: TileState | None = None
+    kind: VoxelKind | None = None
+    bounds: Bounds | None = None  #: map frame; a tile is in when its box meets this one
+    min_score: float | None = None  #: 0..1, inclusive
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class ChangePage:
-    """Some changes of a longer list: newest first, most certain first within a survey."""
+    """Some tiles of a longer list."""
 
     items: tuple[ChangeRecord, ...]
     matched: int  #: of all pages together
-    following: ChangePosition | None  #: where the next page starts, None at the end
+    following: Values | None  #: behind which row the next page starts, None at the end
 
 
 class Changes:
@@ -67,71 +88,135 @@ class Changes:
         self._database = database
 
     def page(
-        self, wanted: ChangeFilter, *, after: ChangePosition | None = None, limit: int = 100
+        self,
+        wanted: ChangeFilter,
+        *,
+        sort: ChangeSort | None = None,
+        after: Values | None = None,
+        limit: int = 100,
     ) -> ChangePage:
-        """Return changed tiles of surveys that are ready: each change once, or with `repeats` for each visit."""
-        query = _matching(wanted)
-        count = select(func.count()).select_from(query.subquery())
-        instant = _instant(wanted)
-        rows = query if after is None else query.where(_behind(instant, after))
-        rows = rows.order_by(
-            instant.desc(), _SURVEY.survey_id.desc(), _TILE.score.desc(), _TILE.tile_id.asc()
-        ).limit(limit + 1)
-        with self._database.read() as session:
-            matched = session.scalar(count) or 0
-            records = [_record(*row) for row in session.execute(rows)]
-        items = tuple(records[:limit])
-        following = _position(items[-1], wanted) if len(records) > limit else None
-        return ChangePage(items=items, matched=matched, following=following)
+        """Return tiles of surveys that are ready: each change once, or with `repeats` for each visit.
+
+        Newest first where no order is given, most certain first within a survey.
+        """
+        return self._page(_matching(wanted), change_order(wanted, sort), after, limit)
+
+    def tiles(
+        self,
+        wanted: TileFilter,
+        *,
+        sort: TileSort = "tile_index",
+        after: Values | None = None,
+        limit: int | None = None,
+    ) -> ChangePage:
+        """Return tiles of a survey, unobserved ones too; all of them where there is no limit."""
+        query = _TILES.where(_TILE.survey_id == wanted.survey_id)
+        if wanted.state is not None:
+            query = query.where(_TILE.state == wanted.state)
+        if wanted.min_score is not None:
+            query = query.where(_TILE.score >= wanted.min_score)
+        query = _with_voxels(query, wanted.kind)
+        return self._page(_meeting(query, wanted.bounds), tile_order(sort), after, limit)
 
     def of_survey(self, survey_id: str) -> tuple[ChangeRecord, ...]:
         """Return every tile of a survey, unobserved ones too, in the order of the grid."""
-        query = _TILES.where(_TILE.survey_id == survey_id).order_by(_TILE.i, _TILE.j, _TILE.k)
+        return self.tiles(TileFilter(survey_id=survey_id)).items
+
+    def _page(self, query: _Tiles, order: Order, after: Values | None, limit: int | None) -> ChangePage:
+        count = select(func.count()).select_from(query.subquery())
+        rows = query if after is None else query.where(behind(order, after))
+        rows = rows.add_columns(*(key.column for key in order)).order_by(*order_by(order))
+        rows = rows if limit is None else rows.limit(limit + 1)
         with self._database.read() as session:
-            return tuple(_record(*row) for row in session.execute(query))
+            matched = session.scalar(count) or 0
+            read: list[tuple[ChangeRecord, Values]] = [
+                (_record(*row[:3]), tuple(row[3:])) for row in session.execute(rows)
+            ]
+        shown = read[:limit]
+        following = shown[-1][1] if shown and len(read) > len(shown) else None
+        return ChangePage(items=tuple(record for record, _ in shown), matched=matched, following=following)
+
+
+def change_order(wanted: ChangeFilter, sort: ChangeSort | None = None) -> Order:
+    """Return the keys that changes are ordered by."""
+    chosen = sort or ("-first_seen" if wanted.once else "-captured_at")
+    columns: dict[str, tuple[Any, type[datetime] | type[float]]] = {
+        "first_seen": (func.coalesce(_TOLD.first_seen, _SURVEY.captured_at), datetime),
+        "last_seen": (func.coalesce(_TOLD.last_seen, _SURVEY.captured_at), datetime),
+        "captured_at": (_SURVEY.captured_at, datetime),
+        "score": (_SCORE, float),
+        "max_score": (func.coalesce(_TOLD.max_score, -1.0), float),
+    }
+    column, kind = columns[chosen.removeprefix("-")]
+    return (
+        Key(column=column, type=kind, descending=chosen.startswith("-")),
+        Key(column=_SURVEY.survey_id, type=str, descending=True),
+        Key(column=_SCORE, type=float, descending=True),
+        Key(column=_TILE.tile_id, type=str),
+    )
+
+
+def tile_order(sort: TileSort) -> Order:
+    """Return the keys that the tiles of a survey are ordered by."""
+    down = sort.startswith("-")
+    if sort in ("score", "-score"):
+        return Key(column=_SCORE, type=float, descending=down), Key(column=_TILE.tile_id, type=str)
+    return tuple(Key(column=column, type=int, descending=down) for column in (_TILE.i, _TILE.j, _TILE.k))
 
 
 def _instant(wanted: ChangeFilter) -> InstrumentedAttribute[datetime]:
-    """Return the column by which changes are ordered and asked for in time."""
+    """Return the column by which changes are asked for in time."""
     return _TOLD.first_seen if wanted.once else _SURVEY.captured_at
 
 
-def _matching(wanted: ChangeFilter) -> Select[tables.SurveyTile, tables.Survey, tables.TileChange]:
-    query = _TILES.where(_SURVEY.map_id == wanted.map_id, _SURVEY.status == "ready", _TILE.state == "changed")
+def _matching(wanted: ChangeFilter) -> _Tiles:
+    query = _TILES.where(
+        _SURVEY.map_id == wanted.map_id, _SURVEY.status == "ready", _TILE.state == wanted.state
+    )
     if wanted.once:
         query = query.where(_TILE.survey_id == _TILE.told_by)
     instant, score = _instant(wanted), _TOLD.max_score if wanted.once else _TILE.score
     if wanted.survey_id is not None:
         query = query.where(_SURVEY.survey_id == wanted.survey_id)
+    if wanted.device_id is not None:
+        query = query.where(
+            _seen_by(wanted.device_id) if wanted.once else _SURVEY.device_id == wanted.device_id
+        )
     if wanted.since is not None:
         query = query.where(instant >= wanted.since)
     if wanted.until is not None:
         query = query.where(instant <= wanted.until)
     if wanted.min_score is not None:
         query = query.where(score >= wanted.min_score)
-    if wanted.bounds is not None:
-        low, high = wanted.bounds.min, wanted.bounds.max
-        query = query.where(
-            and_(_TILE.min_x <= high[0], _TILE.min_y <= high[1], _TILE.min_z <= high[2]),
-            and_(_TILE.max_x >= low[0], _TILE.max_y >= low[1], _TILE.max_z >= low[2]),
-        )
-    return query
+    return _meeting(_with_voxels(query, wanted.kind), wanted.bounds)
 
 
-def _behind(instant: InstrumentedAttribute[datetime], after: ChangePosition) -> Any:
-    same_time = instant == after.instant
-    same_survey = and_(same_time, _SURVEY.survey_id == after.survey_id)
-    return or_(
-        instant < after.instant,
-        and_(same_time, _SURVEY.survey_id < after.survey_id),
-        and_(same_survey, _TILE.score < after.score),
-        and_(same_survey, _TILE.score == after.score, _TILE.tile_id > after.tile_id),
+def _seen_by(device_id: str) -> ColumnElement[bool]:
+    """Return the condition that one of the visits which saw a change is of this device."""
+    tile, survey = aliased(tables.SurveyTile), aliased(tables.Survey)
+    same = (
+        tile.told_by == _TILE.survey_id,
+        tile.tile_id == _TILE.tile_id,
+        tile.survey_id == survey.survey_id,
     )
+    return exists().where(survey.map_id == _SURVEY.map_id, survey.device_id == device_id, *same)
 
 
-def _position(last: ChangeRecord, wanted: ChangeFilter) -> ChangePosition:
-    instant = last.first_seen if wanted.once and last.first_seen is not None else last.captured_at
-    return ChangePosition(instant, last.survey_id, last.tile.score or 0.0, last.tile.tile_id)
+def _with_voxels(query: _Tiles, kind: VoxelKind | None) -> _Tiles:
+    if kind is None:
+        return query
+    return query.where((_TILE.appeared if kind == "appeared" else _TILE.disappeared) > 0)
+
+
+def _meeting(query: _Tiles, bounds: Bounds | None) -> _Tiles:
+    """Keep the tiles whose box meets this one."""
+    if bounds is None:
+        return query
+    low, high = bounds.min, bounds.max
+    return query.where(
+        and_(_TILE.min_x <= high[0], _TILE.min_y <= high[1], _TILE.min_z <= high[2]),
+        and_(_TILE.max_x >= low[0], _TILE.max_y >= low[1], _TILE.max_z >= low[2]),
+    )
 
 
 def _record(tile: tables.SurveyTile, survey: tables.Survey, told: tables.TileChange | None) -> ChangeRecord:
@@ -140,6 +225,7 @@ def _record(tile: tables.SurveyTile, survey: tables.Survey, told: tables.TileCha
         map_id=survey.map_id,
         map_version=survey.map_version,
         survey_id=survey.survey_id,
+        device_id=survey.device_id,
         model=survey.model,
         threshold=survey.threshold,
         captured_at=survey.captured_at,

@@ -12,10 +12,27 @@ from service.catalog import blob_keys, tables
 from service.catalog.blobs import Blobs
 from service.catalog.database import Database
 from service.catalog.jobs import new_job
-from service.catalog.records import Anchor, Built, JobRecord, MapRecord, Page, Position, ScanOutcome
+from service.catalog.records import (
+    Anchor,
+    Built,
+    BuiltSummary,
+    JobRecord,
+    MapRecord,
+    MapSummary,
+    Page,
+    Position,
+    ScanOutcome,
+)
 from service.catalog.scans import checked_scan_ids, scans_in_order
 from service.catalog.tables import new_id, now
-from service.catalog.versions import check_ready, map_row, new_version, shown_version, versions_in_use
+from service.catalog.versions import (
+    check_ready,
+    in_use,
+    map_row,
+    new_version,
+    shown_version,
+    versions_in_short,
+)
 from service.errors import Conflict
 
 
@@ -78,11 +95,12 @@ class Maps:
 
     def page(
         self, *, only: Collection[str] | None = None, after: Position | None = None, limit: int = 100
-    ) -> Page[MapRecord]:
+    ) -> Page[MapSummary]:
         """Return maps, newest first; `only` those of these ids where that is given."""
         created, key = tables.Map.created, tables.Map.map_id
-        query = versions_in_use() if only is None else versions_in_use().where(key.in_(only))
-        return self._database.page(query, created, key, _record, after=after, limit=limit)
+        query = in_use(versions_in_short())
+        query = query if only is None else query.where(key.in_(only))
+        return self._database.page(query, created, key, _summary, after=after, limit=limit)
 
     def set_anchor(self, map_id: str, anchor: Anchor | None) -> MapRecord:
         """Say where the map lies on the Earth, or that nobody knows. Raises NotFound."""
@@ -109,7 +127,16 @@ class Maps:
 
 def _record(shown: tables.MapVersion) -> MapRecord:
     """Return the record of the map that shows this version."""
+    return MapRecord(**dict(Built.of_row(shown)) | _of_map(shown))
+
+
+def _summary(shown: tables.MapVersion) -> MapSummary:
+    """Return the same in short."""
+    return MapSummary(**dict(BuiltSummary.of_row(shown)) | _of_map(shown))
+
+
+def _of_map(shown: tables.MapVersion) -> dict[str, Any]:
+    """Return what a map says for itself, whichever version it shows."""
     row = shown.of_map
-    built = dict(Built.of_row(shown))
-    built |= {"created": row.created, "updated": max(row.updated, shown.updated)}
-    return MapRecord(name=row.name, anchor=row.anchor, objects=row.objects or {}, **built)
+    own = {"name": row.name, "anchor": row.anchor, "objects": row.objects or {}}
+    return own | {"created": row.created, "updated": max(row.updated, shown.updated)}

@@ -43,6 +43,14 @@ ScanReason = Literal[
     "wrong_prior",
     "moved_while_scanning",
     "disagrees",
+    "wrong_units",
+    "far_from_origin",
+    "far_points",
+    "missing_returns",
+    "odd_density",
+    "odd_size",
+    "little_coverage",
+    "clock",
 ]
 ScanFormat = Literal["ply", "pcd"]
 #: What an API key may do; `admin` is everything.
@@ -103,6 +111,19 @@ class Problem(Record):
         )
 
 
+class ScanWarning(Record):
+    """What is odd about a scan or a survey that was taken."""
+
+    reason: ScanReason = Field(examples=["wrong_scale"])
+    detail: str = Field(description="a sentence for people; it may change")
+    numbers: dict[str, float] = Field(
+        default_factory=dict, description="metres, degrees, shares", examples=[{"scale": 1.012}]
+    )
+
+
+Warnings = Annotated[tuple[ScanWarning, ...], BeforeValidator(lambda given: given or ())]
+
+
 class ScanRecord(Record):
     """One uploaded file, unread."""
 
@@ -115,17 +136,10 @@ class ScanRecord(Record):
     captured_at: Utc | None
     pose: Matrix | None = Field(description="map_from_sensor as it was given, row-major")
     key: str = Field(exclude=True)  #: of the blob; clients do not see it
-    created: Utc
-
-
-class ScanWarning(Record):
-    """What is odd about a scan that was accepted."""
-
-    reason: ScanReason = Field(examples=["wrong_scale"])
-    detail: str = Field(description="a sentence for people; it may change")
-    numbers: dict[str, float] = Field(
-        default_factory=dict, description="metres, degrees, shares", examples=[{"scale": 1.012}]
+    warnings: Warnings = Field(
+        (), description="what is odd about it: of its clock at once, of its points once a job has read it"
     )
+    created: Utc
 
 
 class ScanOutcome(Record):
@@ -163,9 +177,7 @@ class ScanOutcome(Record):
     candidates: tuple[Matrix, ...] | None = Field(
         None, description="`ambiguous` alone: each map_from_scan that nothing tells from the others"
     )
-    warnings: Annotated[tuple[ScanWarning, ...], BeforeValidator(lambda given: given or ())] = Field(
-        (), description="what is odd about it though it was accepted"
-    )
+    warnings: Warnings = Field((), description="what is odd about it beside, also where it was left out")
 
 
 class Bounds(Record):
@@ -276,31 +288,37 @@ class ObjectRecord(Record):
         return self
 
 
-class Built(Record):
-    """What a map and a version of it have in common; a map shows its version in use."""
+class BuiltSummary(Record):
+    """What lists tell of maps and of versions alike."""
 
     map_id: str = Field(examples=["lobby"])
     version: int = Field(examples=[1])  #: 1, 2, ... of the map
     status: MapStatus
     model: str = Field(examples=["voxel-net/1"])  #: `name/version`, whose card gives voxel and tile size
-    settings: dict[str, Any]
-    scans: tuple[ScanOutcome, ...]  #: those of the base that were accepted, then the new ones, as requested
+    scan_count: int = Field(description="scans that it is made of, accepted or not", examples=[25])
     bounds: Bounds | None = Field(description="metres, map frame")  #: None until it is built
     counts: dict[str, int] = Field(examples=[{"points": 181342, "tiles": 172, "scans": 25, "accepted": 24}])
-    registration: dict[str, Any] | None = Field(
-        description="totals of the registration of what is new in it (paper, Table 2); null until it is built",
-        examples=[
-            {"scans": 25, "accepted": 24, "pairs_possible": 300, "pairs_tried": 61, "pairs_accepted": 58}
-        ],
-    )
     job_id: str  #: of the job that builds it, and so of its files (`blob_keys.map_folder`)
     problem: Problem | None
     created: Utc
     updated: Utc
 
 
-class MapRecord(Built):
-    """A reference map as it is in use: the newest of its versions that is ready, and the newest where none is."""
+class Built(BuiltSummary):
+    """What a map and a version of it have in common; a map shows its version in use."""
+
+    settings: dict[str, Any]
+    scans: tuple[ScanOutcome, ...]  #: those of the base that were accepted, then the new ones, as requested
+    registration: dict[str, Any] | None = Field(
+        description="totals of the registration of what is new in it (paper, Table 2); null until it is built",
+        examples=[
+            {"scans": 25, "accepted": 24, "pairs_possible": 300, "pairs_tried": 61, "pairs_accepted": 58}
+        ],
+    )
+
+
+class MapSummary(BuiltSummary):
+    """A reference map as it is in use, without what became of each scan."""
 
     name: str | None
     anchor: Anchor | None = Field(description="where the map lies on the Earth; null: nobody said")
@@ -310,11 +328,19 @@ class MapRecord(Built):
     )
 
 
-class VersionRecord(Built):
-    """One state of a map; a survey stays with the version that it was compared with."""
+class MapRecord(MapSummary, Built):
+    """A reference map as it is in use: the newest of its versions that is ready, and the newest where none is."""
+
+
+class VersionSummary(BuiltSummary):
+    """One state of a map, without what became of each scan."""
 
     base_version: int | None = Field(description="the version it goes on from; null in the first")
     survey_id: str | None = Field(description="the survey it takes over; null where it is made of scans")
+
+
+class VersionRecord(VersionSummary, Built):
+    """One state of a map; a survey stays with the version that it was compared with."""
 
 
 class Placement(Record):
@@ -329,18 +355,20 @@ class Placement(Record):
     )
 
 
-class SurveyRecord(Record):
-    """A later visit compared with a map; `counts` is empty until it is done."""
+class SurveySummary(Record):
+    """A later visit compared with a map, without what became of each scan; `counts` is empty until it is done."""
 
     survey_id: str = Field(examples=["survey-91c4"])
     map_id: str = Field(examples=["lobby"])
     map_version: int = Field(description="of the map, that the survey is compared with", examples=[1])
     status: SurveyStatus
     model: str = Field(examples=["voxel-net/1"])
+    asked_threshold: float | None = Field(description="the client's own; null: the model's is taken")
     threshold: float | None = Field(description="asked for, then the one that was used")
     device_id: str | None
     captured_at: Utc  #: given, else the latest of its scans, else the time of the request
-    scans: tuple[ScanOutcome, ...]  #: in the order of the request
+    warnings: Warnings = Field((), description="what is odd about the survey itself: its clock")
+    scan_count: int = Field(description="scans that it is made of, accepted or not", examples=[4])
     placement: Placement | None = Field(
         description="null until its scans are registered, and in surveys of releases that did not judge it"
     )
@@ -360,6 +388,12 @@ class SurveyRecord(Record):
     problem: Problem | None
     created: Utc
     updated: Utc
+
+
+class SurveyRecord(SurveySummary):
+    """A later visit compared with a map."""
+
+    scans: tuple[ScanOutcome, ...]  #: in the order of the request
 
 
 class ModelRecord(Record):
@@ -432,6 +466,7 @@ class ChangeRecord(Record):
     map_id: str
     map_version: int
     survey_id: str
+    device_id: str | None = None  #: of the survey
     model: str
     threshold: float | None
     captured_at: Utc
@@ -450,6 +485,7 @@ class SightingRecord(Record):
     map_id: str
     map_version: int
     survey_id: str
+    device_id: str | None = None  #: of the survey
     model: str
     captured_at: Utc
     first_seen: Utc | None  #: of the object, by any survey

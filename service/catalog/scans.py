@@ -17,11 +17,34 @@ from sqlalchemy.orm import Session
 
 from service.catalog import blob_keys, tables
 from service.catalog.blobs import Blobs
+from service.catalog.clock import clock_warnings
 from service.catalog.database import Database
-from service.catalog.records import Matrix, Page, Position, ScanFormat, ScanOutcome, ScanRecord
+from service.catalog.records import (
+    Matrix,
+    Page,
+    Position,
+    ScanFormat,
+    ScanOutcome,
+    ScanReason,
+    ScanRecord,
+    ScanWarning,
+)
 from service.errors import BadRequest, Conflict, DiskFull, NotFound
 
 log = logging.getLogger(__name__)
+
+#: Warnings that a file bears into every map and survey; the others are of one registration.
+OF_THE_FILE: frozenset[ScanReason] = frozenset(
+    (
+        "far_from_origin",
+        "far_points",
+        "missing_returns",
+        "odd_density",
+        "odd_size",
+        "little_coverage",
+        "other_up_axis",
+    )
+)
 
 Row = TypeVar("Row", tables.VersionScan, tables.SurveyScan)
 
@@ -62,6 +85,7 @@ class Scans:
             return known, False
         key = blob_keys.scan_file(scan_id, uuid4().hex, filename)
         self._blobs.put_file(key, path, move=True)
+        received = tables.now()
         row = tables.Scan(
             scan_id=scan_id,
             filename=filename,
@@ -72,7 +96,8 @@ class Scans:
             captured_at=captured_at,
             pose=None if pose is None else [list(line) for line in pose],
             key=key,
-            created=tables.now(),
+            warnings=as_kept(clock_warnings(captured_at, received=received)),
+            created=received,
         )
         return self._insert(row)
 
@@ -96,7 +121,10 @@ class Scans:
                     f"scan {scan_id!r} has the same bytes, another {what}, and belongs to a map or survey; delete "
                     "what rests on it, then the scan, and send it again"
                 )
-            row.captured_at = captured_at or known.captured_at
+            if new_time:
+                others = tuple(one for one in known.warnings if one.reason != "clock")
+                row.captured_at = captured_at
+                row.warnings = as_kept((*clock_warnings(captured_at, received=tables.now()), *others))
             row.pose = row.pose if pose is None else [list(line) for line in pose]
             session.flush()
             return ScanRecord.of_row(row)
@@ -207,14 +235,35 @@ def known_outcomes(rows: Iterable[Row]) -> list[str]:
     return [row.scan_id for row in rows if row.accepted is not None]
 
 
-def write_outcomes(rows: Iterable[Row], outcomes: Iterable[ScanOutcome]) -> None:
-    """Put `outcomes` on the rows of the same scans. Raises ValueError for a scan that was not asked for."""
+def write_outcomes(session: Session, rows: Iterable[Row], outcomes: Iterable[ScanOutcome]) -> None:
+    """Put `outcomes` on the rows of the same scans, and what they tell of the files on the scans.
+
+    Raises ValueError for a scan that was not asked for.
+    """
     by_scan = {row.scan_id: row for row in rows}
+    scans = session.scalars(select(tables.Scan).where(tables.Scan.scan_id.in_(by_scan)))
+    files = {row.scan_id: row for row in scans}
     for outcome in outcomes:
         if outcome.scan_id not in by_scan:
             raise ValueError(f"scan {outcome.scan_id!r} does not belong to this map or survey")
-        for name, value in outcome_columns(outcome).items():
+        told = _with_clock(outcome, files[outcome.scan_id])
+        for name, value in outcome_columns(told).items():
             setattr(by_scan[outcome.scan_id], name, value)
+
+
+def _with_clock(outcome: ScanOutcome, row: tables.Scan) -> ScanOutcome:
+    """Return an outcome with what is odd about the scan's clock; keeps on the scan what is odd about its file."""
+    if outcome.accepted is None:
+        return outcome
+    clock = tuple(one for one in ScanRecord.of_row(row).warnings if one.reason == "clock")
+    told = tuple(one for one in outcome.warnings if one.reason != "clock")
+    row.warnings = as_kept((*clock, *(one for one in told if one.reason in OF_THE_FILE)))
+    return outcome.model_copy(update={"warnings": (*clock, *told)})
+
+
+def as_kept(warnings: Iterable[ScanWarning]) -> list[dict[str, Any]] | None:
+    """Return warnings as a row keeps them; None of none."""
+    return [one.model_dump(mode="json") for one in warnings] or None
 
 
 def _row(session: Session, scan_id: str, *, lock: bool = False) -> tables.Scan:

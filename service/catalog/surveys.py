@@ -8,10 +8,11 @@ from datetime import datetime
 from typing import get_args
 
 from sqlalchemy import delete, select
-from sqlalchemy.orm import Session, selectinload
+from sqlalchemy.orm import Session, selectinload, undefer
 
 from service.catalog import blob_keys, history, tables, tallies
 from service.catalog.blobs import Blobs
+from service.catalog.clock import clock_warnings
 from service.catalog.database import Database
 from service.catalog.jobs import new_job
 from service.catalog.records import (
@@ -23,10 +24,17 @@ from service.catalog.records import (
     Position,
     ScanOutcome,
     SurveyRecord,
+    SurveySummary,
     TileRecord,
     TileState,
 )
-from service.catalog.scans import checked_scan_ids, known_outcomes, scans_in_order, write_outcomes
+from service.catalog.scans import (
+    as_kept,
+    checked_scan_ids,
+    known_outcomes,
+    scans_in_order,
+    write_outcomes,
+)
 from service.catalog.tables import Survey, SurveyObject, SurveyTile, new_id, now
 from service.catalog.versions import map_row, version_in_use
 from service.errors import Conflict, NotFound, NotReady
@@ -65,9 +73,11 @@ class Surveys:
                 map_version=version.version,
                 status="running",
                 model=model,
+                asked_threshold=threshold,
                 threshold=threshold,
                 device_id=device_id,
                 captured_at=captured_at or max(taken, default=job.created),
+                warnings=as_kept(clock_warnings(captured_at, received=job.created)),
                 counts={},
                 job_id=job.job_id,
                 created=job.created,
@@ -94,12 +104,12 @@ class Surveys:
             raise NotReady(f"survey {survey_id!r} has no result; job {survey.job_id} says why")
         return survey
 
-    def page(self, map_id: str, *, after: Position | None = None, limit: int = 100) -> Page[SurveyRecord]:
+    def page(self, map_id: str, *, after: Position | None = None, limit: int = 100) -> Page[SurveySummary]:
         """Return surveys of a map, newest first."""
         query = select(Survey).where(Survey.map_id == map_id)
-        query = query.options(selectinload(Survey.scans), selectinload(Survey.job))
+        query = query.options(undefer(Survey.scan_count), selectinload(Survey.job))
         created, key = Survey.created, Survey.survey_id
-        return self._database.page(query, created, key, SurveyRecord.of_row, after=after, limit=limit)
+        return self._database.page(query, created, key, SurveySummary.of_row, after=after, limit=limit)
 
     def save_outcomes(
         self, survey_id: str, outcomes: Iterable[ScanOutcome], *, placement: Placement | None = None
@@ -112,7 +122,7 @@ class Surveys:
         with self._database.write() as session:
             row = _row(session, survey_id)
             tallies.tally_outcomes(session, "survey", outcomes, known_outcomes(row.scans))
-            write_outcomes(row.scans, outcomes)
+            write_outcomes(session, row.scans, outcomes)
             row.placement = None if placement is None else placement.model_dump()
             row.updated = now()
 

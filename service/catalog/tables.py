@@ -19,10 +19,12 @@ from sqlalchemy import (
     String,
     TypeDecorator,
     UniqueConstraint,
+    func,
+    select,
 )
 from sqlalchemy.engine import Dialect
 from sqlalchemy.ext.associationproxy import AssociationProxy, association_proxy
-from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column, relationship
+from sqlalchemy.orm import DeclarativeBase, Mapped, column_property, mapped_column, relationship
 
 NAMING = {
     "ix": "ix_%(table_name)s_%(column_0_N_name)s",
@@ -94,6 +96,7 @@ class Scan(Base):
     captured_at: Mapped[datetime | None]
     pose: Mapped[list[list[float]] | None]
     key: Mapped[str]
+    warnings: Mapped[list[dict[str, Any]] | None]
     created: Mapped[datetime]
     resent: Mapped[datetime | None]
 
@@ -159,6 +162,13 @@ class MapVersion(Base):
     scans: Mapped[list[VersionScan]] = relationship(
         order_by=VersionScan.ordinal, cascade="all, delete-orphan", passive_deletes=True
     )
+    scan_count: Mapped[int] = column_property(
+        select(func.count())
+        .where(VersionScan.job_id == job_id)
+        .correlate_except(VersionScan)
+        .scalar_subquery(),
+        deferred=True,
+    )
     of_map: Mapped[Map] = relationship()
     job: Mapped[Job | None] = relationship(
         primaryjoin="foreign(MapVersion.job_id) == Job.job_id", viewonly=True
@@ -197,9 +207,11 @@ class Survey(Base):
     map_version: Mapped[int] = mapped_column(server_default="1")
     status: Mapped[str]
     model: Mapped[str]
+    asked_threshold: Mapped[float | None]
     threshold: Mapped[float | None]
     device_id: Mapped[str | None]
     captured_at: Mapped[datetime]
+    warnings: Mapped[list[dict[str, Any]] | None]
     placement: Mapped[dict[str, Any] | None]
     counts: Mapped[dict[str, int]]
     objects: Mapped[dict[str, int] | None]
@@ -210,6 +222,13 @@ class Survey(Base):
 
     scans: Mapped[list[SurveyScan]] = relationship(
         order_by=SurveyScan.ordinal, cascade="all, delete-orphan", passive_deletes=True
+    )
+    scan_count: Mapped[int] = column_property(
+        select(func.count())
+        .where(SurveyScan.survey_id == survey_id)
+        .correlate_except(SurveyScan)
+        .scalar_subquery(),
+        deferred=True,
     )
     job: Mapped[Job | None] = relationship(primaryjoin="foreign(Survey.job_id) == Job.job_id", viewonly=True)
     problem: AssociationProxy[dict[str, Any] | None] = association_proxy("job", "problem")

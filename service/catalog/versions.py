@@ -6,13 +6,21 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from sqlalchemy import Select, delete, exists, func, select
-from sqlalchemy.orm import Session, aliased, contains_eager, selectinload
+from sqlalchemy.orm import Session, aliased, contains_eager, selectinload, undefer
 
 from service.catalog import blob_keys, tables, tallies
 from service.catalog.blobs import Blobs
 from service.catalog.database import Database
 from service.catalog.jobs import new_job
-from service.catalog.records import Bounds, JobRecord, Page, Position, ScanOutcome, VersionRecord
+from service.catalog.records import (
+    Bounds,
+    JobRecord,
+    Page,
+    Position,
+    ScanOutcome,
+    VersionRecord,
+    VersionSummary,
+)
 from service.catalog.scans import (
     checked_scan_ids,
     known_outcomes,
@@ -74,13 +82,13 @@ class Versions:
         with self._database.read() as session:
             return VersionRecord.of_row(_row_of_job(session, job_id))
 
-    def page(self, map_id: str, *, after: Position | None = None, limit: int = 100) -> Page[VersionRecord]:
+    def page(self, map_id: str, *, after: Position | None = None, limit: int = 100) -> Page[VersionSummary]:
         """Return versions of a map, newest first. Raises NotFound."""
         with self._database.read() as session:
             map_row(session, map_id)
-        query = whole_versions().where(MapVersion.map_id == map_id)
+        query = versions_in_short().where(MapVersion.map_id == map_id)
         created, key = MapVersion.created, MapVersion.job_id
-        return self._database.page(query, created, key, VersionRecord.of_row, after=after, limit=limit)
+        return self._database.page(query, created, key, VersionSummary.of_row, after=after, limit=limit)
 
     def save_outcomes(self, job_id: str, outcomes: Iterable[ScanOutcome]) -> None:
         """Record what became of the scans, also when the version then fails. Raises NotFound."""
@@ -88,7 +96,7 @@ class Versions:
         with self._database.write() as session:
             row = _row_of_job(session, job_id)
             tallies.tally_outcomes(session, "map", outcomes, known_outcomes(row.scans))
-            write_outcomes(row.scans, outcomes)
+            write_outcomes(session, row.scans, outcomes)
             row.updated = now()
 
     def save_result(
@@ -108,7 +116,7 @@ class Versions:
         with self._database.write() as session:
             row = _row_of_job(session, job_id)
             tallies.tally_outcomes(session, "map", outcomes, known_outcomes(row.scans))
-            write_outcomes(row.scans, outcomes)
+            write_outcomes(session, row.scans, outcomes)
             row.bounds = bounds.model_dump(mode="json")
             row.counts = dict(counts)
             row.registration = None if registration is None else dict(registration)
@@ -151,12 +159,22 @@ def whole_versions() -> Select[MapVersion]:
     return select(MapVersion).join(MapVersion.of_map).options(*related)
 
 
-def versions_in_use() -> Select[MapVersion]:
-    """Return a query for the version that each map shows: the newest that is ready, else the newest."""
+def versions_in_short() -> Select[MapVersion]:
+    """Return a query for versions with what their summaries show."""
+    related = (
+        undefer(MapVersion.scan_count),
+        selectinload(MapVersion.job),
+        contains_eager(MapVersion.of_map),
+    )
+    return select(MapVersion).join(MapVersion.of_map).options(*related)
+
+
+def in_use(versions: Select[MapVersion]) -> Select[MapVersion]:
+    """Keep the version that each map shows: the newest that is ready, else the newest."""
     other = aliased(MapVersion)
     newest = select(other.job_id).where(other.map_id == tables.Map.map_id).correlate(tables.Map)
     newest = newest.order_by(other.status != "ready", other.version.desc()).limit(1)
-    return whole_versions().where(MapVersion.job_id == newest.scalar_subquery())
+    return versions.where(MapVersion.job_id == newest.scalar_subquery())
 
 
 def version_in_use(session: Session, map_id: str) -> MapVersion:
@@ -168,7 +186,7 @@ def version_in_use(session: Session, map_id: str) -> MapVersion:
 
 def shown_version(session: Session, map_id: str) -> MapVersion:
     """Return the row of the version that a map shows, whatever its state. Raises NotFound."""
-    row = session.scalar(versions_in_use().where(tables.Map.map_id == map_id))
+    row = session.scalar(in_use(whole_versions()).where(tables.Map.map_id == map_id))
     if row is None:
         raise NotFound(f"no map {map_id!r}; GET /maps lists those there are")
     return row

@@ -87,7 +87,7 @@ def delete(ctx: typer.Context, map_id: MapId) -> None:
 def _table(maps: Sequence[Document]) -> Table:
     table = columns("map", "name", "status", "scans", "counts", "created")
     for one in maps:
-        scans = str(len(one.get("scans", [])))
+        scans = str(one.get("scan_count", len(one.get("scans", []))))
         table.add_row(one["map_id"], one.get("name"), one["status"], scans, counts(one), one.get("created"))
     return table
 

@@ -70,9 +70,13 @@ def _whole(scan: Document) -> Table:
 
 
 def _table(scans: Sequence[Document]) -> Table:
-    table = columns("scan", "file", "bytes", "sha256")
+    table = columns("scan", "file", "bytes", "sha256", "warnings")
     for scan in scans:
         table.add_row(
-            scan["scan_id"], scan.get("filename", ""), f"{scan.get('size', 0):,}", scan["sha256"][:16]
+            scan["scan_id"],
+            scan.get("filename", ""),
+            f"{scan.get('size', 0):,}",
+            scan["sha256"][:16],
+            warnings(scan),
         )
     return table

@@ -150,7 +150,7 @@ def changes(
 def _table(surveys: Sequence[Document]) -> Table:
     table = columns("survey", "status", "captured", "scans", "placement", "counts")
     for one in surveys:
-        scans = str(len(one.get("scans", [])))
+        scans = str(one.get("scan_count", len(one.get("scans", []))))
         table.add_row(
             one["survey_id"], one["status"], one.get("captured_at"), scans, placement(one), counts(one)
         )

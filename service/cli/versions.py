@@ -69,7 +69,7 @@ def _made_from(one: Document) -> str:
 def _table(versions: Sequence[Document]) -> Table:
     table = columns("version", "status", "made from", "scans", "counts", "created")
     for one in versions:
-        scans = str(len(one.get("scans", [])))
+        scans = str(one.get("scan_count", len(one.get("scans", []))))
         table.add_row(
             str(one["version"]), one["status"], _made_from(one), scans, counts(one), one.get("created")
         )

@@ -53,11 +53,17 @@ class CarrierRequest(TypedDict):
     radius: float
 
 
+class CrsName(TypedDict):
+    """The map's frame as GDAL, GeoPandas and QGIS read it (WKT 2)."""
+
+    name: str
+
+
 class Footprint(TypedDict):
     """
-    The footprint on the Earth: longitude, latitude (degrees), height of the tile's floor above the ellipsoid (metres).
+    The footprint on the Earth: longitude, latitude (degrees), height of the floor above the ellipsoid (metres).
 
-    Counter-clockwise and closed (RFC 7946, Section 3.1.6).
+    Counter-clockwise and closed (RFC 7946, Section 3.1.6). With `crs=map` it is x, y, z in the map's frame, metres.
     """
 
     coordinates: tuple[list[tuple[float, float, float]]]
@@ -109,13 +115,24 @@ class Move(TypedDict):
     yaw_degrees: float | None
 
 
+class NamedCrs(TypedDict):
+    """The frame of the coordinates where that is not WGS 84 (the GeoJSON of 2008, Section 3)."""
+
+    properties: CrsName
+    type: NotRequired[Literal["name"]]
+
+
 class ObjectProperties(TypedDict):
     """What all surveys together say of a thing; what is of one survey is that of the latest which saw it."""
 
     accepted_in_version: int | None
     before: Box | None
     captured_at: str
+    center_x: float
+    center_y: float
+    device_id: str | None
     first_seen: str | None
+    height_over_floor: float | None
     kind: Literal["appeared", "disappeared", "moved"]
     last_known: Literal["new", "still_there", "gone_again", "unknown", "accepted"]
     last_looked: str
@@ -124,6 +141,10 @@ class ObjectProperties(TypedDict):
     map_version: int
     model: str
     motion: Move | None
+    moved_x: float | None
+    moved_y: float | None
+    moved_yaw_degrees: float | None
+    moved_z: float | None
     now: Box | None
     number: int
     object_id: str | None
@@ -131,9 +152,16 @@ class ObjectProperties(TypedDict):
     probability: float
     scans_seen_through: int
     sightings: int
+    size_x: float
+    size_y: float
+    size_z: float
     status: Literal["new", "still_there", "gone_again", "unknown", "accepted"]
     survey_id: str
     transient: bool
+    volume: float
+    yaw_degrees: float
+    z_max: float
+    z_min: float
 
 
 class Placement(TypedDict):
@@ -199,27 +227,6 @@ class RegistrationRequest(TypedDict):
 PoseItem: TypeAlias = tuple[float, float, float, float]
 
 
-class ScanDocument(TypedDict):
-    """One uploaded scan."""
-
-    captured_at: str | None
-    created: str
-    device_id: str | None
-    filename: str
-    format: Literal["ply", "pcd"]
-    pose: tuple[PoseItem, PoseItem, PoseItem, PoseItem] | None
-    scan_id: str
-    sha256: str
-    size: int
-
-
-class ScanList(TypedDict):
-    """Scans, newest first."""
-
-    links: list[Link]
-    scans: list[ScanDocument]
-
-
 Candidate: TypeAlias = tuple[float, float, float, float]
 
 
@@ -239,7 +246,7 @@ class ScanRequest(TypedDict):
 
 
 class ScanWarning(TypedDict):
-    """What is odd about a scan that was accepted."""
+    """What is odd about a scan or a survey that was taken."""
 
     detail: str
     numbers: NotRequired[dict[str, float]]
@@ -258,6 +265,14 @@ class ScanWarning(TypedDict):
         "wrong_prior",
         "moved_while_scanning",
         "disagrees",
+        "wrong_units",
+        "far_from_origin",
+        "far_points",
+        "missing_returns",
+        "odd_density",
+        "odd_size",
+        "little_coverage",
+        "clock",
     ]
 
 
@@ -266,19 +281,34 @@ class SightingProperties(TypedDict):
 
     before: Box | None
     captured_at: str
+    center_x: float
+    center_y: float
+    device_id: str | None
     first_seen: str | None
+    height_over_floor: float | None
     kind: Literal["appeared", "disappeared", "moved"]
     map_id: str
     map_version: int
     model: str
     motion: Move | None
+    moved_x: float | None
+    moved_y: float | None
+    moved_yaw_degrees: float | None
+    moved_z: float | None
     now: Box | None
     number: int
     object_id: str | None
     observed_share: float
     probability: float
     scans_seen_through: int
+    size_x: float
+    size_y: float
+    size_z: float
     survey_id: str
+    volume: float
+    yaw_degrees: float
+    z_max: float
+    z_min: float
 
 
 class SurveyRequest(TypedDict):
@@ -291,12 +321,40 @@ class SurveyRequest(TypedDict):
     threshold: NotRequired[float | None]
 
 
+class SurveySummaryDocument(TypedDict):
+    """A survey in short; the survey itself tells what became of each scan."""
+
+    asked_threshold: float | None
+    captured_at: str
+    counts: dict[str, int]
+    created: str
+    device_id: str | None
+    job_id: str
+    links: list[Link]
+    map_id: str
+    map_version: int
+    model: str
+    moving: int | None
+    objects: dict[str, int] | None
+    placement: Placement | None
+    problem: ProblemDocument | None
+    scan_count: int
+    status: Literal["running", "ready", "failed"]
+    survey_id: str
+    threshold: float | None
+    updated: str
+    warnings: NotRequired[list[ScanWarning]]
+
+
 class TileProperties(TypedDict):
     """What is said of a tile."""
 
     appeared: int | None
     captured_at: str
     center: tuple[float, float, float]
+    center_x: float
+    center_y: float
+    device_id: str | None
     disappeared: int | None
     first_seen: str | None
     last_seen: str | None
@@ -307,6 +365,9 @@ class TileProperties(TypedDict):
     n_current: int
     n_reference: int
     observed_share: float | None
+    p_changed: float | None
+    p_different: float | None
+    p_unchanged: float | None
     probabilities: tuple[float, float, float] | None
     score: float | None
     state: Literal["unchanged", "changed", "inconsistent", "unobserved"]
@@ -314,6 +375,8 @@ class TileProperties(TypedDict):
     threshold: float | None
     tile_id: str
     tile_index: tuple[int, int, int]
+    z_max: float
+    z_min: float
 
 
 class Time(TypedDict):
@@ -338,6 +401,25 @@ class VersionRequest(TypedDict):
     device_id: NotRequired[str | None]
     scan_ids: NotRequired[list[ScanId]]
     survey_id: NotRequired[str | None]
+
+
+class VersionSummaryDocument(TypedDict):
+    """One state of a map in short; the version itself tells what became of each scan."""
+
+    base_version: int | None
+    bounds: Bounds | None
+    counts: dict[str, int]
+    created: str
+    job_id: str
+    links: list[Link]
+    map_id: str
+    model: str
+    problem: ProblemDocument | None
+    scan_count: int
+    status: Literal["building", "ready", "failed"]
+    survey_id: str | None
+    updated: str
+    version: int
 
 
 class AcceptedMap(TypedDict):
@@ -381,6 +463,39 @@ class AcceptedVersion(TypedDict):
     version: int
 
 
+class FgObjectFeature(TypedDict):
+    """A thing over all surveys of a map, in JSON-FG."""
+
+    geometry: Footprint | None
+    id: str
+    place: Prism
+    properties: ObjectProperties
+    time: Interval
+    type: NotRequired[Literal["Feature"]]
+
+
+class FgSightingFeature(TypedDict):
+    """A thing as one survey saw it, in JSON-FG."""
+
+    geometry: Footprint | None
+    id: str
+    place: Prism
+    properties: SightingProperties
+    time: Time
+    type: NotRequired[Literal["Feature"]]
+
+
+class FgTileFeature(TypedDict):
+    """One tile in JSON-FG."""
+
+    geometry: Footprint | None
+    id: str
+    place: Prism
+    properties: TileProperties
+    time: Time
+    type: NotRequired[Literal["Feature"]]
+
+
 class JobDocument(TypedDict):
     """The status of a job (OGC API - Processes - Part 1, statusInfo), with what it works on."""
 
@@ -422,15 +537,55 @@ class MapSettings(TypedDict):
     registration: NotRequired[RegistrationRequest]
 
 
+class MapSummaryDocument(TypedDict):
+    """A reference map in short; the map itself tells its settings and what became of each scan."""
+
+    anchor: Anchor | None
+    bounds: Bounds | None
+    counts: dict[str, int]
+    created: str
+    job_id: str
+    links: list[Link]
+    map_id: str
+    model: str
+    name: str | None
+    objects: dict[str, int]
+    problem: ProblemDocument | None
+    scan_count: int
+    status: Literal["building", "ready", "failed"]
+    updated: str
+    version: int
+
+
 class ObjectFeature(TypedDict):
-    """A thing over all surveys of a map."""
+    """A thing over all surveys of a map; its footprint is as in its latest sighting."""
 
     geometry: Footprint | None
     id: str
-    place: Prism
     properties: ObjectProperties
-    time: Interval
     type: NotRequired[Literal["Feature"]]
+
+
+class ScanDocument(TypedDict):
+    """One uploaded scan."""
+
+    captured_at: str | None
+    created: str
+    device_id: str | None
+    filename: str
+    format: Literal["ply", "pcd"]
+    pose: tuple[PoseItem, PoseItem, PoseItem, PoseItem] | None
+    scan_id: str
+    sha256: str
+    size: int
+    warnings: NotRequired[list[ScanWarning]]
+
+
+class ScanList(TypedDict):
+    """Scans, newest first."""
+
+    links: list[Link]
+    scans: list[ScanDocument]
 
 
 class ScanOutcome(TypedDict):
@@ -466,6 +621,14 @@ class ScanOutcome(TypedDict):
             "wrong_prior",
             "moved_while_scanning",
             "disagrees",
+            "wrong_units",
+            "far_from_origin",
+            "far_points",
+            "missing_returns",
+            "odd_density",
+            "odd_size",
+            "little_coverage",
+            "clock",
         ]
         | None
     ]
@@ -477,19 +640,18 @@ class ScanOutcome(TypedDict):
 
 
 class SightingFeature(TypedDict):
-    """A thing as one survey saw it."""
+    """A thing as one survey saw it; its footprint is where it is now, or was before where it disappeared."""
 
     geometry: Footprint | None
     id: str
-    place: Prism
     properties: SightingProperties
-    time: Time
     type: NotRequired[Literal["Feature"]]
 
 
 class SurveyDocument(TypedDict):
     """A survey and what became of its scans."""
 
+    asked_threshold: float | None
     captured_at: str
     counts: dict[str, int]
     created: str
@@ -503,18 +665,20 @@ class SurveyDocument(TypedDict):
     objects: dict[str, int] | None
     placement: Placement | None
     problem: ProblemDocument | None
+    scan_count: int
     scans: list[ScanOutcome]
     status: Literal["running", "ready", "failed"]
     survey_id: str
     threshold: float | None
     updated: str
+    warnings: NotRequired[list[ScanWarning]]
 
 
 class SurveyList(TypedDict):
     """Surveys, newest first."""
 
     links: list[Link]
-    surveys: list[SurveyDocument]
+    surveys: list[SurveySummaryDocument]
 
 
 class TileFeature(TypedDict):
@@ -522,9 +686,7 @@ class TileFeature(TypedDict):
 
     geometry: Footprint | None
     id: str
-    place: Prism
     properties: TileProperties
-    time: Time
     type: NotRequired[Literal["Feature"]]
 
 
@@ -541,6 +703,7 @@ class VersionDocument(TypedDict):
     model: str
     problem: ProblemDocument | None
     registration: dict[str, Any] | None
+    scan_count: int
     scans: list[ScanOutcome]
     settings: dict[str, Any]
     status: Literal["building", "ready", "failed"]
@@ -553,7 +716,62 @@ class VersionList(TypedDict):
     """Versions of one map, newest first."""
 
     links: list[Link]
-    versions: list[VersionDocument]
+    versions: list[VersionSummaryDocument]
+
+
+class FgObjectCollection(TypedDict):
+    """The changed things of a map, in JSON-FG."""
+
+    conformsTo: NotRequired[list[str]]
+    coordRefSys: NotRequired[str]
+    featureType: str
+    features: list[FgObjectFeature]
+    links: list[Link]
+    numberMatched: int
+    numberReturned: int
+    timeStamp: str
+    type: NotRequired[Literal["FeatureCollection"]]
+
+
+class FgObjectHistory(TypedDict):
+    """A thing over all surveys of a map, with each sighting of it, in JSON-FG."""
+
+    geometry: Footprint | None
+    id: str
+    links: list[Link]
+    place: Prism
+    properties: ObjectProperties
+    sightings: list[FgSightingFeature]
+    time: Interval
+    type: NotRequired[Literal["Feature"]]
+
+
+class FgSightingCollection(TypedDict):
+    """The things that one survey found changed, in JSON-FG."""
+
+    conformsTo: NotRequired[list[str]]
+    coordRefSys: NotRequired[str]
+    featureType: str
+    features: list[FgSightingFeature]
+    links: list[Link]
+    numberMatched: int
+    numberReturned: int
+    timeStamp: str
+    type: NotRequired[Literal["FeatureCollection"]]
+
+
+class FgTileCollection(TypedDict):
+    """Tiles in JSON-FG."""
+
+    conformsTo: NotRequired[list[str]]
+    coordRefSys: NotRequired[str]
+    featureType: str
+    features: list[FgTileFeature]
+    links: list[Link]
+    numberMatched: int
+    numberReturned: int
+    timeStamp: str
+    type: NotRequired[Literal["FeatureCollection"]]
 
 
 class MapDocument(TypedDict):
@@ -571,6 +789,7 @@ class MapDocument(TypedDict):
     objects: dict[str, int]
     problem: ProblemDocument | None
     registration: dict[str, Any] | None
+    scan_count: int
     scans: list[ScanOutcome]
     settings: dict[str, Any]
     status: Literal["building", "ready", "failed"]
@@ -582,7 +801,7 @@ class MapList(TypedDict):
     """Maps, newest first."""
 
     links: list[Link]
-    maps: list[MapDocument]
+    maps: list[MapSummaryDocument]
 
 
 class MapRequest(TypedDict):
@@ -601,9 +820,7 @@ class MapRequest(TypedDict):
 class ObjectCollection(TypedDict):
     """The changed things of a map."""
 
-    conformsTo: NotRequired[list[str]]
-    coordRefSys: NotRequired[str]
-    featureType: NotRequired[str]
+    crs: NotRequired[NamedCrs | None]
     features: list[ObjectFeature]
     links: list[Link]
     numberMatched: int
@@ -615,22 +832,19 @@ class ObjectCollection(TypedDict):
 class ObjectHistory(TypedDict):
     """A thing over all surveys of a map, with each sighting of it."""
 
+    crs: NotRequired[NamedCrs | None]
     geometry: Footprint | None
     id: str
     links: list[Link]
-    place: Prism
     properties: ObjectProperties
     sightings: list[SightingFeature]
-    time: Interval
     type: NotRequired[Literal["Feature"]]
 
 
 class SightingCollection(TypedDict):
     """The things that one survey found changed."""
 
-    conformsTo: NotRequired[list[str]]
-    coordRefSys: NotRequired[str]
-    featureType: NotRequired[str]
+    crs: NotRequired[NamedCrs | None]
     features: list[SightingFeature]
     links: list[Link]
     numberMatched: int
@@ -640,11 +854,9 @@ class SightingCollection(TypedDict):
 
 
 class TileCollection(TypedDict):
-    """Tiles; the members that hold for all stand on the root, as the standard has it."""
+    """Tiles."""
 
-    conformsTo: NotRequired[list[str]]
-    coordRefSys: NotRequired[str]
-    featureType: NotRequired[str]
+    crs: NotRequired[NamedCrs | None]
     features: list[TileFeature]
     links: list[Link]
     numberMatched: int

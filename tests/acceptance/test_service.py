@@ -127,7 +127,7 @@ def test_a_tile_is_changed_only_above_the_threshold_and_where_an_object_lies(
 
 
 def test_features_are_prisms_around_their_centres(service: Service, survey: dict[str, Any]) -> None:
-    collection = service.get(f"/surveys/{survey['survey_id']}/tiles")
+    collection = service.get(f"/surveys/{survey['survey_id']}/tiles?profile=jsonfg")
     assert collection["type"] == "FeatureCollection"
     assert collection["numberMatched"] == collection["numberReturned"] == len(collection["features"])
     assert len({feature["id"] for feature in collection["features"]}) == len(collection["features"])
@@ -174,8 +174,8 @@ def test_the_cloud_is_a_sound_scan_with_a_score_and_a_state_at_every_point(
 ) -> None:
     content = service.http.get(f"/surveys/{survey['survey_id']}/cloud.ply").content
     header = content[: content.index(b"end_header")]
-    assert b"property float change_score" in header
-    assert b"property uchar tile_state" in header
+    assert b"property float scalar_change_score" in header
+    assert b"property uchar scalar_tile_state" in header
     path = tmp_path / "cloud.ply"
     path.write_bytes(content)
     cloud = read_scan(path)

@@ -185,8 +185,9 @@ def _outcome(content: bytes) -> str:
 def what_is_wrong(scan: Scan, content: bytes) -> str | None:
     """Hold a scan against what its file declares, by another way than the reader's."""
     declared = declared_points(content)
-    if len(scan.points) + scan.n_dropped != declared:
-        return f"{len(scan.points)} points and {scan.n_dropped} dropped of {declared} declared"
+    if len(scan.points) + scan.n_dropped + scan.n_far != declared:
+        left_out = scan.n_dropped + scan.n_far
+        return f"{len(scan.points)} points and {left_out} dropped of {declared} declared"
     if not len(scan.points) or not np.isfinite(scan.points).all():
         return "no point, or one that is not finite"
     if scan.colors is not None and scan.colors.shape != scan.points.shape:

@@ -14,11 +14,13 @@ import pytest
 
 from service.catalog import blob_keys
 from service.catalog.changes import ChangeFilter
+from service.catalog.jobs import Jobs
 from service.catalog.objects import SightingFilter
 from service.catalog.records import JobRecord, ObjectRecord, Placement, ScanRecord, SurveyRecord
 from service.errors import Conflict
 from tests.support.house import MAP, House, run
 from tests.support.release_0_1 import scan_of_0_1
+from tests.support.traffic import Room, Upload
 from tests.support.two_visits import free_place
 from worker.cloud import npz
 from worker.cloud.seen import Seen
@@ -74,6 +76,11 @@ def compared(house: House, *scans: ScanRecord, model: str = RULE, map_id: str = 
     job = house.catalog.surveys.create(map_id, scan_ids=ids, model=model)[1]
     run(job)
     return house.survey(job)
+
+
+def sent(house: House, upload: Upload) -> str:
+    pose = np.array(json.loads(upload.pose))
+    return house.add_file(upload.name, upload.content, pose=pose).scan_id
 
 
 def things(house: House, survey: SurveyRecord) -> list[ObjectRecord]:
@@ -230,6 +237,27 @@ def test_the_steps_may_run_twice_and_leave_the_same(seeing: House, put: Crate) -
         files = seeing.files()
         run(job, step)
         assert seeing.files() == files
+
+
+def test_a_last_step_that_was_killed_after_it_recorded_its_findings_tells_the_same_again(
+    house: House, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Between `save_result` and `succeed`; in this survey a tile scores above the threshold, but no object lies there."""
+    monkeypatch.setenv("SPICD_MODEL_STORE", str(MODEL_STORE))
+    room = Room(map_scans=2, views=2, scan_s=1.0)
+    before, visits = room.map_uploads(), room.survey_upload(1)
+    ids = [sent(house, upload) for upload in before]
+    run(house.catalog.maps.create(scan_ids=ids, model="voxel-net/1", map_id="room", settings={})[1])
+    job = house.catalog.surveys.create("room", scan_ids=[sent(house, visits)], model="voxel-net/1")[1]
+    with monkeypatch.context() as patch:
+        patch.setattr(Jobs, "succeed", lambda *_, **__: False)
+        run(job)
+    recorded = house.tiles(house.survey(job).survey_id)
+    assert any((tile["score"] or 0) > 0.5 and tile["state"] == "unchanged" for tile in recorded)
+    run(job, "export")
+    assert house.catalog.jobs.get(job.job_id).status == "successful"
+    assert house.tiles(house.survey(job).survey_id) == recorded
+    assert house.survey(job).asked_threshold is None
 
 
 def test_an_extended_map_saw_what_both_saw_and_a_renewed_one_has_the_crate(seeing: House, put: Crate) -> None:

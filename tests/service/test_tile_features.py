@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from service.api.features import TileCollection, feature
+from service.api.features import JSON_FG, MEDIA_TYPE, Form
+from service.api.tiles import FgTileCollection, TileCollection, feature
 from service.catalog.records import ChangeRecord
-from service.tile_features import CONFORMS_TO, MAP_FRAME, tile_collection, tile_feature
+from service.tile_features import CONFORMS_TO, MAP_FRAME, geojson_collection, tile_collection, tile_feature
 from tests.support.samples import NOON, tile
 
 SURVEY: dict[str, Any] = {
@@ -43,6 +44,7 @@ def test_what_is_shared_by_all_tiles_of_a_survey_stands_in_each() -> None:
     properties = tile_feature(**TILE, survey=SURVEY)["properties"]
     own = {"tile_id", "tile_index", "center", "state", "score", "probabilities", "n_reference", "n_current"}
     own |= {"observed_share", "appeared", "disappeared"}
+    own |= {"center_x", "center_y", "z_min", "z_max", "p_unchanged", "p_changed", "p_different"}
     assert set(properties) == own | set(SURVEY)
 
 
@@ -76,6 +78,20 @@ def test_the_documented_shape_holds_all_that_is_written() -> None:
         threshold=0.5,
         captured_at=NOON,
     )
-    made = tile_collection([feature(change, None)]) | {"timeStamp": "2026-03-01T12:05:00Z"}
-    document = TileCollection.model_validate(made).model_dump(mode="json")
-    assert document == made
+    form = Form(media_type=JSON_FG, in_map_frame=False, convert=None)
+    made = tile_collection([feature(change, form)]) | {"timeStamp": "2026-03-01T12:05:00Z"}
+    assert FgTileCollection.model_validate(made).model_dump(mode="json", exclude_unset=True) == made
+    for in_map_frame in (False, True):
+        form = Form(media_type=MEDIA_TYPE, in_map_frame=in_map_frame, convert=None)
+        plain = geojson_collection([feature(change, form)], in_map_frame=in_map_frame)
+        plain |= {"timeStamp": "2026-03-01T12:05:00Z"}
+        assert TileCollection.model_validate(plain).model_dump(mode="json", exclude_unset=True) == plain
+
+
+def test_plain_geojson_has_no_sign_of_json_fg_but_the_same_numbers() -> None:
+    made = tile_feature(**TILE, survey=SURVEY)
+    (plain,) = geojson_collection([made])["features"]
+    assert plain == {name: made[name] for name in ("type", "id", "geometry", "properties")}
+    told = plain["properties"]
+    assert (told["z_min"], told["z_max"], told["center_x"], told["center_y"]) == (0.0, 1.0, 6.75, 3.75)
+    assert (told["p_unchanged"], told["p_changed"], told["p_different"]) == (0.05, 0.93, 0.02)

@@ -8,8 +8,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from service.object_features import object_collection, sighting_feature
-from service.tile_features import tile_collection, tile_feature
+from service.object_features import ring_of, sighting_feature
+from service.tile_features import footprint, geojson_collection, local_footprint, tile_feature
 from worker.cli.scan_results import placement_document, verdict
 from worker.detectors.detector import Detector
 from worker.pipeline import (
@@ -72,18 +72,28 @@ def write_results(
 ) -> dict[str, Path]:
     """Write `tiles.geojson`, `cloud.ply` and `picture.png` to the folder `out`, by what they are. Raises OSError.
 
-    A detector of voxels finds objects as well, which come as `objects.geojson`.
+    A detector of voxels finds objects as well, which come as `objects.geojson`. The features are plain GeoJSON in the
+    frame of the first reference, metres, and say so.
     """
     out.mkdir(parents=True, exist_ok=True)
     survey = {"map_id": map_id, "survey_id": survey_id, "model": model, "captured_at": None}
     threshold = {"threshold": visits.changes.threshold}
     tiles = [
-        tile_feature(**asdict(tile), survey={**survey, **threshold}) for tile in tile_results(visits.changes)
+        tile_feature(
+            **asdict(tile),
+            survey={**survey, **threshold},
+            geometry=local_footprint(footprint(tile.lower, tile.upper), tile.lower[2]),
+        )
+        for tile in tile_results(visits.changes)
     ]
-    files = {"tiles": _written(out / "tiles.geojson", tile_collection(tiles))}
+    files = {"tiles": _written(out / "tiles.geojson", geojson_collection(tiles, in_map_frame=True))}
     if visits.changes.objects is not None:
-        things = [sighting_feature(asdict(thing), survey=survey) for thing in visits.changes.objects.objects]
-        files["objects"] = _written(out / "objects.geojson", object_collection(things))
+        found = [asdict(thing) for thing in visits.changes.objects.objects]
+        things = [
+            sighting_feature(thing, survey=survey, geometry=local_footprint(*ring_of(thing)))
+            for thing in found
+        ]
+        files["objects"] = _written(out / "objects.geojson", geojson_collection(things, in_map_frame=True))
     files |= {"cloud": out / "cloud.ply", "picture": out / "picture.png"}
     clouds = visits.built.reference.points, visits.located.current.points
     write_coloured_cloud(files["cloud"], *clouds, visits.changes)

@@ -109,7 +109,8 @@ def export_survey(context: Context) -> None:
     detection = load(context, blob_keys.survey_scores(survey_id), functools.partial(npz.load, kind=Detection))
     card = card_of(context, survey.model)
     limit = _least_score(context, version, card, survey.model) if detection.voxels is not None else 0.0
-    threshold = card.threshold if survey.threshold is None else survey.threshold
+    asked = survey.asked_threshold
+    threshold = card.threshold if asked is None else asked
     objects = settings.objects.with_values(min_score=max(limit, settings.objects.min_score))
     changes = concluded(
         comparison,
@@ -117,7 +118,7 @@ def export_survey(context: Context) -> None:
         threshold=threshold,
         settings=settings.with_values(objects=objects),
         placement=kept_placement(survey.placement),
-        by_objects=survey.threshold is None,
+        by_objects=asked is None,
     )
     context.report("exporting", 0.3)
     _put_cloud_and_picture(context, survey, comparison, changes)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Callable
 from datetime import UTC, datetime
 from typing import Annotated, Any
 
@@ -29,6 +30,16 @@ def instant(value: object) -> datetime:
         return datetime.fromisoformat(value.upper()).astimezone(UTC)
     except OverflowError as error:
         raise ValueError("the time is outside the years 1 to 9999 in UTC") from error
+
+
+def readable(read: Callable[[str], object]) -> AfterValidator:
+    """Check a text with `read`, and leave it a text: a query parameter of many parts is taken for a list."""
+
+    def check(text: str) -> str:
+        read(text)
+        return text
+
+    return AfterValidator(check)
 
 
 def from_text(value: Any) -> Any:

@@ -6,6 +6,7 @@ import base64
 import json
 import math
 from collections.abc import Callable, Sequence
+from datetime import datetime
 from typing import Annotated, Any
 
 from fastapi import Request as HttpRequest
@@ -14,6 +15,7 @@ from pydantic import Field
 from service.api.http.documents import Link, Request, link
 from service.api.http.fields import instant
 from service.api.http.json_text import read_json
+from service.catalog.keyset import Value, Values
 from service.catalog.records import Page, Position, rfc3339
 from service.errors import BadRequest
 
@@ -64,6 +66,32 @@ def decoded(cursor: str, *readers: Callable[[str], Any]) -> Sequence[Any]:
         raise BadRequest(f"cursor {cursor[:40]!r} is none of ours; follow a `next` link") from error
 
 
+def encoded_values(sort: str, values: Values | None) -> str | None:
+    """Return the cursor behind the row with these values of a list in the order `sort`; None where there is no more."""
+    if values is None:
+        return None
+    return encoded(sort, *(_written(value) for value in values))
+
+
+def decoded_values(
+    cursor: str | None, sort: str, types: Sequence[type[datetime] | type[float] | type[int] | type[str]]
+) -> Values | None:
+    """Return the values behind which a list in the order `sort` goes on. Raises BadRequest, also for another order's."""
+    if cursor is None:
+        return None
+    readers: list[Callable[[str], Any]] = [_READERS[kind] for kind in types]
+    of, *values = decoded(cursor, str, *readers)
+    if of != sort:
+        raise BadRequest(f"the cursor is of a list in another order than sortby={sort}; follow a `next` link")
+    return tuple(values)
+
+
+def _written(value: Value) -> str:
+    if isinstance(value, datetime):
+        return rfc3339(value)
+    return float(value).hex() if isinstance(value, float) else str(value)
+
+
 def finite(text: str) -> float:
     """Read a number as `float.hex` writes it. Raises ValueError and OverflowError."""
     number = float.fromhex(text)
@@ -77,6 +105,9 @@ def count(text: str) -> int:
     if not text.isdigit() or len(text) > 9:
         raise ValueError(f"{text[:20]} is no number of ours")
     return int(text)
+
+
+_READERS: dict[type, Callable[[str], Any]] = {datetime: instant, float: finite, int: count, str: str}
 
 
 def _plain(part: object) -> str:

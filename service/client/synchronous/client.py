@@ -16,13 +16,16 @@ from service.client.documents import (
     AcceptedVersion,
     JobDocument,
     MapDocument,
+    MapSummaryDocument,
     ObjectCollection,
     ObjectHistory,
     ScanDocument,
     SightingCollection,
     SurveyDocument,
+    SurveySummaryDocument,
     TileCollection,
     VersionDocument,
+    VersionSummaryDocument,
 )
 from service.client.errors import Document, JobFailed, retry_after_s
 from service.client.requests import Body, OnSent, Pose, csv_lines, given, quoted, scans_of
@@ -101,9 +104,9 @@ class Client(Feeds):
         about = given(id=map_id, name=name, model=model, settings=settings, anchor=anchor)
         return self._json(AcceptedMap, "POST", "/maps", json={**about, **scans_of(scan_ids, poses)})
 
-    def maps(self) -> list[MapDocument]:
-        """Return every map."""
-        return self._all(MapDocument, "/maps", "maps")
+    def maps(self) -> list[MapSummaryDocument]:
+        """Return every map in short; `map` has its scans."""
+        return self._all(MapSummaryDocument, "/maps", "maps")
 
     def map(self, map_id: str) -> MapDocument:
         """Return one map as its version in use, with its scans."""
@@ -135,9 +138,9 @@ class Client(Feeds):
         body = {**given(survey_id=survey_id), **(scans_of(scan_ids, poses) if scan_ids else {})}
         return self._json(AcceptedVersion, "POST", f"/maps/{quoted(map_id)}/versions", json=body)
 
-    def versions(self, map_id: str) -> list[VersionDocument]:
-        """Return every version of a map, newest first."""
-        return self._all(VersionDocument, f"/maps/{quoted(map_id)}/versions", "versions")
+    def versions(self, map_id: str) -> list[VersionSummaryDocument]:
+        """Return every version of a map in short, newest first; `version` has its scans."""
+        return self._all(VersionSummaryDocument, f"/maps/{quoted(map_id)}/versions", "versions")
 
     def version(self, map_id: str, version: int) -> VersionDocument:
         """Return one version of a map with its scans."""
@@ -165,9 +168,9 @@ class Client(Feeds):
         body = {**about, **scans_of(scan_ids, poses)}
         return self._json(AcceptedSurvey, "POST", f"/maps/{quoted(map_id)}/surveys", json=body)
 
-    def surveys(self, map_id: str) -> list[SurveyDocument]:
-        """Return every survey of a map."""
-        return self._all(SurveyDocument, f"/maps/{quoted(map_id)}/surveys", "surveys")
+    def surveys(self, map_id: str) -> list[SurveySummaryDocument]:
+        """Return every survey of a map in short; `survey` has its scans."""
+        return self._all(SurveySummaryDocument, f"/maps/{quoted(map_id)}/surveys", "surveys")
 
     def survey(self, survey_id: str) -> SurveyDocument:
         """Return one survey with its scans and counts."""

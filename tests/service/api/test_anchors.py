@@ -25,8 +25,9 @@ def survey_id(catalog: Catalog) -> str:
 
 def feature(client: TestClient, survey_id: str) -> dict[str, Any]:
     found: dict[str, Any]
-    (found,) = client.get(f"/surveys/{survey_id}/tiles").json()["features"]
-    (changed,) = client.get("/maps/lobby/changes").json()["features"]
+    asked = {"profile": "jsonfg"}
+    (found,) = client.get(f"/surveys/{survey_id}/tiles", params=asked).json()["features"]
+    (changed,) = client.get("/maps/lobby/changes", params=asked).json()["features"]
     assert found == changed
     return found
 

@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 from fastapi.testclient import TestClient
 
-from service.api.features import TileCollection
 from service.api.http.paging import encoded
+from service.api.tiles import TileCollection
 from service.catalog.catalog import Catalog
 from service.catalog.records import TileState
 from tests.support.samples import (

@@ -12,7 +12,7 @@ from fastapi.testclient import TestClient
 
 from service.api.geodesy import to_wgs84
 from service.api.http.paging import encoded
-from service.api.objects import ObjectCollection, ObjectHistory, SightingCollection
+from service.api.objects import FgObjectCollection, FgObjectHistory, FgSightingCollection
 from service.catalog.catalog import Catalog
 from service.catalog.records import Anchor, ObjectRecord
 from tests.support.samples import (
@@ -108,9 +108,9 @@ def test_an_object_is_a_prism_over_its_footprint_with_both_places(
     asked_often: tuple[TestClient, list[str]],
 ) -> None:
     client, (first, _, _) = asked_often
-    answer = client.get(f"/surveys/{first}/objects")
-    assert answer.headers["content-type"] == "application/geo+json"
-    SightingCollection.model_validate_json(answer.content)
+    answer = client.get(f"/surveys/{first}/objects", params={"profile": "jsonfg"})
+    assert answer.headers["content-type"] == "application/vnd.ogc.fg+json"
+    FgSightingCollection.model_validate_json(answer.content)
     body = answer.json()
     assert (body["featureType"], body["numberMatched"]) == ("spicd-object", 2)
     box, desk = body["features"]
@@ -138,13 +138,13 @@ def test_an_object_over_time_has_an_interval_and_each_of_its_sightings(
     asked_often: tuple[TestClient, list[str]],
 ) -> None:
     client, (first, second, _) = asked_often
-    answer = client.get("/maps/lobby/objects")
-    ObjectCollection.model_validate_json(answer.content)
+    answer = client.get("/maps/lobby/objects", params={"profile": "jsonfg"})
+    FgObjectCollection.model_validate_json(answer.content)
     (box,) = (one for one in answer.json()["features"] if one["properties"]["kind"] == "appeared")
     assert box["id"] == box["properties"]["object_id"]
     assert box["time"] == {"interval": ["2026-03-01T12:00:00Z", "2026-03-02T12:00:00Z"]}
-    answer = client.get(f"/maps/lobby/objects/{box['id']}")
-    ObjectHistory.model_validate_json(answer.content)
+    answer = client.get(f"/maps/lobby/objects/{box['id']}", params={"profile": "jsonfg"})
+    FgObjectHistory.model_validate_json(answer.content)
     found = answer.json()
     assert found["properties"] == box["properties"]
     assert [one["properties"]["survey_id"] for one in found["sightings"]] == [first, second]
@@ -190,6 +190,66 @@ def test_the_objects_of_a_survey_are_filtered_too(
 ) -> None:
     client, (_, second, _) = asked_often
     assert [one["number"] for one in properties(client, f"/surveys/{second}/objects", **asked)] == expected
+
+
+def test_the_objects_of_a_survey_are_found_by_place_and_ordered(
+    asked_often: tuple[TestClient, list[str]],
+) -> None:
+    client, (_, second, _) = asked_often
+    here = f"/surveys/{second}/objects"
+
+    def numbers(**asked: str) -> list[int]:
+        return [one["number"] for one in properties(client, here, **asked)]
+
+    assert numbers(bbox="0,0,2,2") == [1]
+    assert numbers(bbox="0,0,2,9,9,3") == []  # above all of them
+    assert numbers(sortby="-number") == [3, 2, 1]
+    assert numbers(sortby="probability") == [3, 2, 1]
+    for sortby, expected in (("-number", [3, 2, 1]), ("-probability", [1, 2, 3])):
+        url: str | None = f"{here}?limit=1&sortby={sortby}"
+        seen = []
+        while url:
+            body = client.get(url).json()
+            assert body["numberMatched"] == 3
+            seen += [one["properties"]["number"] for one in body["features"]]
+            url = next((one["href"] for one in body["links"] if one["rel"] == "next"), None)
+        assert seen == expected
+
+
+def test_the_objects_of_a_map_are_found_by_survey_and_device_and_ordered(
+    asked_often: tuple[TestClient, list[str]],
+) -> None:
+    client, (first, _, third) = asked_often
+    assert kinds(client, survey=first) == ["appeared", "moved"]
+    assert kinds(client, survey=third) == ["disappeared", "moved"]
+    assert kinds(client, device_id="robot-1") == []
+    told = [one["kind"] for one in properties(client, sortby="probability")]
+    assert told == ["disappeared", "moved", "appeared"]
+    for sortby in ("first_seen", "-last_seen", "last_looked", "-probability"):
+        whole = [one["object_id"] for one in properties(client, sortby=sortby)]
+        url: str | None = f"/maps/lobby/objects?limit=1&sortby={sortby}"
+        seen = []
+        while url:
+            body = client.get(url).json()
+            seen += [one["id"] for one in body["features"]]
+            url = next((one["href"] for one in body["links"] if one["rel"] == "next"), None)
+        assert seen == whole
+
+
+def test_an_object_says_in_flat_numbers_what_its_places_say(
+    asked_often: tuple[TestClient, list[str]],
+) -> None:
+    client, (first, _, _) = asked_often
+    box, desk = properties(client, f"/surveys/{first}/objects")
+    for told, place_now in ((box, box["now"]), (desk, desk["now"])):
+        assert [told["center_x"], told["center_y"]] == place_now["center"][:2]
+        assert [told["size_x"], told["size_y"], told["size_z"]] == place_now["size"]
+        assert told["z_max"] - told["z_min"] == pytest.approx(place_now["size"][2])
+        assert told["yaw_degrees"] == place_now["yaw_degrees"]
+        assert told["height_over_floor"] == place_now["height_over_floor"]
+    assert [desk["moved_x"], desk["moved_y"], desk["moved_z"]] == desk["motion"]["translation"]
+    assert desk["moved_yaw_degrees"] == -90
+    assert [box[name] for name in ("moved_x", "moved_y", "moved_z", "moved_yaw_degrees")] == [None] * 4
 
 
 @pytest.mark.parametrize(
@@ -267,9 +327,10 @@ def test_an_anchor_puts_footprints_on_the_earth(client: TestClient, catalog: Cat
     client.put("/maps/lobby/anchor", json=BERLIN)
     convert = to_wgs84(Anchor(**BERLIN))
     object_id = properties(client, kind="appeared")[0]["object_id"]
-    alone = client.get(f"/maps/lobby/objects/{object_id}").json()
-    listed = client.get("/maps/lobby/objects").json()["features"]
-    seen = client.get(f"/surveys/{first}/objects").json()["features"]
+    asked = {"profile": "jsonfg"}
+    alone = client.get(f"/maps/lobby/objects/{object_id}", params=asked).json()
+    listed = client.get("/maps/lobby/objects", params=asked).json()["features"]
+    seen = client.get(f"/surveys/{first}/objects", params=asked).json()["features"]
     for feature in (alone, *alone["sightings"], *listed, *seen):
         (ring,) = feature["geometry"]["coordinates"]
         (local,) = feature["place"]["base"]["coordinates"]

@@ -69,8 +69,8 @@ def test_the_tiles_are_features_in_the_frame_of_the_map(client: TestClient, cata
         tile(0, 1, "unchanged", 0.1),
     ]
     survey_id, _ = add_survey(catalog, tiles)
-    answer = client.get(f"/surveys/{survey_id}/tiles")
-    assert answer.headers["content-type"] == "application/geo+json"
+    answer = client.get(f"/surveys/{survey_id}/tiles", params={"profile": "jsonfg"})
+    assert answer.headers["content-type"] == "application/vnd.ogc.fg+json"
     found = answer.json()
     assert found["type"] == "FeatureCollection"
     assert found["conformsTo"] == [
@@ -95,9 +95,16 @@ def test_the_tiles_are_features_in_the_frame_of_the_map(client: TestClient, cata
         "tile_id": "tile_001_002_000",
         "tile_index": [1, 2, 0],
         "center": [2.25, 3.75, 0.5],
+        "center_x": 2.25,
+        "center_y": 3.75,
+        "z_min": 0.0,
+        "z_max": 1.0,
         "state": "changed",
         "score": 0.93,
         "probabilities": [pytest.approx(0.07), 0.93, 0],
+        "p_unchanged": pytest.approx(0.07),
+        "p_changed": 0.93,
+        "p_different": 0,
         "threshold": 0.5,
         "n_reference": 900,
         "n_current": 800,
@@ -107,6 +114,7 @@ def test_the_tiles_are_features_in_the_frame_of_the_map(client: TestClient, cata
         "map_id": "lobby",
         "map_version": 1,
         "survey_id": survey_id,
+        "device_id": None,
         "model": "spicd-net/1",
         "captured_at": "2026-03-01T12:00:00Z",
         "first_seen": "2026-03-01T12:00:00Z",

@@ -51,7 +51,9 @@ def test_the_map_of_the_last_build_is_read_as_it_was_written(opened: Catalog) ->
     assert (lobby.anchor.longitude, lobby.anchor.heading) == (13.4, 90)
     (scan,) = lobby.scans
     assert (scan.scan_id, scan.accepted, scan.fitness, scan.map_from_scan) == ("scan-1", True, 0.98, IDENTITY)
-    building, ready = opened.versions.page("lobby").items
+    building, ready = (
+        opened.versions.get("lobby", one.version) for one in opened.versions.page("lobby").items
+    )
     assert (building.version, building.base_version, building.status) == (2, 1, "building")
     assert [scan.scan_id for scan in building.scans] == ["scan-1", "scan-3"]
     assert (ready.version, ready.registration) == (1, {"scans": 1})

@@ -15,6 +15,7 @@ from service.client.documents import (
     AcceptedMap,
     JobDocument,
     MapDocument,
+    MapSummaryDocument,
     ScanDocument,
     SurveyDocument,
     TileProperties,
@@ -30,7 +31,7 @@ def synchronous() -> None:
         job = client.wait(building["job_id"])
         assert_type(job, JobDocument)
         assert_type(job["status"], Literal["accepted", "running", "successful", "failed", "dismissed"])
-        assert_type(client.maps(), list[MapDocument])
+        assert_type(client.maps(), list[MapSummaryDocument])
         assert_type(client.survey("survey-1"), SurveyDocument)
         for feature in client.tiles("survey-1")["features"]:
             assert_type(feature["properties"], TileProperties)

@@ -90,7 +90,9 @@ def test_detect_writes_features_a_cloud_and_a_picture_and_tells_where(
     out = tmp_path / "out"
     assert run("detect", *files, "--out", str(out), "--model-store", str(store), "--json") == 0
     told = json.loads(capsys.readouterr().out)
-    features = json.loads((out / "tiles.geojson").read_text())["features"]
+    collection = json.loads((out / "tiles.geojson").read_text())
+    assert collection["crs"]["properties"]["name"].startswith("ENGCRS")
+    features = collection["features"]
     states = Counter(feature["properties"]["state"] for feature in features)
     assert told["counts"]["tiles"] == len(features) == sum(told["counts"].values()) // 2 > 0
     assert {state: count for state, count in told["counts"].items() if state in states} == states
@@ -98,8 +100,10 @@ def test_detect_writes_features_a_cloud_and_a_picture_and_tells_where(
         about = feature["properties"]
         if about["center"][0] > 3:  # not seen again
             assert (about["state"], about["score"]) == ("unobserved", None)
-        assert about["center"][2] == pytest.approx(
-            (feature["place"]["lower"] + feature["place"]["upper"]) / 2
+        assert about["center"][2] == pytest.approx((about["z_min"] + about["z_max"]) / 2)
+        corners = np.array(feature["geometry"]["coordinates"][0])
+        np.testing.assert_allclose(
+            corners[:4].mean(axis=0), [*about["center"][:2], about["z_min"]], atol=1e-6
         )
     assert read_scan(Path(told["files"]["cloud"])).points[:, 0].max() < 2.2
     assert Path(told["files"]["picture"]).read_bytes().startswith(b"\x89PNG")

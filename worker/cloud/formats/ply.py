@@ -8,7 +8,7 @@ from __future__ import annotations
 import mmap
 import re
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -43,6 +43,7 @@ _LONG_NAMES = {
 }  # fmt: skip
 _TYPES = _SHORT_NAMES | _LONG_NAMES
 _ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
+SCALAR = "scalar_"  #: what the names of scalar fields begin with (CloudCompare, PlyFilter)
 _LISTS_LIMIT = 5_000_000  #: lists of an element that are walked one by one in Python, about 0.5 us each
 
 
@@ -246,23 +247,33 @@ def write_ply(
     *,
     colors: Colors | None = None,
     scalars: Mapping[str, NDArray[Any]] | None = None,
+    quality: NDArray[Any] | None = None,
+    comments: Sequence[str] = (),
 ) -> None:
     """Write binary little endian PLY: float x y z, uchar red green blue, then one property for each scalar (N,).
 
-    Scalars of bool or uint8 become uchar, other integers int, floats float. The file appears whole or not at all.
-    Raises ValueError for a scalar whose name is no word, whose length is not N or whose values do not fit.
+    A scalar `name` becomes the property `scalar_name`, which CloudCompare takes for a scalar field without being told;
+    `quality` (N,) becomes the property of that name, the only number of a point that MeshLab reads. Comments are lines
+    of ASCII. Scalars of bool or uint8 become uchar, other integers int, floats float. The file appears whole or not at all.
+    Raises ValueError for a scalar whose name is no word, whose length is not N or whose values do not fit, and for a
+    comment of more than a line.
     """
     columns: dict[str, NDArray[Any]] = dict(zip("xyz", np.asarray(points, "<f4").T, strict=True))
     if colors is not None:
         columns |= dict(zip(("red", "green", "blue"), np.asarray(colors, np.uint8).T, strict=True))
     for name, values in (scalars or {}).items():
-        if name in columns or re.fullmatch("[A-Za-z_][A-Za-z0-9_]*", name) is None:
+        if re.fullmatch("[A-Za-z_][A-Za-z0-9_]*", name) is None:
             raise ValueError(f"scalar field {name!r} needs another name")
-        columns[name] = _scalar(name, np.asarray(values))
+        columns[SCALAR + name] = _scalar(name, np.asarray(values))
+    if quality is not None:
+        columns["quality"] = np.asarray(quality, "<f4")
     if any(column.shape != (len(points),) for column in columns.values()):
         raise ValueError(f"columns of {[len(c) for c in columns.values()]} values for {len(points)} points")
     words = {code: word for word, code in _SHORT_NAMES.items()}
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}"]
+    if any(re.fullmatch("[ -~]*", comment) is None for comment in comments):
+        raise ValueError(f"comments {comments!r} are not one line of ASCII each")
+    header = ["ply", "format binary_little_endian 1.0", *(f"comment {comment}" for comment in comments)]
+    header.append(f"element vertex {len(points)}")
     header += [f"property {words[column.dtype.str[1:]]} {name}" for name, column in columns.items()]
     rows = np.empty(len(points), np.dtype([(name, column.dtype) for name, column in columns.items()]))
     for name, column in columns.items():

@@ -1,7 +1,8 @@
 """Scans: one upload as points, read strictly (docs/decisions/0003-reading-scans.md).
 
 The header is checked against the file's real size before anything is allocated, and what cannot be right
-is refused with the numbers that show it. A scan is never repaired, except that missing returns are dropped.
+is refused with the numbers that show it. A scan is never repaired, except that missing returns are dropped, and
+the few points that lie far from all others.
 """
 
 from __future__ import annotations
@@ -15,15 +16,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from worker.cloud.formats.fields import FARTHEST, Columns, RawCloud, colors_of
+from worker.cloud.formats.extent import SAMPLE, Extent
+from worker.cloud.formats.fields import Columns, RawCloud, colors_of
 from worker.cloud.formats.pcd import looks_like_pcd, read_pcd
 from worker.cloud.formats.ply import looks_like_ply, read_ply
 from worker.cloud.types import Bools, Colors, Matrix4, Points
-from worker.errors import ScanError, ScanTooLarge, ScanUnits
+from worker.errors import ScanError, ScanTooLarge
 
-LONGEST_SITE = 500.0  #: metres along one axis; an indoor scan that is longer is not in metres
-SHORTEST_ROOM = 3.0  #: metres; what another unit would make of the extent has to be a room
-_SAMPLE = 100_000  #: points that the extent is measured on
 _AT_ONCE = 1_000_000  #: points checked and copied together
 
 
@@ -36,12 +35,14 @@ class Scan:
     colors: Colors | None  #: (N, 3) uint8
     sensor_pose: Matrix4  #: (4, 4) float64, scan_from_sensor; PCD's VIEWPOINT, otherwise identity
     n_dropped: int  #: points with NaN or inf that were left out
+    n_far: int = 0  #: points far from all others that were left out
+    farthest: float = 0.0  #: metres from the middle of the scan to the farthest of those
 
 
 def read_scan(path: Path, *, name: str | None = None, max_points: int = 50_000_000) -> Scan:
     """Read a PLY or PCD file, told apart by content.
 
-    Raises ScanError, ScanTooLarge or ScanUnits; the message starts with `name` (default: the file's name).
+    Raises ScanError, ScanTooLarge, ScanUnits or ScanFarAway; the message starts with `name` (default: the file's name).
     """
     name = path.name if name is None else name
     try:
@@ -77,25 +78,26 @@ def _checked_scan(raw: RawCloud, name: str) -> Scan:
     n = int(np.count_nonzero(finite))
     if not n:
         raise ScanError(f"no points are left: {len(finite)} declared, {len(finite)} of them NaN or inf")
-    check_units(_sampled(raw, finite, n))
-    points, far = np.empty((n, 3), np.float32), _FarPoints()
+    extent = Extent.of(_sampled(raw, finite, n))
+    points = np.empty((n, 3), np.float32)
     colors: list[Colors | None] = []
     done = 0
     for piece in _pieces(raw):
         kept = finite[piece]
         positions = _positions(raw.columns, piece)[kept]
-        far.count(positions)
-        with np.errstate(over="ignore"):  # what overflows is too far away, and refused below
-            points[done : done + len(positions)] = positions
-        done += len(positions)
+        near = extent.near(positions)
+        kept[kept] = near  # rows of the file that stay
+        points[done : done + int(np.count_nonzero(near))] = positions[near]
+        done += int(np.count_nonzero(near))
         colors.append(_colors(raw.columns, piece, kept))
-    far.refuse(n)
     return Scan(
         name=name,
-        points=points,
+        points=points[:done],
         colors=_joined(colors),
         sensor_pose=raw.sensor_pose,
         n_dropped=len(finite) - n,
+        n_far=extent.n_far,
+        farthest=extent.farthest,
     )
 
 
@@ -114,7 +116,7 @@ def _positions(columns: Columns, rows: slice | NDArray[np.intp]) -> NDArray[np.f
 
 def _sampled(raw: RawCloud, finite: Bools, n: int) -> NDArray[np.floating[Any]]:
     """Return positions (K, 3) of every so manieth of the `n` finite rows, 100,000 or up to twice as many."""
-    step = max(1, n // _SAMPLE)
+    step = max(1, n // SAMPLE)
     rows, before = [], 0
     for piece in _pieces(raw):
         there = np.flatnonzero(finite[piece])
@@ -134,44 +136,3 @@ def _joined(colors: Sequence[Colors | None]) -> Colors | None:
     """Join the colours of all pieces; None where one of them has none."""
     there = [part for part in colors if part is not None]
     return np.concatenate(there) if len(there) == len(colors) else None
-
-
-def check_units(positions: NDArray[np.floating[Any]]) -> None:
-    """Raise ScanUnits when the cloud (N, 3) is longer than any building, as one in millimetres is.
-
-    The extent is that of the middle 98% of the points on each axis, so that stray returns do not decide.
-    """
-    sample = positions[:: max(1, len(positions) // _SAMPLE)].astype(np.float64)
-    low, high = np.percentile(sample / 2, [1, 99], axis=0)  # of halves, whose difference cannot overflow
-    extent = 2 * float(np.max(high - low))
-    if extent <= LONGEST_SITE:
-        return
-    span = f"it spans {extent:.6g} along one axis, over {LONGEST_SITE:g} m"
-    for unit, factor in (("millimetres", 0.001), ("centimetres", 0.01)):  # the commoner one first
-        if SHORTEST_ROOM <= extent * factor <= LONGEST_SITE:
-            raise ScanUnits(f"{span}: looks like {unit}; multiply by {factor} to get metres")
-    raise ScanUnits(f"{span}: not a scan of a building in metres; check its units")
-
-
-@dataclass(slots=True)
-class _FarPoints:
-    """Points that lie too far away for float32 to keep their millimetres."""
-
-    n: int = 0
-    first: NDArray[np.floating[Any]] | None = None  #: (3,)
-
-    def count(self, positions: NDArray[np.floating[Any]]) -> None:
-        """Add those among positions (K, 3)."""
-        far = (np.abs(positions) > FARTHEST).any(axis=1)
-        if far.any():
-            self.n += int(np.count_nonzero(far))
-            self.first = positions[int(np.argmax(far))] if self.first is None else self.first
-
-    def refuse(self, n: int) -> None:
-        """Raise ScanError where any of the `n` points is far."""
-        if self.first is not None:
-            where = ", ".join(f"{v:.6g}" for v in self.first)
-            raise ScanError(
-                f"{self.n} of {n} points lie over {FARTHEST:g} m from the origin, "
-                f"one at ({where}); subtract the map's offset, and write missing returns as NaN"
-            )

@@ -8,7 +8,8 @@ from typing import Any, Self
 
 import numpy as np
 
-from worker.cloud.poses import transformed
+from worker.cloud.poses import inverse, transformed
+from worker.cloud.sight import Sights
 from worker.cloud.types import Matrix4
 from worker.errors import MapFailed, ScanError
 from worker.pipeline.mapping.multiview_refinement import Refined, refine_jointly
@@ -21,9 +22,21 @@ from worker.pipeline.mapping.pair_registration import (
     register_planned,
 )
 from worker.pipeline.mapping.pose_graph import Solution, components, map_from_reference, solve_graph
+from worker.pipeline.mapping.refusals import explained, may_be_explained
 from worker.pipeline.mapping.relocalization import Relocalized, relocalize
 from worker.pipeline.mapping.settings import JointRegistrationSettings
-from worker.pipeline.mapping.tasks import PrepareTask, ValidScan, Workspace, open_workspace, read_and_prepare
+from worker.pipeline.mapping.tasks import (
+    PlaceTask,
+    PrepareTask,
+    ValidScan,
+    Workspace,
+    lay_together,
+    open_workspace,
+    read_and_prepare,
+)
+from worker.pipeline.placement.contradictions import Place
+from worker.pipeline.placement.scan_placement import turned_up
+from worker.pipeline.registration.diagnosis import Reason, without_doubles
 from worker.pipeline.registration.results import RegistrationResult, ScanFile, ScanRejected, ScanResult
 from worker.pipeline.registration.scan_to_scan import PairResult
 from worker.processes import default_processes
@@ -31,6 +44,7 @@ from worker.progress import Progress, monotonic_progress, no_progress
 
 _FEW = 4  # scans up to which processes cost more than they bring
 _FIRST_REFINEMENT, _REFINEMENTS = 0.6, 0.9  # of the stage's progress
+_TRUE_CAUSES: tuple[Reason, ...] = ("mirrored", "wrong_scale", "wrong_prior", "ambiguous")
 
 Scans = Mapping[int, ValidScan]  #: by index of the file
 Prepared = Mapping[int, ValidScan | ScanError | ScanRejected]  #: likewise; why a scan is not valid
@@ -147,6 +161,8 @@ class _Build:
         pairs, graph = self._connect(scans)
         refined, relocalized = self._refine_and_relocalize(scans, graph)
         kept = tuple(edge for edge in graph.kept if refined.poses.keys() >= set(edge.pair))
+        relocalized = {**relocalized, **self._explained(scans, graph.reference, refined, relocalized)}
+        self.progress("refining", 1.0)
         results = self._results(prepared, replace(graph, kept=kept), refined, relocalized)
         report = MapReport.of(results, pairs=pairs, kept=kept, reference=graph.reference)
         return MapRegistration(outcomes=results, report=report, kept=kept, rejected=graph.rejected)
@@ -230,8 +246,64 @@ class _Build:
             refined = self._refine(together, scans, graph.reference, ties, span=_REFINEMENTS)
             if len(refined.poses) <= before:  # what was found is contradicted by the others
                 break
-        self.progress("refining", 1.0)
+        self.progress("refining", _REFINEMENTS)
         return refined, relocalized
+
+    def _explained(
+        self, scans: Scans, reference: int, refined: Refined, relocalized: Mapping[int, Relocalized]
+    ) -> dict[int, Relocalized]:
+        """Return the scans left out for which there is a better reason: mirrored, scaled, a prior kilometres off."""
+        left_out = {
+            index: ScanRejected(item.result.diagnosis)
+            for index, item in relocalized.items()
+            if index not in refined.poses and item.pose is None and item.result.diagnosis is not None
+        }
+        doubtful = [index for index, error in left_out.items() if may_be_explained(error)]
+        if not doubtful:
+            return {}
+        place = self._place_of(refined.poses)
+        map_index = -len(self.files) - 1  # below that of every map that scans were relocalized in
+        self.workspace.folder.save_map(map_index, place.surface, place.sights)
+        priors = {index: scan.prior for index, scan in scans.items() if scan.prior is not None}
+        reference_from_map = inverse(map_from_reference(refined.poses, priors, reference))
+        in_reference = {index: reference_from_map @ priors[index] for index in left_out if index in priors}
+        errors: dict[int, Exception] = dict(left_out)
+        for index in doubtful[: self.workspace.settings.placement.diagnosed]:
+            task = PlaceTask(
+                folder=self.workspace.folder,
+                map_index=map_index,
+                index=index,
+                prior=in_reference.get(index),
+                settings=self.workspace.settings,
+            )
+            found = task.run(place, tick=lambda: self.progress("refining", _REFINEMENTS))
+            errors[index] = found if isinstance(found, ScanRejected) else left_out[index]
+        better = explained(
+            errors,
+            self.files,
+            in_reference,
+            place,
+            self.workspace,
+            map_index=map_index,
+            tick=lambda: self.progress("refining", _REFINEMENTS),
+        )
+        own = {index: error for index, error in errors.items() if _is_told(error)}
+        return {
+            index: Relocalized(index=index, result=ScanResult.rejected(self.files[index].name, error))
+            for index, error in (own | better).items()
+        }
+
+    def _place_of(self, poses: Mapping[int, Matrix4]) -> Place:
+        """Return what was registered as a place to hold other scans against, in the frame of the poses."""
+        folder = self.workspace.folder
+        voxel_size = self.workspace.settings.registration.voxel_size
+        seen = []
+        for index, pose in poses.items():
+            scan = folder.load(index)
+            if scan.origin is not None:
+                seen.append((transformed(scan.surface.points, pose), transformed(scan.origin[None], pose)[0]))
+        surface = lay_together(folder, list(poses.items()), voxel_size=voxel_size)
+        return Place(surface=surface, sights=Sights.of(seen) if seen else None)
 
     def _refine(
         self,
@@ -276,18 +348,21 @@ class _Build:
         results = []
         for index, scan in prepared.items():
             name, late = self.files[index].name, relocalized.get(index)
+            odd = scan.oddities if isinstance(scan, ValidScan) else ()
             if index in refined.poses:
                 registration = self._registration(index, graph, refined, late, frame)
-                results.append(ScanResult.accepted(name, registration))
+                told = without_doubles((*turned_up(name, registration.map_from_scan), *odd))
+                results.append(ScanResult.accepted(name, registration, warnings=told))
             elif isinstance(scan, Exception):
                 results.append(ScanResult.rejected(name, scan))
             elif late is not None and late.pose is None:
-                results.append(late.result)
+                results.append(replace(late.result, warnings=odd))
             else:
                 detail = (
                     f"scan {name}: it contradicts what its neighbours saw as free space; scan there again"
                 )
-                results.append(ScanResult.rejected(name, ScanRejected.because("disagrees", detail)))
+                error = ScanRejected.because("disagrees", detail)
+                results.append(ScanResult.rejected(name, error, warnings=odd))
         return tuple(results)
 
     def _registration(
@@ -309,6 +384,11 @@ class _Build:
             uncertainty=refined.uncertainties[index] if len(refined.poses) > 1 else None,
             path=path,
         )
+
+
+def _is_told(error: Exception) -> bool:
+    """Tell whether the search for the scan itself found a true cause."""
+    return isinstance(error, ScanRejected) and error.diagnosis.reason in _TRUE_CAUSES
 
 
 def _mean_of_edges(edges: Sequence[PairResult]) -> RegistrationResult:

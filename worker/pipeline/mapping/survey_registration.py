@@ -18,16 +18,15 @@ from worker.cloud.sight import Sights
 from worker.cloud.types import Matrix4
 from worker.errors import ScanError
 from worker.pipeline.mapping.multiview_refinement import Refined, refine_jointly, uncertainties
+from worker.pipeline.mapping.refusals import explained
 from worker.pipeline.mapping.settings import JointRegistrationSettings
 from worker.pipeline.mapping.tasks import (
-    ExplainTask,
     LinearizedPair,
     PlaceTask,
     PrepareTask,
     ValidScan,
     Workspace,
     downsample,
-    explain_one,
     lay_together,
     open_workspace,
     place_one,
@@ -37,7 +36,7 @@ from worker.pipeline.placement.belief import confidence, log_odds
 from worker.pipeline.placement.contradictions import Held, Place
 from worker.pipeline.placement.placed_scan import PlacedScan, other_place
 from worker.pipeline.placement.scan_placement import CLEAR
-from worker.pipeline.registration.diagnosis import Diagnosis, Reason
+from worker.pipeline.registration.diagnosis import Diagnosis, without_doubles
 from worker.pipeline.registration.hypothesis import Hypothesis
 from worker.pipeline.registration.icp import normal_equations
 from worker.pipeline.registration.preprocessing import PreparedScan
@@ -56,8 +55,6 @@ from worker.progress import Progress, monotonic_progress, no_progress
 MAP = -1  #: the map's index among the scans; the lowest, so that it is the target of every pair
 _DISTANCE, _EVERY = 0.05, 2  # metres; points: how a scan by itself is weighed
 _DISAGREE = 0.05  # metres that the other scans may move a scan from where it was registered
-#: Reasons behind which there may be a better one.
-EXPLAINED: tuple[Reason, ...] = ("other_place", "no_fit", "wrong_prior", "too_few_points", "degenerate")
 _FEW = 5  # scans up to which processes cost more than they bring
 _LIKELY = 0.5  # confidence below which a scan needs another one to vouch for it
 
@@ -114,13 +111,16 @@ class _Visit:
     progress: Progress
     growing: bool
     errors: dict[int, Exception] = field(default_factory=dict)  #: why a file is left out, by its index
+    oddities: dict[int, tuple[Diagnosis, ...]] = field(
+        default_factory=dict
+    )  #: what is odd about it by itself
 
     def run(self) -> SurveyRegistration:
         """Run the steps in order."""
         priors = self._prepare()
         placed = self._place(priors, self.place, MAP)
         self._vouch(placed, priors)
-        self._explain()
+        self._explain(priors)
         if self.growing:
             self._grow(placed, priors)
         self.progress("registering", 1.0)
@@ -128,7 +128,7 @@ class _Visit:
         outcomes = tuple(
             self._accepted(index, placed[index], refined)
             if index in refined.poses
-            else ScanResult.rejected(file.name, self.errors[index])
+            else ScanResult.rejected(file.name, self.errors[index], warnings=self.oddities.get(index, ()))
             for index, file in enumerate(self.files)
         )
         kept = [scan for index, scan in placed.items() if index in refined.poses]
@@ -151,7 +151,7 @@ class _Visit:
         for index, scan in self.workspace.processes.map_unordered(read_and_prepare, tasks):
             self.progress("registering", 0.0)
             if isinstance(scan, ValidScan):
-                priors[index] = scan.prior
+                priors[index], self.oddities[index] = scan.prior, scan.oddities
             else:
                 self.errors[index] = scan
         unreadable = [self.errors[index] for index in sorted(self.errors)]
@@ -216,33 +216,18 @@ class _Visit:
                 self.errors[index] = other_place(self.files[index].name, scan)
                 del placed[index]
 
-    def _explain(self) -> None:
-        """Look for better reasons why scans found no place: mirrored, scaled, moved, and so on."""
-        settings = self.workspace.settings
-        tasks = [
-            ExplainTask(
-                folder=self.workspace.folder,
-                map_index=MAP,
-                index=index,
-                file=self.files[index],
-                hypotheses=getattr(error, "hypotheses", ()),
-                settings=settings,
-            )
-            for index, error in sorted(self.errors.items())
-            if isinstance(error, ScanRejected) and error.diagnosis.reason in EXPLAINED
-        ][: settings.placement.diagnosed]
-        for index, diagnosis in self._explaining(tasks):
-            error = self.errors[index]
-            if diagnosis is not None and isinstance(error, ScanRejected):
-                fitness, inlier_rmse = error.fitness, error.inlier_rmse
-                self.errors[index] = ScanRejected(diagnosis, fitness=fitness, inlier_rmse=inlier_rmse)
-
-    def _explaining(self, tasks: Sequence[ExplainTask]) -> Iterator[tuple[int, Diagnosis | None]]:
-        if self.workspace.processes.count > 1:
-            yield from self.workspace.processes.map_unordered(explain_one, tasks)
-            return
-        for task in tasks:
-            yield task.index, task.run(self.place, tick=self._tick(1.0))
+    def _explain(self, priors: Mapping[int, Matrix4 | None]) -> None:
+        """Look for better reasons why scans found no place: mirrored, scaled, moved, a prior kilometres off."""
+        better = explained(
+            self.errors,
+            self.files,
+            priors,
+            self.place,
+            self.workspace,
+            map_index=MAP,
+            tick=self._tick(1.0),
+        )
+        self.errors.update(better)
 
     def _expected(self, index: int, placed: Placed, priors: Mapping[int, Matrix4 | None]) -> Matrix4 | None:
         """Return where the other scans, by their priors, would have this one; None where they do not say."""
@@ -383,7 +368,7 @@ class _Visit:
         return ScanResult.accepted(
             self.files[index].name,
             replace(result, uncertainty=refined.uncertainties[index]),
-            warnings=placed.warnings,
+            warnings=without_doubles((*placed.warnings, *self.oddities.get(index, ()))),
             confidence=placed.confidence,
         )
 

@@ -25,6 +25,7 @@ from worker.pipeline.registration import bev_correlation
 from worker.pipeline.registration.diagnosis import Diagnosis
 from worker.pipeline.registration.hypothesis import Hypothesis
 from worker.pipeline.registration.icp import NormalEquations, normal_equations
+from worker.pipeline.registration.oddities import oddities
 from worker.pipeline.registration.preprocessing import PreparedScan, prepare
 from worker.pipeline.registration.refinement import CoarsePose, by_score
 from worker.pipeline.registration.results import ScanFile, ScanRejected
@@ -94,6 +95,7 @@ class ValidScan:
 
     points: Points  #: (N, 3) metres, scan frame, downsampled: for its extent
     prior: Matrix4 | None  #: map_from_scan as the robot believes it
+    oddities: tuple[Diagnosis, ...] = ()  #: what is odd about it by itself
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -116,7 +118,12 @@ def read_and_prepare(task: PrepareTask) -> tuple[int, ValidScan | ScanError | Sc
         return task.index, error
     prepared.save(task.folder.path(task.index))
     prior = task.file.prior(scan.sensor_pose)
-    return task.index, ValidScan(points=downsample(prepared.surface.points), prior=prior)
+    voxel_size = task.settings.registration.voxel_size
+    return task.index, ValidScan(
+        points=downsample(prepared.surface.points),
+        prior=prior,
+        oddities=oddities(scan, prepared, prior=prior, voxel_size=voxel_size),
+    )
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from worker.cloud.poses import difference, skew
+from worker.cloud.poses import difference, skew, transformed
 from worker.cloud.types import Floats, Matrix4
 from worker.pipeline.placement.belief import log_odds, odds_of
 from worker.pipeline.placement.contradictions import (
@@ -27,7 +27,7 @@ from worker.pipeline.placement.scale import estimate_scale
 from worker.pipeline.placement.settings import PlacementSettings
 from worker.pipeline.placement.variants import up_axis
 from worker.pipeline.registration.bev_correlation import bev_candidates
-from worker.pipeline.registration.diagnosis import Diagnosis
+from worker.pipeline.registration.diagnosis import Diagnosis, length
 from worker.pipeline.registration.fpfh_ransac import fpfh_candidates
 from worker.pipeline.registration.hypothesis import Hypothesis
 from worker.pipeline.registration.icp import icp, normal_equations
@@ -46,6 +46,7 @@ from worker.pipeline.registration.verification import (
 
 CLEAR = 0.9  #: confidence from which on nothing else is looked for
 OVERCOMES = 0.99  #: confidence that a pose needs against a prior that says otherwise
+OUTSIDE = 50.0  #: metres outside the map, from which on a prior is no start
 _BEV_CANDIDATES, _NEAR_PRIOR = (
     12,
     48,
@@ -76,17 +77,32 @@ def place_scan(
 ) -> PlacedScan:
     """Find map_from_scan and believe it only where rays do not contradict it and no other pose does as well.
 
-    Raises NotPlaced with a diagnosis. Where neither the rays of the scan nor those of the map are known, surfaces
+    Raises NotPlaced with a diagnosis. A prior that puts the scan well outside the map is no start: the scan is looked for
+    without it, and where it has a place the prior is refused. Where neither the rays of the scan nor those of the map are known, surfaces
     decide alone, as in `registration.scan_to_map.register`.
     """
+    astray = prior is not None and outside(scan, place, prior) > OUTSIDE
     search = _Search(
-        scan=scan, place=place, prior=prior, registration=registration, placement=placement, tick=tick
+        scan=scan,
+        place=place,
+        prior=None if astray else prior,
+        registration=registration,
+        placement=placement,
+        tick=tick,
     )
     try:
         blind = scan.sights is None and place.sights is None
-        return search.by_surfaces() if blind else search.run()
+        placed = search.by_surfaces() if blind else search.run()
+        return replace(search, prior=prior).overcome(placed) if astray else placed
     except ScanRejected as error:
         raise NotPlaced(error, search.hypotheses()) from error
+
+
+def outside(scan: PreparedScan, place: Place, map_from_scan: Matrix4) -> float:
+    """Return how far outside the map (metres) a pose puts a scan; 0 where their boxes meet."""
+    points, mapped = transformed(scan.surface.points, map_from_scan), place.surface.points
+    gaps = np.maximum(mapped.min(axis=0) - points.max(axis=0), points.min(axis=0) - mapped.max(axis=0))
+    return float(np.linalg.norm(np.maximum(gaps, 0.0)))
 
 
 def poses_tried(
@@ -264,7 +280,7 @@ class _Search:
                 return self._believed(near[0])
         if len(rivals) > 1:
             raise self._ambiguous(rivals)
-        return best if self.prior is None else self._overcome(best)
+        return best if self.prior is None else self.overcome(best)
 
     def _is_accepted(self, placed: PlacedScan) -> bool:
         """Ask for what surfaces have to show; clear odds let a smaller overlap do, as a prior does."""
@@ -295,13 +311,13 @@ class _Search:
             raise other_place(self.scan.name, placed)
         return placed
 
-    def _overcome(self, placed: PlacedScan) -> PlacedScan:
+    def overcome(self, placed: PlacedScan) -> PlacedScan:
         """Say by how much the prior was wrong; raise ScanRejected where that is too much, or the pose is not clear."""
         if self.prior is None:
             raise ValueError("a scan without a prior has none that is wrong")
         metres, radians = difference(placed.pose, self.prior)
         numbers = {"metres": metres, "degrees": float(np.degrees(radians))}
-        off = f"{metres:.1f} m and {numbers['degrees']:.0f} degrees"
+        off = f"{length(metres)} and {numbers['degrees']:.0f} degrees"
         sure = placed.log_odds is not None and placed.log_odds >= odds_of(OVERCOMES)
         if metres > self.placement.max_prior_distance or not sure:
             raise rejected(
@@ -310,6 +326,8 @@ class _Search:
                 "wrong_prior",
                 f"it fits the map {off} from its prior and not near it; check the prior, or leave it out",
                 **numbers,
+                outside=outside(self.scan, self.place, self.prior),
+                **({} if placed.confidence is None else {"confidence": placed.confidence}),
             )
         detail = f"scan {self.scan.name}: its prior is off by {off}; the place was found without it"
         warning = Diagnosis(reason="wrong_prior", detail=detail, numbers=numbers)
@@ -397,16 +415,20 @@ class _Search:
 
     def _upright(self, placed: PlacedScan) -> PlacedScan:
         """Tell of a scan that lies on the map with another axis up than z."""
-        number = up_axis(placed.pose[:3, :3])
-        if number == _UP:
-            return placed
-        name = ("-" if number < 0 else "") + "xyz"[abs(number) - 1]
-        detail = f"scan {self.scan.name}: its {name} axis points up, not z; it was turned to fit the map"
-        warning = Diagnosis(reason="other_up_axis", detail=detail, numbers={"up": number})
-        return replace(placed, warnings=(*placed.warnings, warning))
+        return replace(placed, warnings=(*placed.warnings, *turned_up(self.scan.name, placed.pose)))
 
     def _final(self, placed: PlacedScan) -> PlacedScan:
         return self._told(self._free.final(placed.hypothesis))
+
+
+def turned_up(name: str, map_from_scan: Matrix4) -> tuple[Diagnosis, ...]:
+    """Return the warning of a scan that lies on the map with another axis up than z; none where z is up."""
+    number = up_axis(map_from_scan[:3, :3])
+    if number == _UP:
+        return ()
+    axis = ("-" if number < 0 else "") + "xyz"[abs(number) - 1]
+    detail = f"scan {name}: its {axis} axis points up, not z; it was turned to fit the map"
+    return (Diagnosis(reason="other_up_axis", detail=detail, numbers={"up": number}),)
 
 
 def _same(a: Matrix4, b: Matrix4) -> bool:

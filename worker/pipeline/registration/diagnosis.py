@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Literal, get_args
 
@@ -23,6 +23,14 @@ Reason = Literal[
     "wrong_prior",
     "moved_while_scanning",
     "disagrees",
+    "wrong_units",
+    "far_from_origin",
+    "far_points",
+    "missing_returns",
+    "odd_density",
+    "odd_size",
+    "little_coverage",
+    "clock",
 ]
 REASONS: tuple[Reason, ...] = get_args(Reason)
 
@@ -42,6 +50,14 @@ MEANING: dict[Reason, str] = {
     "wrong_prior": "the given prior is off by more than a prior may be",
     "moved_while_scanning": "its first and last points fit the map at different poses: the sensor moved",
     "disagrees": "the other scans of the visit would have it elsewhere, or see through it",
+    "wrong_units": "its extent is that of another unit than metres",
+    "far_from_origin": "its points lie kilometres from the origin of its frame, or from its sensor",
+    "far_points": "a few points far from all others were left out",
+    "missing_returns": "most of its points are missing returns",
+    "odd_density": "points lie on each other, or on a grid",
+    "odd_size": "it is higher than rooms are, or smaller",
+    "little_coverage": "it shows few surfaces, or looks into few directions",
+    "clock": "the time that was given for it cannot be right",
 }
 
 
@@ -55,3 +71,18 @@ class Diagnosis:
         default_factory=dict
     )  #: e.g. {"scale": 1.012}; metres, degrees, 0..1
     poses: tuple[Matrix4, ...] = ()  #: map_from_scan of the poses that nothing tells apart, where ambiguous
+
+
+def length(metres: float) -> str:
+    """Write a distance as people would: in kilometres from one on."""
+    if metres >= 1e7:
+        return "over 10,000 km"
+    return f"{metres / 1000:.1f} km" if metres >= 1000 else f"{metres:.1f} m"
+
+
+def without_doubles(diagnoses: Iterable[Diagnosis]) -> tuple[Diagnosis, ...]:
+    """Return the first of each reason: what a map showed goes before what the scan alone makes likely."""
+    first: dict[Reason, Diagnosis] = {}
+    for diagnosis in diagnoses:
+        first.setdefault(diagnosis.reason, diagnosis)
+    return tuple(first.values())

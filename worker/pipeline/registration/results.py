@@ -18,9 +18,11 @@ from worker.cloud.formats.scan import Scan, read_scan
 from worker.cloud.poses import inverse, transformed
 from worker.cloud.types import Colors, Floats, Matrix4, Points
 from worker.cloud.voxels import Voxels
-from worker.errors import RegistrationFailed, ScanError
+from worker.errors import RegistrationFailed, ScanError, ScanFarAway, ScanUnits
 from worker.pipeline.registration.diagnosis import Diagnosis, Reason
 
+#: Why a file that can be decoded is not taken; any other error of reading is `unreadable`.
+_UNREAD: dict[type[Exception], Reason] = {ScanUnits: "wrong_units", ScanFarAway: "far_from_origin"}
 _SAMPLED = 20  # scans of a visit that its carrier is looked for in
 
 
@@ -128,7 +130,7 @@ class ScanResult:
     name: str
     registration: RegistrationResult | None
     diagnosis: Diagnosis | None = None  #: why it was left out
-    warnings: tuple[Diagnosis, ...] = ()  #: what is odd about it though it was accepted
+    warnings: tuple[Diagnosis, ...] = ()  #: what is odd about it beside, also where it was left out
     confidence: float | None = None  #: 0..1, that its pose is right; None where that was not asked
     fitness: float | None = None  #: 0..1, the best reached; None where there was nothing to fit to
     inlier_rmse: float | None = None  #: metres
@@ -158,12 +160,14 @@ class ScanResult:
         )
 
     @classmethod
-    def rejected(cls, name: str, error: Exception) -> Self:
+    def rejected(cls, name: str, error: Exception, *, warnings: tuple[Diagnosis, ...] = ()) -> Self:
         """Return the result of a scan that was left out, with the numbers where the error has them."""
+        unread = Diagnosis(reason=_UNREAD.get(type(error), "unreadable"), detail=str(error))
         return cls(
             name=name,
             registration=None,
-            diagnosis=getattr(error, "diagnosis", None) or Diagnosis(reason="unreadable", detail=str(error)),
+            diagnosis=getattr(error, "diagnosis", None) or unread,
+            warnings=warnings,
             fitness=getattr(error, "fitness", None),
             inlier_rmse=getattr(error, "inlier_rmse", None),
         )

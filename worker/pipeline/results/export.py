@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 from pathlib import Path
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from worker.cloud.formats.ply import write_ply
+from worker.cloud.formats.ply import SCALAR, write_ply
 from worker.cloud.tiling import tile_id
 from worker.cloud.types import Bools, Colors, Points
 from worker.cloud.voxel_keys import rows_of
@@ -110,15 +110,16 @@ def _rounded(corner: NDArray[np.float64]) -> tuple[float, float, float]:
 def write_coloured_cloud(path: Path, reference: Points, current: Points, changes: ChangeSet) -> None:
     """Write the survey's fused cloud (N, 3), map frame, as coloured PLY; with objects also what the map (M, 3) lost.
 
-    Scalar fields: `change_score` (float; NaN where not scored) and `tile_state` (uchar; TileState, or 255 outside
-    every tile). A detector of tiles alone colours each point by its tile's state. Where there are objects the score
+    Scalar fields, each with `scalar_` before its name in the file and told of in its header: `change_score` (float; NaN
+    where not scored; as `quality` too, for MeshLab) and `tile_state` (uchar; TileState, or 255 outside every tile). A detector of tiles alone colours each point by its tile's state. Where there are objects the score
     is the point's own, each point is coloured by its `kind` (uchar; PointKind), and `object_id` (int) is the number
     of its object, 0 where it is of none.
     """
     if changes.voxels is None or changes.objects is None:
         state, score = _of_tiles(current, changes)
         colors = _colors(STATE_COLORS)[state]
-        write_ply(path, current, colors=colors, scalars={"change_score": score, "tile_state": state})
+        scalars: dict[str, NDArray[Any]] = {"change_score": score, "tile_state": state}
+        write_ply(path, current, colors=colors, scalars=scalars, quality=score, comments=_legend(scalars))
         return
     told = [
         _survey_points(current, changes.voxels, changes.objects),
@@ -129,13 +130,27 @@ def write_coloured_cloud(path: Path, reference: Points, current: Points, changes
     score = np.concatenate([score for _, _, score, _ in told])
     number = np.concatenate([number for _, _, _, number in told])
     state, _ = _of_tiles(points, changes)
-    scalars: dict[str, NDArray[Any]] = {
-        "change_score": score,
-        "tile_state": state,
-        "kind": kind,
-        "object_id": number,
+    scalars = {"change_score": score, "tile_state": state, "kind": kind, "object_id": number}
+    colors = _colors(KIND_COLORS)[kind]
+    write_ply(path, points, colors=colors, scalars=scalars, quality=score, comments=_legend(scalars))
+
+
+def _legend(names: Collection[str]) -> list[str]:
+    """Return what the values of these scalar fields mean, a line each."""
+    states = ", ".join(f"{state.value} {state.label}" for state in TileState)
+    kinds = ", ".join(f"{kind.value} {kind.name.lower().replace('_', ' ')}" for kind in PointKind)
+    meanings = {
+        "change_score": "probability of change 0..1, NaN where nothing could be compared",
+        "tile_state": f"{states}, {NOT_IN_A_TILE} outside every tile",
+        "kind": kinds,
+        "object_id": "number of the object in its survey, 0 none",
     }
-    write_ply(path, points, colors=_colors(KIND_COLORS)[kind], scalars=scalars)
+    frame = f"SPICD: metres, map frame, z up; colours by {'kind' if 'kind' in names else 'tile_state'}"
+    return [
+        frame,
+        *(f"{SCALAR}{name}: {meanings[name]}" for name in names),
+        "quality: as scalar_change_score",
+    ]
 
 
 def _of_tiles(points: Points, changes: ChangeSet) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:

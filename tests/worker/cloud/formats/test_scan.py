@@ -13,7 +13,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from worker.cloud.formats.pcd import write_pcd
 from worker.cloud.formats.ply import write_ply
 from worker.cloud.formats.scan import Scan, read_scan
-from worker.errors import ScanError, ScanTooLarge, ScanUnits
+from worker.errors import ScanError, ScanFarAway, ScanTooLarge, ScanUnits
 
 WITH_COLORS, PLAIN = True, False
 ROOM_808, N_808 = "ipad_rooms/pix4d_database_808_db.ply", 47_043
@@ -167,21 +167,56 @@ def test_a_room_of_20_m_in_centimetres_is_refused_with_that_hint(tmp_path):
         read_scan(tmp_path / "cm.pcd")
 
 
-def test_a_few_stray_returns_do_not_make_a_room_look_like_millimetres(tmp_path):
+def test_a_few_points_far_from_all_others_are_left_out_and_counted(tmp_path):
     points = hall(12)
     points[::500] += [2_000, 0, 0]
-    write_pcd(tmp_path / "room.pcd", points)
-    assert len(read_scan(tmp_path / "room.pcd").points) == len(points)
+    colors = np.arange(len(points) * 3).reshape(-1, 3).astype(np.uint8)
+    write_ply(tmp_path / "room.ply", points, colors=colors)
+    scan = read_scan(tmp_path / "room.ply")
+    kept = np.arange(len(points)) % 500 != 0
+    assert_array_equal(scan.points, points[kept].astype(np.float32))
+    assert_array_equal(scan.colors, colors[kept])
+    assert (scan.n_far, scan.n_dropped) == (48, 0)
+    assert scan.farthest == pytest.approx(2_006, abs=6)
 
 
-def test_a_huge_finite_value_is_refused_with_its_count(tmp_path):
+@pytest.mark.parametrize("away", [300, 5_000, 20_000, 1e30])
+def test_one_stray_return_does_not_cost_a_room(tmp_path, away):
     points = hall(12)
-    points[7] = 1e30
+    points[7] = [away, 0, 0]
+    write_pcd(tmp_path / "room.pcd", points)
+    scan = read_scan(tmp_path / "room.pcd")
+    assert (len(scan.points), scan.n_far) == (23_999, 1)
+    assert scan.farthest == pytest.approx(away, rel=0.03)
+
+
+def test_a_return_at_the_end_of_a_long_hall_is_kept(tmp_path):
+    points = hall(12)
+    points[7] = [240, 0, 0]
+    write_pcd(tmp_path / "room.pcd", points)
+    scan = read_scan(tmp_path / "room.pcd")
+    assert (len(scan.points), scan.n_far, scan.farthest) == (24_000, 0, 0.0)
+
+
+def test_many_points_far_from_the_others_are_refused_for_what_they_are(tmp_path):
+    points = hall(12)
+    points[::30] += [5_000, 0, 0]
     write_pcd(tmp_path / "room.pcd", points)
     with pytest.raises(
-        ScanError, match=r"1 of 24000 points lie over 10000 m from the origin, one at \(1e\+30"
-    ):
+        ScanError, match=r"3.3% of its points lie over 250 m from the others, up to 5.0 km"
+    ) as caught:
         read_scan(tmp_path / "room.pcd")
+    assert not isinstance(caught.value, ScanUnits)
+
+
+def test_the_coordinates_of_a_country_s_grid_are_refused_with_an_offset_that_would_do(tmp_path):
+    head = "ply\nformat ascii 1.0\nelement vertex 400\n" + "".join(f"property double {a}\n" for a in "xyz")
+    rows = "\n".join(f"{450_000 + i % 20:.3f} {5_411_000 + i // 20:.3f} 112.5" for i in range(400))
+    (tmp_path / "utm.ply").write_text(f"{head}end_header\n{rows}\n", encoding="ascii")
+    with pytest.raises(
+        ScanFarAway, match=r"lie 5429.7 km from the origin .* such as \(450000, 5411000, 100\)"
+    ):
+        read_scan(tmp_path / "utm.ply")
 
 
 def test_doubles_beyond_float32_and_map_coordinates_are_refused(tmp_path):
@@ -282,14 +317,15 @@ def test_a_scan_is_the_same_whatever_is_gone_through_at_once(tmp_path, monkeypat
 
 
 @pytest.mark.parametrize("at_once", [3, 1000])
-def test_a_far_point_is_named_wherever_it_lies(tmp_path, monkeypatch, at_once):
+def test_far_points_are_counted_wherever_they_lie(tmp_path, monkeypatch, at_once):
     points = np.random.default_rng(3).uniform(-4, 4, (500, 3)).astype(np.float32)
     points[[400, 450], 0] = 20_000, 30_000
     path = tmp_path / "scan.ply"
     write_ply(path, points)
     monkeypatch.setattr("worker.cloud.formats.scan._AT_ONCE", at_once)
-    with pytest.raises(ScanError, match=r"2 of 500 points lie over 10000 m from the origin, one at \(20000"):
-        read_scan(path)
+    scan = read_scan(path)
+    assert_array_equal(scan.points, np.delete(points, [400, 450], axis=0))
+    assert (scan.n_far, round(scan.farthest / 1000)) == (2, 30)
 
 
 def test_lines_are_found_whatever_block_they_lie_in(tmp_path, monkeypatch):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -396,3 +397,47 @@ def test_a_dismissal_stops_any_stage(drifted: tuple[ScanFile, ...], last: str) -
         register(drifted[:2], progress=dismissed)
     assert told[-1] == last
     assert told.count(last) == 1
+
+
+# true causes
+
+
+def test_a_mirrored_scan_of_a_map_is_refused_as_mirrored(
+    room: Room, drifted: tuple[ScanFile, ...], folder: Path
+) -> None:
+    scan = room.before[1]
+    write_pcd(folder / "mirrored.pcd", (scan.points * [-1, 1, 1]).astype(np.float32))
+    sent = [drifted[0], drifted[2], drifted[3], ScanFile(name="mirrored.pcd", path=folder / "mirrored.pcd")]
+    found = register(sent, joint_settings(QUICK))
+    assert [outcome.registration is not None for outcome in found.outcomes] == [True, True, True, False]
+    diagnosis = found.outcomes[3].diagnosis
+    assert diagnosis is not None
+    assert diagnosis.reason == "mirrored"
+
+
+def test_a_scan_of_a_map_whose_prior_is_kilometres_off_is_told_so(
+    room: Room, drifted: tuple[ScanFile, ...]
+) -> None:
+    away = shifted(5000.0, 0.0) @ room.before[3].world_from_sensor
+    found = register([*drifted[:3], replace(drifted[3], pose=away)])
+    diagnosis = found.outcomes[3].diagnosis
+    assert diagnosis is not None
+    assert diagnosis.reason == "wrong_prior"
+    assert "5.0 km" in diagnosis.detail
+
+
+def test_a_scan_of_a_map_with_y_up_is_turned_and_told(
+    room: Room, drifted: tuple[ScanFile, ...], folder: Path
+) -> None:
+    y_up = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # y, -z become z, y
+    scan = room.before[1]
+    write_pcd(folder / "y-up.pcd", (scan.points @ y_up.T).astype(np.float32))
+    pose = scan.world_from_sensor.copy()
+    pose[:3, :3] = pose[:3, :3] @ y_up.T
+    sent = [drifted[0], drifted[2], ScanFile(name="y-up.pcd", path=folder / "y-up.pcd", pose=pose)]
+    found = register(sent)
+    assert [tuple(warning.reason for warning in outcome.warnings) for outcome in found.outcomes] == [
+        (),
+        (),
+        ("other_up_axis",),
+    ]

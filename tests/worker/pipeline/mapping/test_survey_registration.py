@@ -417,3 +417,24 @@ def test_a_mirrored_scan_is_named_as_one(room: Room, folder: Path, sights: Sight
     (outcome,) = surveyed([ScanFile(name=path.name, path=path)], room, sights).outcomes
     assert outcome.diagnosis is not None
     assert outcome.diagnosis.reason == "mirrored"
+
+
+def test_a_prior_kilometres_outside_the_map_is_blamed_with_the_distance(
+    room: Room, files: tuple[ScanFile, ...], sights: Sights | None
+) -> None:
+    pose = files[0].pose
+    assert pose is not None
+    (outcome,) = surveyed([replace(files[0], pose=shifted(5000.0, 0.0) @ pose)], room, sights).outcomes
+    assert outcome.diagnosis is not None
+    assert outcome.diagnosis.reason == "wrong_prior"
+    assert "5.0 km" in outcome.diagnosis.detail
+    assert outcome.diagnosis.numbers["outside"] == pytest.approx(5000, abs=20)
+
+
+def test_a_scan_of_another_room_with_a_prior_outside_the_map_is_told_of_the_prior(
+    room: Room, strange: ScanFile, sights: Sights | None
+) -> None:
+    (outcome,) = surveyed([replace(strange, pose=shifted(1e8, 0.0))], room, sights).outcomes
+    assert outcome.diagnosis is not None
+    assert outcome.diagnosis.reason == "wrong_prior"
+    assert "outside the map, and it was found nowhere else in the map" in outcome.diagnosis.detail

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import open3d as o3d
 import pytest
 
 from tests.support.tilings import ORIGIN, four_states, in_tile
+from tests.support.tools import TESTS, needs_tools, run
 from worker.cloud.formats.scan import read_scan
 from worker.cloud.voxels import Voxels
 from worker.detectors.detector import VoxelScores
@@ -54,7 +56,9 @@ def test_no_two_states_share_a_colour() -> None:
 
 def test_open3d_reads_state_and_score_of_each_point(written: Path) -> None:
     cloud = o3d.t.io.read_point_cloud(written)
-    state, score = (cloud.point[name].numpy().ravel() for name in ("tile_state", "change_score"))
+    state, score = (
+        cloud.point[name].numpy().ravel() for name in ("scalar_tile_state", "scalar_change_score")
+    )
     assert state.tolist() == [0, 1, 1, 2, 2, 2, 3, 3, 3, 3, NOT_IN_A_TILE, NOT_IN_A_TILE]
     assert score[:6].tolist() == [0.25, 0.75, 0.75, 0.875, 0.875, 0.875]
     assert np.isnan(score[6:]).all()
@@ -81,7 +85,7 @@ def test_in_a_map_that_grew_below_its_origin_points_have_the_colours_of_their_ow
     )
     cloud = np.concatenate([in_tile(i - 2, 0, 0, 1) for i in range(5)])  # the last one is of no tile
     write_coloured_cloud(tmp_path / "c.ply", cloud, cloud, replace(known, pairs=pairs))
-    state = o3d.t.io.read_point_cloud(tmp_path / "c.ply").point["tile_state"].numpy().ravel()
+    state = o3d.t.io.read_point_cloud(tmp_path / "c.ply").point["scalar_tile_state"].numpy().ravel()
     assert state.tolist() == [0, 1, 2, 3, NOT_IN_A_TILE]
 
 
@@ -128,7 +132,8 @@ def by_voxels(tmp_path: Path) -> Path:
 def test_with_objects_each_point_bears_its_own_kind_score_and_number(by_voxels: Path) -> None:
     cloud = o3d.t.io.read_point_cloud(by_voxels).point
     kind, score, number, state = (
-        cloud[name].numpy().ravel() for name in ("kind", "change_score", "object_id", "tile_state")
+        cloud[f"scalar_{name}"].numpy().ravel()
+        for name in ("kind", "change_score", "object_id", "tile_state")
     )
     lost = PointKind.DISAPPEARED
     assert kind.tolist() == [
@@ -143,6 +148,26 @@ def test_with_objects_each_point_bears_its_own_kind_score_and_number(by_voxels: 
     assert np.isnan(score[1])
     assert state.tolist() == [TileState.UNCHANGED] * 5
     assert (kind.dtype, number.dtype) == (np.uint8, np.int32)
+
+
+def test_the_header_tells_what_the_numbers_mean(written: Path, by_voxels: Path) -> None:
+    tiles, voxels = (path.read_bytes().split(b"end_header")[0].decode() for path in (written, by_voxels))
+    assert (
+        "comment scalar_tile_state: 0 unchanged, 1 changed, 2 inconsistent, 3 unobserved, 255 outside"
+        in tiles
+    )
+    assert "comment scalar_kind: 0 unchanged, 1 appeared, 2 disappeared, 3 not judged, 4 moving" in voxels
+    for header in (tiles, voxels):
+        told = {line.split()[1].rstrip(":") for line in header.splitlines() if line.startswith("comment s")}
+        kept = {line.split()[2] for line in header.splitlines() if line.startswith("property")}
+        assert told == {name for name in kept if name.startswith("scalar_")}
+
+
+@needs_tools
+@pytest.mark.slow
+def test_meshlab_reads_the_score_of_each_point(by_voxels: Path) -> None:
+    seen = json.loads(run("python", TESTS / "read_cloud.py", by_voxels))
+    assert seen == {"points": 5, "quality": [0.0, None, 0.75, 0.25, 0.875]}
 
 
 def test_with_objects_the_points_that_the_map_lost_are_in_the_cloud(by_voxels: Path) -> None:
