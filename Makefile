@@ -6,7 +6,7 @@ INSTALLED := $(VENV)/.installed
 SERVERS := build/servers
 TOOLS := build/tools
 
-.PHONY: help servers tools demo up test test-fast acceptance-shared check format bench chaos fuzz load soak openapi client clean
+.PHONY: help servers tools demo up test test-fast acceptance-shared check format bench chaos fuzz schemathesis load soak openapi client clean
 help: ## this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
 
@@ -50,6 +50,9 @@ chaos: $(INSTALLED) ## 1,000 kills and 100 freezes while surveys run: an hour, 9
 fuzz: $(INSTALLED) ## a million mutated scans to the readers, 100,000 requests to the API: about 20 minutes, 40 at most
 	$(BIN)/python -m tests.breaking.fuzz_readers --files 1000000 --minutes 25
 	$(BIN)/python -m tests.breaking.fuzz_api --cases 100000 --minutes 15
+
+schemathesis: $(INSTALLED) $(TOOLS)/.installed ## hold a running API against its OpenAPI document: about 15 minutes
+	$(BIN)/python -m tests.breaking.contract --minutes 10
 
 load: $(INSTALLED) ## 20 robots at 200 kB/s, 50 surveys, 5 dashboards against a service of its own
 	$(BIN)/python -m tests.breaking.load

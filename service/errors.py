@@ -6,6 +6,9 @@ ServiceError
 ├── Conflict             conflict             the id is taken, the scan is in use
 ├── BadRequest           bad_request          a value that the schema admits and the service does not
 ├── ScanUnreadable       scan_unreadable      an uploaded file that is neither PLY nor PCD
+├── KeyMalformed         idempotency_key_malformed   an Idempotency-Key that is none
+├── KeyReused            idempotency_key_reused      it came with another request before
+├── KeyInUse             idempotency_key_in_use      the request under it is being carried out
 ├── TooLarge             too_large            a body over the limit
 ├── TooSlow              too_slow             a body that takes too long
 ├── WrongMediaType       wrong_media_type     neither a scan nor JSON
@@ -56,6 +59,19 @@ class BadRequest(ServiceError):
 
 class ScanUnreadable(ServiceError):
     code = "scan_unreadable"
+
+
+class KeyMalformed(ServiceError):
+    code = "idempotency_key_malformed"
+
+
+class KeyReused(ServiceError):
+    code = "idempotency_key_reused"
+
+
+class KeyInUse(ServiceError):
+    code = "idempotency_key_in_use"
+    retry_after_s = 2  #: seconds that the API asks a client to wait
 
 
 class TooLarge(ServiceError):

@@ -98,6 +98,9 @@ class Settings(BaseSettings):
     keep_surveys_days: float = Field(
         0, ge=0, description="days that surveys are kept which no version of a map took over; 0: for ever"
     )
+    keep_idempotency_keys_hours: float = Field(
+        24, ge=24, description="hours that an `Idempotency-Key` is kept with the answer to its request"
+    )
     log_level: Literal["debug", "info", "warning", "error"] = Field("info", description="of every process")
     log_format: Literal["text", "json"] = Field(
         "text", description="lines for people, or a JSON object a line"

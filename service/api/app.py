@@ -17,12 +17,13 @@ from starlette.types import ASGIApp
 
 from service.api import changes, health, jobs, maps, models, objects, scans, surveys, tiles, versions
 from service.api.housekeeping import housekeeping
-from service.api.http import problems
+from service.api.http import idempotency, problems
 from service.api.http.access import authorize, secured
 from service.api.http.bodies import INCOMING
 from service.api.http.cards import Cards
 from service.api.http.cross_site import add_cross_site_checks
 from service.api.http.dependencies import Queue, Services
+from service.api.http.description import mended, operation_id
 from service.api.http.docs_pages import add_pages
 from service.api.http.known_query import refuse_unknown
 from service.api.http.lanes import UPLOAD_TURN_S, Lane
@@ -95,7 +96,7 @@ class Api(FastAPI):
             for replaced in ("HTTPValidationError", "ValidationError"):  # by problems
                 schemas.pop(replaced, None)
             secured(document, problems.documented("unauthorized", "forbidden"))
-            self.openapi_schema = document
+            self.openapi_schema = mended(document)
         return self.openapi_schema
 
 
@@ -109,6 +110,7 @@ def create_app(settings: Settings, *, queue: Queue | None = None) -> FastAPI:
         lifespan=_lifespan(settings, queue),
         docs_url=None,
         redoc_url=None,
+        generate_unique_id_function=operation_id,
         redirect_slashes=False,  # it would be asked before any key and host, and name a host of the client's choice
         dependencies=[Depends(authorize), Depends(refuse_unknown)],
     )
@@ -116,6 +118,7 @@ def create_app(settings: Settings, *, queue: Queue | None = None) -> FastAPI:
     add_cross_site_checks(app, settings)
     app.add_middleware(MetricsMiddleware, metrics=app.state.metrics)
     problems.add_handlers(app)
+    idempotency.add_handler(app)
     add_pages(app)
     for part in (scans, maps, versions, surveys, tiles, changes, objects, jobs, models, health):
         app.include_router(part.router, responses=None if part is health else problems.OUTAGES)

@@ -68,7 +68,7 @@ def _ask_workers(queue: Queue) -> None:
 
 
 @router.get("/health/live", summary="Is the process alive")
-async def live() -> Live:
+async def get_liveness() -> Live:
     """Always, while it answers at all."""
     return Live()
 
@@ -79,7 +79,7 @@ async def live() -> Live:
     response_model=Ready,
     responses=documented("unhealthy"),
 )
-async def ready(request: Request) -> Ready | Response:
+async def get_readiness(request: Request) -> Ready | Response:
     """What the database, the queue and the blob store said when they were asked last, some seconds ago at most.
 
     `reasons` says of each part that failed why. Never waits for one of them. Workers that do not answer make it
@@ -98,7 +98,7 @@ async def ready(request: Request) -> Ready | Response:
 
 
 @router.get("/metrics", summary="Metrics for Prometheus", response_class=Response)
-def metrics(request: Request, services: Provided) -> Response:
+def get_metrics(request: Request, services: Provided) -> Response:
     """Requests by route, and what the catalog, the disk and the queue tell."""
     counted: Metrics = request.app.state.metrics
     text = counted.text(services.catalog, services.settings.data_dir, services.queue.snapshot)

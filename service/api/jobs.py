@@ -12,10 +12,12 @@ from service.api.http.access import maps_of_key
 from service.api.http.dependencies import Provided, Services
 from service.api.http.documents import Document, Link, link
 from service.api.http.fields import Id
+from service.api.http.idempotency import KEYED, Keyed
 from service.api.http.paging import PageRequest, list_links
 from service.api.http.problems import LISTED, NAMED, JobProblem, documented
-from service.api.http.submission import dismiss, run_again
+from service.api.http.submission import accepted, dismiss, run_again
 from service.api.models import model_path
+from service.catalog.idempotency import Answer
 from service.catalog.records import JobRecord, JobStatus
 from service.catalog.steps import JobKind
 from service.catalog.tables import now
@@ -100,15 +102,22 @@ async def dismiss_job(request: Request, services: Provided, job_id: JobId) -> Jo
     status_code=202,
     summary="Run a failed job again",
     responses=documented(
-        "not_found", "conflict", "invalid_request", "disk_full", "queue_unavailable", "queue_full"
+        "not_found", "conflict", "invalid_request", "disk_full", "queue_unavailable", "queue_full", *KEYED
     ),
 )
-async def retry_job(request: Request, response: Response, services: Provided, job_id: JobId) -> JobDocument:
+async def retry_job(
+    request: Request, response: Response, services: Provided, job_id: JobId, keyed: Keyed
+) -> JobDocument:
     """Goes on with the step that it failed in, once what was wrong is mended: a full disk, a setting, a worker.
 
-    A job that waits or runs is left as it is, so that a retry may be sent twice.
+    A job that waits or runs is left as it is, so that a retry may be sent twice; under an Idempotency-Key also once the
+    job has failed again.
     """
-    job = await services.writes.run(run_again, services, job_id)
+
+    def accept(job: JobRecord) -> Answer:
+        return accepted(request, job_document(job, request), job)
+
+    job = await services.writes.run(run_again, services, job_id, keyed.once(None, accept))
     response.headers["Location"] = link(request, f"/jobs/{job_id}", "monitor").href
     return job_document(job, request)
 

@@ -16,10 +16,12 @@ from service.api.http.dependencies import Provided, Services
 from service.api.http.documents import Document, Link, Request, checked, link
 from service.api.http.fields import Id, Model, Text, from_text
 from service.api.http.files import blob_response
+from service.api.http.idempotency import KEYED, Keyed
 from service.api.http.paging import PageRequest, list_links
 from service.api.http.problems import BODY, LISTED, MADE, NAMED, JobProblem, documented
 from service.api.http.submission import (
     ScansRequest,
+    accepted,
     admit,
     delete,
     kept_scans,
@@ -29,6 +31,7 @@ from service.api.http.submission import (
     submit,
 )
 from service.catalog import blob_keys
+from service.catalog.idempotency import Answer, Once
 from service.catalog.records import Anchor, Built, JobRecord, MapRecord, MapStatus, MapSummary
 
 router = APIRouter(tags=["maps"])
@@ -167,19 +170,27 @@ class MapList(Document):
     status_code=202,
     summary="Build a map",
     responses=documented(
-        *BODY, "not_found", "conflict", "scan_unreadable", "queue_unavailable", "queue_full"
+        *BODY, "not_found", "conflict", "scan_unreadable", "queue_unavailable", "queue_full", *KEYED
     ),
     openapi_extra=bodies.documented(json=MapRequest, form=MapRequest, file="scans"),
 )
-async def create_map(request: HttpRequest, response: Response, services: Provided) -> AcceptedMap:
+async def create_map(
+    request: HttpRequest, response: Response, services: Provided, keyed: Keyed
+) -> AcceptedMap:
     """From scans uploaded before (`scan_ids`) or sent here (`scans`); their poses, where given, set the frame of the map."""
-    await run_in_threadpool(admit, services)
+
+    def accept(record: MapRecord, job: JobRecord) -> Answer:
+        return accepted(request, _accepted(request, record, job), job)
+
+    if not keyed.seen:
+        await run_in_threadpool(admit, services)
     async with bodies.received(request, services) as body:
         wanted = checked(MapRequest, body.fields)
         require_map(request, wanted.id)
-        record, job = await lane(services, body).run(_create, services, wanted, body)
-    links = [link(request, f"/maps/{record.map_id}", "self"), monitor(request, response, job)]
-    return AcceptedMap(map_id=record.map_id, job_id=job.job_id, status=record.status, links=links)
+        once = keyed.once(body, accept)
+        record, job = await lane(services, body).run(_create, services, wanted, body, once)
+    response.headers["Location"] = monitor(request, job).href
+    return _accepted(request, record, job)
 
 
 @router.get("/maps", summary="List maps", responses=LISTED)
@@ -250,19 +261,27 @@ async def delete_anchor(services: Provided, map_id: MapId) -> None:
     await services.writes.run(services.catalog.maps.set_anchor, map_id, None)
 
 
-def _create(services: Services, wanted: MapRequest, body: Body) -> tuple[MapRecord, JobRecord]:
+def _accepted(request: HttpRequest, record: MapRecord, job: JobRecord) -> AcceptedMap:
+    links = [link(request, f"/maps/{record.map_id}", "self"), monitor(request, job)]
+    return AcceptedMap(map_id=record.map_id, job_id=job.job_id, status=record.status, links=links)
+
+
+def _create(services: Services, wanted: MapRequest, body: Body, once: Once) -> tuple[MapRecord, JobRecord]:
+    once.look()
     catalog = services.catalog
     model = services.cards.check_released(wanted.model or services.settings.model)
     with kept_scans(catalog, body, wanted) as scan_ids:
         record, job = catalog.maps.create(
             scan_ids=scan_ids,
+            poses=wanted.poses,
             model=model,
             map_id=wanted.id,
             name=wanted.name,
             settings=wanted.settings.model_dump(mode="json", exclude_none=True),
             anchor=wanted.anchor,
+            once=once,
         )
-        submit(services, job, forget=lambda: catalog.maps.delete(record.map_id))
+        submit(services, job, forget=lambda: catalog.maps.delete(record.map_id), once=once)
     return record, job
 
 

@@ -14,8 +14,10 @@ from service.api.http.access import maps_of_key
 from service.api.http.dependencies import Provided, Services
 from service.api.http.documents import Document, Link, Request, checked, link
 from service.api.http.fields import Id, Model
+from service.api.http.idempotency import KEYED, Keyed
 from service.api.http.problems import BODY, documented
-from service.api.http.submission import admit, monitor, submit
+from service.api.http.submission import accepted, admit, monitor, submit
+from service.catalog.idempotency import Answer, Once
 from service.catalog.models import name_for
 from service.catalog.records import JobRecord, ModelRecord, ModelStatus
 from service.errors import BadRequest, Conflict
@@ -75,28 +77,31 @@ class AcceptedModel(Document):
     "/maps/{map_id}/models",
     status_code=202,
     summary="Train a model on a map",
-    responses=documented(*BODY, "not_found", "not_ready", "conflict", "queue_unavailable", "queue_full"),
+    responses=documented(
+        *BODY, "not_found", "not_ready", "conflict", "queue_unavailable", "queue_full", *KEYED
+    ),
     openapi_extra=bodies.documented(json=TrainingRequest),
 )
 async def train_model(
-    request: HttpRequest, response: Response, services: Provided, map_id: Annotated[Id, Path()]
+    request: HttpRequest,
+    response: Response,
+    services: Provided,
+    map_id: Annotated[Id, Path()],
+    keyed: Keyed,
 ) -> AcceptedModel:
     """From nothing, or from a model that is there (`base`); the changes to learn from are made, no label is needed.
 
     Its threshold is chosen on a part of the map that was kept out of training. Surveys then name the model.
     """
+
+    def accept(record: ModelRecord, job: JobRecord) -> Answer:
+        return accepted(request, _accepted(request, record, job), job)
+
     async with bodies.received(request, services, takes=(bodies.JSON,)) as body:
-        wanted = checked(TrainingRequest, body.fields)
-    record, job = await services.writes.run(_create, services, map_id, wanted, maps_of_key(request))
-    return AcceptedModel(
-        model=record.model,
-        map_id=map_id,
-        map_version=record.map_version,
-        minutes=record.minutes,
-        job_id=job.job_id,
-        status=record.status,
-        links=[link(request, model_path(record.model), "self"), monitor(request, response, job)],
-    )
+        wanted, once = checked(TrainingRequest, body.fields), keyed.once(body, accept)
+    record, job = await services.writes.run(_create, services, map_id, wanted, maps_of_key(request), once)
+    response.headers["Location"] = monitor(request, job).href
+    return _accepted(request, record, job)
 
 
 @router.get("/models", summary="List models")
@@ -123,9 +128,22 @@ def get_model(
     return services.cards.of(name, asked.version, maps_of_key(request))
 
 
+def _accepted(request: HttpRequest, record: ModelRecord, job: JobRecord) -> AcceptedModel:
+    return AcceptedModel(
+        model=record.model,
+        map_id=record.map_id,
+        map_version=record.map_version,
+        minutes=record.minutes,
+        job_id=job.job_id,
+        status=record.status,
+        links=[link(request, model_path(record.model), "self"), monitor(request, job)],
+    )
+
+
 def _create(
-    services: Services, map_id: str, wanted: TrainingRequest, maps: Collection[str] | None
+    services: Services, map_id: str, wanted: TrainingRequest, maps: Collection[str] | None, once: Once
 ) -> tuple[ModelRecord, JobRecord]:
+    once.look()
     catalog, most = services.catalog, services.settings.most_training_minutes()
     minutes = min(services.settings.training_minutes, most) if wanted.minutes is None else wanted.minutes
     if minutes > most:
@@ -141,8 +159,9 @@ def _create(
         base=None if wanted.base is None else services.cards.check(wanted.base, maps),
         minutes=minutes,
         epochs=wanted.epochs,
+        once=once,
     )
-    submit(services, job, forget=lambda: catalog.models.take_back(job.job_id))
+    submit(services, job, forget=lambda: catalog.models.take_back(job.job_id), once=once)
     return record, job
 
 

@@ -14,10 +14,12 @@ from service.api.http.bodies import Body
 from service.api.http.dependencies import Provided
 from service.api.http.documents import Document, Link, Request, checked
 from service.api.http.fields import DeviceId, Id, Instant, Pose, Text
+from service.api.http.idempotency import KEYED, Keyed, answered
 from service.api.http.paging import PageRequest, list_links
 from service.api.http.problems import BODY, LISTED, NAMED, documented
 from service.api.http.submission import delete, lane
 from service.catalog.catalog import Catalog
+from service.catalog.idempotency import ANY_TIMES, Answer, Once
 from service.catalog.records import ScanRecord
 from service.errors import BadRequest
 
@@ -65,7 +67,7 @@ class ScanList(Document):
     summary="Upload a scan",
     responses={
         200: {"model": ScanDocument, "description": "The same bytes from the same device were here already"},
-        **documented(*BODY, "conflict", "scan_unreadable"),
+        **documented(*BODY, "conflict", "scan_unreadable", *KEYED),
     },
     openapi_extra=bodies.documented(raw=True, form=ScanRequest, file="file"),
 )
@@ -74,13 +76,20 @@ async def upload_scan(
     response: Response,
     services: Provided,
     asked: Annotated[ScanQuery, Query()],
+    keyed: Keyed,
 ) -> ScanDocument:
     """One PLY or PCD, as the raw body or as the field `file` of a form; it is read later, by the job that uses it.
 
     What is said of the scan stands in the query, or in the form, which wins. The same bytes from the same device
-    are one scan: sent again with another `pose` or `captured_at`, it is corrected while no map or survey rests on it,
-    and refused (409) once one does.
+    are one scan: sent again with another `pose` or `captured_at`, these are kept from then on, as the answer shows.
+    Maps and surveys that were asked for before stay with what they were asked for with, and a request for one may name
+    a pose of its own (`scans`).
     """
+
+    def accept(record: ScanRecord, is_new: bool) -> Answer:
+        location = f"{request.scope.get('root_path', '')}/scans/{record.scan_id}"
+        return answered(ScanDocument.of_row(record), status=201 if is_new else 200, location=location)
+
     query = asked.model_dump(exclude_none=True)
     checked(ScanRequest, query, place="query")  # before a long upload
     async with bodies.received(
@@ -91,9 +100,11 @@ async def upload_scan(
         filename=asked.filename,
     ) as body:
         wanted = checked(ScanRequest, {**query, **body.fields})
-        record, is_new = await lane(services, body).run(_keep, services.catalog, body, wanted)
-    response.status_code = 201 if is_new else 200
-    response.headers["Location"] = f"{request.scope.get('root_path', '')}/scans/{record.scan_id}"
+        once = keyed.once(body, accept)
+        record, is_new = await lane(services, body).run(_keep, services.catalog, body, wanted, once)
+    answer = accept(record, is_new)
+    response.status_code = answer.status
+    response.headers.update(answer.headers)
     return ScanDocument.of_row(record)
 
 
@@ -122,7 +133,11 @@ async def delete_scan(services: Provided, scan_id: Annotated[Id, Path()]) -> Non
     await delete(services, services.catalog.scans.delete, scan_id)
 
 
-def _keep(catalog: Catalog, body: Body, wanted: ScanRequest) -> tuple[ScanRecord, bool]:
+def _keep(
+    catalog: Catalog, body: Body, wanted: ScanRequest, once: Once = ANY_TIMES
+) -> tuple[ScanRecord, bool]:
+    """Keep one scan. The answer is kept after it: cut off in between, the same bytes are the same scan."""
+    once.look()
     if len(body.uploads) != 1:
         raise BadRequest(f"{len(body.uploads)} files in the form; send one, in the field 'file'")
     upload = body.uploads[0]
@@ -134,4 +149,5 @@ def _keep(catalog: Catalog, body: Body, wanted: ScanRequest) -> tuple[ScanRecord
     )
     if not is_new:
         record = catalog.scans.correct(record.scan_id, captured_at=wanted.captured_at, pose=wanted.pose)
+    once.note(record, is_new)
     return record, is_new

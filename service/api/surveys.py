@@ -18,10 +18,12 @@ from service.api.http.dependencies import Provided, Services
 from service.api.http.documents import Document, Link, checked, link
 from service.api.http.fields import DeviceId, Id, Instant, Model
 from service.api.http.files import blob_response
+from service.api.http.idempotency import KEYED, Keyed
 from service.api.http.paging import PageRequest, list_links
 from service.api.http.problems import BODY, MADE, NAMED, JobProblem, documented
 from service.api.http.submission import (
     ScansRequest,
+    accepted,
     admit,
     delete,
     kept_scans,
@@ -31,6 +33,7 @@ from service.api.http.submission import (
     submit,
 )
 from service.catalog import blob_keys
+from service.catalog.idempotency import Answer, Once
 from service.catalog.records import JobRecord, MapRecord, SurveyRecord, SurveyStatus, SurveySummary
 
 router = APIRouter(tags=["surveys"])
@@ -85,28 +88,28 @@ class SurveyList(Document):
     status_code=202,
     summary="Compare a visit with a map",
     responses=documented(
-        *BODY, "not_found", "not_ready", "scan_unreadable", "queue_unavailable", "queue_full"
+        *BODY, "not_found", "not_ready", "scan_unreadable", "queue_unavailable", "queue_full", *KEYED
     ),
     openapi_extra=bodies.documented(json=SurveyRequest, form=SurveyRequest, file="scans"),
 )
 async def create_survey(
-    request: HttpRequest, response: Response, services: Provided, map_id: MapId
+    request: HttpRequest, response: Response, services: Provided, map_id: MapId, keyed: Keyed
 ) -> AcceptedSurvey:
     """Of scans uploaded before (`scan_ids`) or sent here (`scans`), with the version of the map that is in use now."""
+
+    def accept(record: SurveyRecord, job: JobRecord) -> Answer:
+        return accepted(request, _accepted(request, record, job), job)
+
     reference = await run_in_threadpool(services.catalog.maps.ready, map_id)  # before a long upload
-    await run_in_threadpool(admit, services)
+    if not keyed.seen:
+        await run_in_threadpool(admit, services)
     async with bodies.received(request, services) as body:
-        wanted = checked(SurveyRequest, body.fields)
+        wanted, once = checked(SurveyRequest, body.fields), keyed.once(body, accept)
         record, job = await lane(services, body).run(
-            _create, services, reference, wanted, body, maps_of_key(request), request.state.key
+            _create, services, reference, wanted, body, maps_of_key(request), request.state.key, once
         )
-    return AcceptedSurvey(
-        survey_id=record.survey_id,
-        map_id=map_id,
-        job_id=job.job_id,
-        status=record.status,
-        links=[link(request, f"/surveys/{record.survey_id}", "self"), monitor(request, response, job)],
-    )
+    response.headers["Location"] = monitor(request, job).href
+    return _accepted(request, record, job)
 
 
 @router.get(
@@ -182,6 +185,16 @@ def _refused(survey: SurveySummary) -> bool:
     return survey.status == "failed" and placement is not None and placement.state == "refused"
 
 
+def _accepted(request: HttpRequest, record: SurveyRecord, job: JobRecord) -> AcceptedSurvey:
+    return AcceptedSurvey(
+        survey_id=record.survey_id,
+        map_id=record.map_id,
+        job_id=job.job_id,
+        status=record.status,
+        links=[link(request, f"/surveys/{record.survey_id}", "self"), monitor(request, job)],
+    )
+
+
 def _create(
     services: Services,
     reference: MapRecord,
@@ -189,8 +202,10 @@ def _create(
     body: Body,
     maps: Collection[str] | None,
     key: str | None,
+    once: Once,
 ) -> tuple[SurveyRecord, JobRecord]:
     """Record and submit; who takes turns with others is the device, where none is named the key, else the map."""
+    once.look()
     owner = wanted.device_id or key or reference.map_id
     admit(services, owner)
     catalog = services.catalog
@@ -199,13 +214,15 @@ def _create(
         record, job = catalog.surveys.create(
             reference.map_id,
             scan_ids=scan_ids,
+            poses=wanted.poses,
             model=model,
             threshold=wanted.threshold,
             device_id=wanted.device_id,
             captured_at=wanted.captured_at,
             owner=owner,
+            once=once,
         )
-        submit(services, job, forget=lambda: catalog.surveys.delete(record.survey_id))
+        submit(services, job, forget=lambda: catalog.surveys.delete(record.survey_id), once=once)
     return record, job
 
 

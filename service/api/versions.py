@@ -14,10 +14,21 @@ from service.api.http.bodies import Body
 from service.api.http.dependencies import Provided, Services
 from service.api.http.documents import Document, Link, checked, link
 from service.api.http.fields import Id
+from service.api.http.idempotency import KEYED, Keyed
 from service.api.http.paging import PageRequest, list_links
 from service.api.http.problems import BODY, MADE, NAMED, JobProblem, documented
-from service.api.http.submission import ScansRequest, admit, delete, kept_scans, lane, monitor, submit
+from service.api.http.submission import (
+    ScansRequest,
+    accepted,
+    admit,
+    delete,
+    kept_scans,
+    lane,
+    monitor,
+    submit,
+)
 from service.api.maps import BuiltDocument, MapId, cloud_response, file_links, manifest_response
+from service.catalog.idempotency import Answer, Once
 from service.catalog.records import JobRecord, MapStatus, VersionRecord, VersionSummary
 
 router = APIRouter(tags=["versions"])
@@ -67,31 +78,37 @@ class VersionList(Document):
     status_code=202,
     summary="Build a new version of a map",
     responses=documented(
-        *BODY, "not_found", "not_ready", "conflict", "scan_unreadable", "queue_unavailable", "queue_full"
+        *BODY,
+        "not_found",
+        "not_ready",
+        "conflict",
+        "scan_unreadable",
+        "queue_unavailable",
+        "queue_full",
+        *KEYED,
     ),
     openapi_extra=bodies.documented(json=VersionRequest, form=VersionRequest, file="scans"),
 )
 async def create_version(
-    request: HttpRequest, response: Response, services: Provided, map_id: MapId
+    request: HttpRequest, response: Response, services: Provided, map_id: MapId, keyed: Keyed
 ) -> AcceptedVersion:
     """From the version in use and further scans (`scan_ids`, or files in `scans`), or an accepted survey (`survey_id`).
 
     Of a survey the tiles that it found changed are taken over; one whose placement is in doubt is a conflict. The frame
     and the ids of tiles stay. The version in use stays in use until the new one is ready; one version builds at a time.
     """
+
+    def accept(record: VersionRecord, job: JobRecord) -> Answer:
+        return accepted(request, _accepted(request, record, job), job)
+
     await run_in_threadpool(services.catalog.maps.ready, map_id)  # before a long upload
-    await run_in_threadpool(admit, services)
+    if not keyed.seen:
+        await run_in_threadpool(admit, services)
     async with bodies.received(request, services) as body:
-        wanted = checked(VersionRequest, body.fields)
-        record, job = await lane(services, body).run(_create, services, map_id, wanted, body)
-    here = link(request, f"/maps/{map_id}/versions/{record.version}", "self")
-    return AcceptedVersion(
-        map_id=map_id,
-        version=record.version,
-        job_id=job.job_id,
-        status=record.status,
-        links=[here, monitor(request, response, job), link(request, f"/maps/{map_id}", "map")],
-    )
+        wanted, once = checked(VersionRequest, body.fields), keyed.once(body, accept)
+        record, job = await lane(services, body).run(_create, services, map_id, wanted, body, once)
+    response.headers["Location"] = monitor(request, job).href
+    return _accepted(request, record, job)
 
 
 @router.get(
@@ -153,13 +170,28 @@ async def get_version_cloud(services: Provided, map_id: MapId, number: Number) -
     return await cloud_response(services, version.job_id, f"{map_id}-{number}.ply")
 
 
+def _accepted(request: HttpRequest, record: VersionRecord, job: JobRecord) -> AcceptedVersion:
+    map_path = f"/maps/{record.map_id}"
+    here = link(request, f"{map_path}/versions/{record.version}", "self")
+    return AcceptedVersion(
+        map_id=record.map_id,
+        version=record.version,
+        job_id=job.job_id,
+        status=record.status,
+        links=[here, monitor(request, job), link(request, map_path, "map")],
+    )
+
+
 def _create(
-    services: Services, map_id: str, wanted: VersionRequest, body: Body
+    services: Services, map_id: str, wanted: VersionRequest, body: Body, once: Once
 ) -> tuple[VersionRecord, JobRecord]:
+    once.look()
     catalog = services.catalog
     with kept_scans(catalog, body, wanted) as scan_ids:
-        record, job = catalog.versions.create(map_id, scan_ids=scan_ids, survey_id=wanted.survey_id)
-        submit(services, job, forget=lambda: catalog.versions.take_back(job.job_id))
+        record, job = catalog.versions.create(
+            map_id, scan_ids=scan_ids, poses=wanted.poses, survey_id=wanted.survey_id, once=once
+        )
+        submit(services, job, forget=lambda: catalog.versions.take_back(job.job_id), once=once)
     return record, job
 
 

@@ -22,6 +22,7 @@ from sqlalchemy.orm import Session
 
 from service.catalog import history, tables, tallies
 from service.catalog.database import Database
+from service.catalog.idempotency import ANY_TIMES, Once
 from service.catalog.records import JobRecord, JobStatus, Page, Position, Problem
 from service.catalog.steps import STEPS, JobKind, Step, first_step, step_after, step_of
 from service.catalog.steps import Queue as QueueName
@@ -229,17 +230,20 @@ class Jobs:
             raise Conflict(f"job {job_id!r} is already {job.status}; delete its map or survey instead")
         return job
 
-    def run_again(self, job_id: str) -> JobRecord:
+    def run_again(self, job_id: str, *, once: Once = ANY_TIMES) -> JobRecord:
         """Have a failed job go on with the step that it failed in; one that has not ended is left as it is.
 
-        Raises NotFound, and Conflict for a job that ended otherwise, whose map, survey or model is gone, or beside which
+        Raises what `once` does, NotFound, and Conflict for a job that ended otherwise, whose map, survey or model is gone, or beside which
         another version of the map is being built.
         """
         with self._database.write() as session:
+            once.claim(session)
             job = _row(session, job_id)
             session.get(tables.Map, job.map_id, with_for_update=True)
             if job.status in ("accepted", "running"):
-                return JobRecord.of_row(job)
+                record = JobRecord.of_row(job)
+                once.keep(session, record)
+                return record
             subject = _subject(session, job)
             if job.status != "failed" or subject is None:
                 raise Conflict(f"job {job_id!r} is {job.status}; only one that failed can be run again")
@@ -251,7 +255,9 @@ class Jobs:
             job.due, job.begun, job.updated = instant, None, instant
             subject.status, subject.updated = _UNDER_WAY[cast("JobKind", job.kind)], instant
             session.flush()
-            return JobRecord.of_row(job)
+            record = JobRecord.of_row(job)
+            once.keep(session, record)
+            return record
 
     def lose_attempt(self, job_id: str, step: str, reason: str, *, begun: datetime | None = None) -> bool:
         """Count an attempt that ended without a result, by its own fault; `reason` is the first half of a sentence.

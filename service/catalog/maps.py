@@ -11,6 +11,7 @@ from sqlalchemy.exc import IntegrityError
 from service.catalog import blob_keys, tables
 from service.catalog.blobs import Blobs
 from service.catalog.database import Database
+from service.catalog.idempotency import ANY_TIMES, Once
 from service.catalog.jobs import new_job
 from service.catalog.records import (
     Anchor,
@@ -19,11 +20,11 @@ from service.catalog.records import (
     JobRecord,
     MapRecord,
     MapSummary,
+    Matrix,
     Page,
     Position,
-    ScanOutcome,
 )
-from service.catalog.scans import checked_scan_ids, scans_in_order
+from service.catalog.scans import NO_POSES, checked_scan_ids, new_uses, scans_in_order
 from service.catalog.tables import new_id, now
 from service.catalog.versions import (
     check_ready,
@@ -47,15 +48,17 @@ class Maps:
         self,
         *,
         scan_ids: Sequence[str],
+        poses: Mapping[str, Matrix] = NO_POSES,
         model: str,
         map_id: str | None = None,
         name: str | None = None,
         settings: Mapping[str, Any] | None = None,
         anchor: Anchor | None = None,
+        once: Once = ANY_TIMES,
     ) -> tuple[MapRecord, JobRecord]:
-        """Record a map, its version 1 and the job of that together.
+        """Record a map, its version 1 and the job of that together; `poses` of scans, by id, count for this map alone.
 
-        Raises NotFound (a scan), Conflict (the id), BadRequest (the scans).
+        Raises NotFound (a scan), Conflict (the id), BadRequest (the scans), and what `once` does.
         """
         scan_ids = checked_scan_ids(scan_ids)
         map_id = map_id or new_id("map")
@@ -72,13 +75,16 @@ class Maps:
         )
         try:
             with self._database.write() as session:
-                scans_in_order(session, scan_ids)
+                once.claim(session)
+                uses = new_uses(scans_in_order(session, scan_ids), poses)
                 session.add(row)
                 session.flush()
-                version = new_version(job, [ScanOutcome(scan_id=scan_id) for scan_id in scan_ids], 1)
+                version = new_version(job, uses, 1)
                 session.add_all([version, job])
                 session.flush()
-                return _record(version), JobRecord.of_row(job)
+                made = _record(version), JobRecord.of_row(job)
+                once.keep(session, *made, job=job)
+                return made
         except IntegrityError as error:
             raise Conflict(f"map {map_id!r} exists; choose another id or delete that map") from error
 

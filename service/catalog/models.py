@@ -12,6 +12,7 @@ from sqlalchemy.orm import Session
 
 from service.catalog import tables
 from service.catalog.database import Database
+from service.catalog.idempotency import ANY_TIMES, Once
 from service.catalog.jobs import new_job
 from service.catalog.records import JobRecord, ModelRecord
 from service.catalog.tables import Model, now
@@ -33,14 +34,16 @@ class Models:
         name: str | None = None,
         base: str | None = None,
         epochs: int | None = None,
+        once: Once = ANY_TIMES,
     ) -> tuple[ModelRecord, JobRecord]:
         """Record a model of a map's version in use, and its job; the next number of its name.
 
-        Raises NotFound and NotReady (the map), and Conflict where the same name is taken at this moment.
+        Raises NotFound and NotReady (the map), Conflict where the same name is taken at this moment, and what `once` does.
         """
         name = name or name_for(map_id)
         try:
             with self._database.write() as session:
+                once.claim(session)
                 map_row(session, map_id, lock=True)  # nobody deletes the version meanwhile
                 version = version_in_use(session, map_id)
                 number = _next_number(session, name)
@@ -60,7 +63,9 @@ class Models:
                 )
                 session.add_all([row, job])
                 session.flush()
-                return ModelRecord.of_row(row), JobRecord.of_row(job)
+                made = ModelRecord.of_row(row), JobRecord.of_row(job)
+                once.keep(session, *made, job=job)
+                return made
         except IntegrityError as error:
             raise Conflict(f"another training took the name {name!r} just now; try again") from error
 

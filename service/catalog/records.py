@@ -82,7 +82,12 @@ class Page(Generic[T]):
 class Record(BaseModel):
     """Base of every record: frozen, strict about names, and free of NaN and infinity."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+    model_config = ConfigDict(
+        extra="forbid",
+        frozen=True,
+        allow_inf_nan=False,
+        json_schema_serialization_defaults_required=True,  # documents have every member
+    )
 
     @classmethod
     def of_row(cls, row: object) -> Self:
@@ -149,6 +154,11 @@ class ScanOutcome(Record):
     """
 
     scan_id: str
+    pose: Matrix | None = Field(
+        None,
+        description="map_from_sensor that its registration starts from, row-major: as the request for this map or survey "
+        "gave it, else as the upload had it then; null: none",
+    )
     accepted: bool | None = None
     fitness: float | None = None  #: inlier fraction, 0..1
     rmse: float | None = None  #: metres, over the inliers

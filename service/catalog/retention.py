@@ -15,7 +15,7 @@ from datetime import datetime, timedelta
 from sqlalchemy import ColumnElement, Select, and_, exists, false, or_, select
 from sqlalchemy.orm import Session
 
-from service.catalog import blob_keys, tallies
+from service.catalog import blob_keys, idempotency, tallies
 from service.catalog.catalog import Catalog
 from service.catalog.tables import Job, MapVersion, Model, Scan, Survey, SurveyScan, VersionScan
 from service.errors import Conflict, NotFound
@@ -49,6 +49,7 @@ class Policy:
     scans_before: datetime | None  #: scans that nobody sent since go
     surveys_before: datetime | None  #: surveys that were asked for earlier go
     files_before: datetime  #: files without a row that were written earlier go
+    keys_before: datetime  #: answers under an Idempotency-Key that were given earlier go
 
 
 def policy_of(settings: Settings, at: datetime) -> Policy:
@@ -61,6 +62,7 @@ def policy_of(settings: Settings, at: datetime) -> Policy:
         scans_before=before(settings.keep_scans_days),
         surveys_before=before(settings.keep_surveys_days),
         files_before=at - ABANDONED,
+        keys_before=at - timedelta(hours=settings.keep_idempotency_keys_hours),
     )
 
 
@@ -83,6 +85,7 @@ def remove(catalog: Catalog, policy: Policy, leftovers: Leftovers) -> dict[str, 
     for folder in leftovers.folders:
         catalog.blobs.delete_prefix(folder)
     with catalog.database.write() as session:
+        idempotency.forget(session, policy.keys_before)
         for what, number in swept.items():
             if number:
                 tallies.add(session, tallies.SWEPT.name, {"what": what}, number)

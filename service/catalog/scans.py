@@ -5,13 +5,13 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import logging
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import Any, TypeVar
 from uuid import uuid4
 
-from sqlalchemy import ColumnElement, delete, exists, select, update
+from sqlalchemy import ColumnElement, delete, select, update
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
@@ -46,6 +46,7 @@ OF_THE_FILE: frozenset[ScanReason] = frozenset(
     )
 )
 
+NO_POSES: Mapping[str, Matrix] = {}
 Row = TypeVar("Row", tables.VersionScan, tables.SurveyScan)
 
 
@@ -106,23 +107,12 @@ class Scans:
     ) -> ScanRecord:
         """Change what is said of a scan; what is None stays. Raises NotFound.
 
-        Raises Conflict where it would change under a map or survey that rests on it.
+        Maps and surveys that were asked for before keep the pose and the time that they were asked for with.
         """
         with self._database.write() as session:
             row = _row(session, scan_id, lock=True)
-            known = ScanRecord.of_row(row)
-            new_time = captured_at is not None and captured_at != known.captured_at
-            new_pose = pose is not None and pose != known.pose
-            if not (new_time or new_pose):
-                return known
-            if session.scalar(select(_in_use(scan_id))):
-                what = " and ".join(["pose"] * new_pose + ["captured_at"] * new_time)
-                raise Conflict(
-                    f"scan {scan_id!r} has the same bytes, another {what}, and belongs to a map or survey; delete "
-                    "what rests on it, then the scan, and send it again"
-                )
-            if new_time:
-                others = tuple(one for one in known.warnings if one.reason != "clock")
+            if captured_at is not None and captured_at != row.captured_at:
+                others = tuple(one for one in ScanRecord.of_row(row).warnings if one.reason != "clock")
                 row.captured_at = captured_at
                 row.warnings = as_kept((*clock_warnings(captured_at, received=tables.now()), *others))
             row.pose = row.pose if pose is None else [list(line) for line in pose]
@@ -225,6 +215,14 @@ def scans_in_order(session: Session, scan_ids: Sequence[str]) -> tuple[ScanRecor
     return tuple(known[scan_id] for scan_id in scan_ids)
 
 
+def new_uses(scans: Iterable[ScanRecord], poses: Mapping[str, Matrix]) -> tuple[ScanOutcome, ...]:
+    """Return what a map or survey says of scans that are still to be registered.
+
+    A pose is of this use: that in `poses`, by the id of the scan, else that of the upload as it is now.
+    """
+    return tuple(ScanOutcome(scan_id=scan.scan_id, pose=poses.get(scan.scan_id, scan.pose)) for scan in scans)
+
+
 def outcome_columns(outcome: ScanOutcome) -> dict[str, Any]:
     """Return the columns of an outcome, less its scan."""
     return outcome.model_dump(mode="json", exclude={"scan_id"})
@@ -238,6 +236,8 @@ def known_outcomes(rows: Iterable[Row]) -> list[str]:
 def write_outcomes(session: Session, rows: Iterable[Row], outcomes: Iterable[ScanOutcome]) -> None:
     """Put `outcomes` on the rows of the same scans, and what they tell of the files on the scans.
 
+    The rows keep the pose that they were asked for with.
+
     Raises ValueError for a scan that was not asked for.
     """
     by_scan = {row.scan_id: row for row in rows}
@@ -246,8 +246,9 @@ def write_outcomes(session: Session, rows: Iterable[Row], outcomes: Iterable[Sca
     for outcome in outcomes:
         if outcome.scan_id not in by_scan:
             raise ValueError(f"scan {outcome.scan_id!r} does not belong to this map or survey")
-        told = _with_clock(outcome, files[outcome.scan_id])
-        for name, value in outcome_columns(told).items():
+        columns = outcome_columns(_with_clock(outcome, files[outcome.scan_id]))
+        del columns["pose"]
+        for name, value in columns.items():
             setattr(by_scan[outcome.scan_id], name, value)
 
 
@@ -271,9 +272,3 @@ def _row(session: Session, scan_id: str, *, lock: bool = False) -> tables.Scan:
     if row is None:
         raise NotFound(f"no scan {scan_id!r}; upload it with POST /scans")
     return row
-
-
-def _in_use(scan_id: str) -> ColumnElement[bool]:
-    return exists().where(tables.VersionScan.scan_id == scan_id) | exists().where(
-        tables.SurveyScan.scan_id == scan_id
-    )

@@ -14,9 +14,11 @@ from service.catalog import blob_keys, history, tables, tallies
 from service.catalog.blobs import Blobs
 from service.catalog.clock import clock_warnings
 from service.catalog.database import Database
+from service.catalog.idempotency import ANY_TIMES, Once
 from service.catalog.jobs import new_job
 from service.catalog.records import (
     JobRecord,
+    Matrix,
     ObjectKind,
     ObjectRecord,
     Page,
@@ -29,9 +31,12 @@ from service.catalog.records import (
     TileState,
 )
 from service.catalog.scans import (
+    NO_POSES,
     as_kept,
     checked_scan_ids,
     known_outcomes,
+    new_uses,
+    outcome_columns,
     scans_in_order,
     write_outcomes,
 )
@@ -52,17 +57,25 @@ class Surveys:
         map_id: str,
         *,
         scan_ids: Sequence[str],
+        poses: Mapping[str, Matrix] = NO_POSES,
         model: str,
         threshold: float | None = None,
         device_id: str | None = None,
         captured_at: datetime | None = None,
         owner: str | None = None,
+        once: Once = ANY_TIMES,
     ) -> tuple[SurveyRecord, JobRecord]:
-        """Record a survey and its job together; `owner` takes turns with others, left out it is the device. Raises NotFound, NotReady (the map), BadRequest (the scans)."""
+        """Record a survey and its job together; `owner` takes turns with others, left out it is the device.
+
+        `poses` of scans, by id, count for this survey alone.
+
+        Raises NotFound, NotReady (the map), BadRequest (the scans), and what `once` does.
+        """
         scan_ids = checked_scan_ids(scan_ids)
         survey_id = new_id("survey")
         job = new_job("survey", map_id, survey_id, owner=owner or device_id)
         with self._database.write() as session:
+            once.claim(session)
             map_row(session, map_id, lock=True)  # nobody deletes the version meanwhile
             version = version_in_use(session, map_id)
             scans = scans_in_order(session, scan_ids)
@@ -82,13 +95,18 @@ class Surveys:
                 job_id=job.job_id,
                 created=job.created,
                 updated=job.created,
-                scans=[tables.SurveyScan(scan_id=scan_id, ordinal=n) for n, scan_id in enumerate(scan_ids)],
+                scans=[
+                    tables.SurveyScan(scan_id=use.scan_id, ordinal=n, **outcome_columns(use))
+                    for n, use in enumerate(new_uses(scans, poses))
+                ],
             )
             session.add(row)
             session.flush()
             session.add(job)
             session.flush()
-            return SurveyRecord.of_row(row), JobRecord.of_row(job)
+            made = SurveyRecord.of_row(row), JobRecord.of_row(job)
+            once.keep(session, *made, job=job)
+            return made
 
     def get(self, survey_id: str) -> SurveyRecord:
         """Return one survey. Raises NotFound."""

@@ -74,6 +74,7 @@ class Base(DeclarativeBase):
         dict[str, Any]: JSON(none_as_null=True),
         dict[str, int]: JSON(none_as_null=True),
         dict[str, float]: JSON(none_as_null=True),
+        dict[str, str]: JSON(none_as_null=True),
         list[list[float]]: JSON(none_as_null=True),
         list[list[list[float]]]: JSON(none_as_null=True),
         list[str]: JSON(none_as_null=True),
@@ -107,6 +108,7 @@ class Outcome:
     """The columns that `version_scans` and `survey_scans` share."""
 
     ordinal: Mapped[int]
+    pose: Mapped[list[list[float]] | None]
     accepted: Mapped[bool | None]
     fitness: Mapped[float | None]
     rmse: Mapped[float | None]
@@ -418,6 +420,25 @@ class Key(Base):
     revoked: Mapped[datetime | None]
 
     __table_args__ = (Index("ix_keys_digest", "digest", unique=True),)
+
+
+class IdempotencyKey(Base):
+    """A request under a key that its client chose, and what it was answered."""
+
+    __tablename__ = "idempotency_keys"
+
+    owner: Mapped[str] = mapped_column(primary_key=True)  #: id of the API key; empty: none
+    route: Mapped[str] = mapped_column(primary_key=True)  #: method and template of the path
+    key: Mapped[str] = mapped_column(primary_key=True)
+    fingerprint: Mapped[str]  #: of what was asked
+    status: Mapped[int | None]
+    headers: Mapped[dict[str, str] | None]
+    body: Mapped[dict[str, Any] | None]
+    job_id: Mapped[str | None]  # no foreign key: the answer outlives what it tells of
+    under_way: Mapped[datetime | None]  #: since when, while what it made may still be taken back
+    created: Mapped[datetime]
+
+    __table_args__ = (Index(None, "created"),)
 
 
 class Tally(Base):

@@ -11,10 +11,12 @@ from sqlalchemy.orm import Session, aliased, contains_eager, selectinload, undef
 from service.catalog import blob_keys, tables, tallies
 from service.catalog.blobs import Blobs
 from service.catalog.database import Database
+from service.catalog.idempotency import ANY_TIMES, Once
 from service.catalog.jobs import new_job
 from service.catalog.records import (
     Bounds,
     JobRecord,
+    Matrix,
     Page,
     Position,
     ScanOutcome,
@@ -22,8 +24,10 @@ from service.catalog.records import (
     VersionSummary,
 )
 from service.catalog.scans import (
+    NO_POSES,
     checked_scan_ids,
     known_outcomes,
+    new_uses,
     outcome_columns,
     scans_in_order,
     write_outcomes,
@@ -40,23 +44,32 @@ class Versions:
         self._blobs = blobs
 
     def create(
-        self, map_id: str, *, scan_ids: Sequence[str] = (), survey_id: str | None = None
+        self,
+        map_id: str,
+        *,
+        scan_ids: Sequence[str] = (),
+        poses: Mapping[str, Matrix] = NO_POSES,
+        survey_id: str | None = None,
+        once: Once = ANY_TIMES,
     ) -> tuple[VersionRecord, JobRecord]:
         """Record a version of further scans or of an accepted survey, and its job; the one in use is its base.
 
+        `poses` of further scans, by id, count for this version alone.
+
         Raises NotFound (map, survey, scan), NotReady (map, survey), BadRequest (the scans; both or neither of the two),
-        Conflict (another version builds; the base has taken the survey over).
+        Conflict (another version builds; the base has taken the survey over), and what `once` does.
         """
         if bool(scan_ids) == (survey_id is not None):
             raise BadRequest(
                 "a version is made either of scans (scan_ids or files) or of one survey (survey_id)"
             )
         with self._database.write() as session:
+            once.claim(session)
             map_row(session, map_id, lock=True)
             base = version_in_use(session, map_id)
             number = _next_number(session, map_id)
             if survey_id is None:
-                new = _further_scans(session, scan_ids, base)
+                new = _further_scans(session, scan_ids, poses, base)
             else:
                 new = _survey_scans(session, survey_id, base)
             job = new_job("map", map_id)
@@ -64,7 +77,9 @@ class Versions:
             row.base_version, row.survey_id = base.version, survey_id
             session.add_all([row, job])
             session.flush()
-            return VersionRecord.of_row(row), JobRecord.of_row(job)
+            made = VersionRecord.of_row(row), JobRecord.of_row(job)
+            once.keep(session, *made, job=job)
+            return made
 
     def get(self, map_id: str, number: int) -> VersionRecord:
         """Return one version. Raises NotFound."""
@@ -247,14 +262,16 @@ def _next_number(session: Session, map_id: str) -> int:
     return 1 + (session.scalar(select(func.max(MapVersion.version)).where(of_map)) or 0)
 
 
-def _further_scans(session: Session, scan_ids: Sequence[str], base: MapVersion) -> list[ScanOutcome]:
+def _further_scans(
+    session: Session, scan_ids: Sequence[str], poses: Mapping[str, Matrix], base: MapVersion
+) -> list[ScanOutcome]:
     """Return scans that are still to be registered. Raises NotFound, and BadRequest for one that is in `base`."""
     scan_ids = checked_scan_ids(scan_ids)
-    scans_in_order(session, scan_ids)
+    scans = scans_in_order(session, scan_ids)
     known = _shared(base, scan_ids)
     if known:
         raise BadRequest(f"scan {known} is in version {base.version} of the map; send further ones")
-    return [ScanOutcome(scan_id=scan_id) for scan_id in scan_ids]
+    return list(new_uses(scans, poses))
 
 
 def _survey_scans(session: Session, survey_id: str, base: MapVersion) -> list[ScanOutcome]:

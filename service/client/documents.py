@@ -29,18 +29,18 @@ class AnchorRequest(TypedDict):
 class Bounds(TypedDict):
     """An axis-aligned box in the map frame, metres."""
 
-    max: tuple[float, float, float]
-    min: tuple[float, float, float]
+    max: list[float]
+    min: list[float]
 
 
 class Box(TypedDict):
     """Where a thing stands or stood: an upright box in the map's frame, metres, and what lies in it."""
 
-    center: tuple[float, float, float]
-    footprint: list[tuple[float, float]]
+    center: list[float]
+    footprint: list[list[float]]
     height_over_floor: float | None
     points: int
-    size: tuple[float, float, float]
+    size: list[float]
     tiles: list[str]
     volume: float
     voxels: int
@@ -66,14 +66,14 @@ class Footprint(TypedDict):
     Counter-clockwise and closed (RFC 7946, Section 3.1.6). With `crs=map` it is x, y, z in the map's frame, metres.
     """
 
-    coordinates: tuple[list[tuple[float, float, float]]]
-    type: NotRequired[Literal["Polygon"]]
+    coordinates: list[list[list[float]]]
+    type: Literal["Polygon"]
 
 
 class Interval(TypedDict):
     """From the first sighting to the last."""
 
-    interval: tuple[str, str]
+    interval: list[str]
 
 
 class InvalidValue(TypedDict):
@@ -89,13 +89,13 @@ class Link(TypedDict):
 
     href: str
     rel: str
-    type: NotRequired[str]
+    type: str
 
 
 class Live(TypedDict):
     """The process answers."""
 
-    status: NotRequired[Literal["ok"]]
+    status: Literal["ok"]
 
 
 ScanId: TypeAlias = str
@@ -111,7 +111,7 @@ class ModelList(TypedDict):
 class Move(TypedDict):
     """How a thing was moved: turned about its upright axis, then shifted."""
 
-    translation: tuple[float, float, float]
+    translation: list[float]
     yaw_degrees: float | None
 
 
@@ -119,7 +119,7 @@ class NamedCrs(TypedDict):
     """The frame of the coordinates where that is not WGS 84 (the GeoJSON of 2008, Section 3)."""
 
     properties: CrsName
-    type: NotRequired[Literal["name"]]
+    type: Literal["name"]
 
 
 class ObjectProperties(TypedDict):
@@ -181,8 +181,8 @@ class PlacementRequest(TypedDict):
 class Polygon(TypedDict):
     """The footprint, counter-clockwise and closed."""
 
-    coordinates: tuple[list[tuple[float, float]]]
-    type: NotRequired[Literal["Polygon"]]
+    coordinates: list[list[list[float]]]
+    type: Literal["Polygon"]
 
 
 class Prism(TypedDict):
@@ -190,7 +190,7 @@ class Prism(TypedDict):
 
     base: Polygon
     lower: float
-    type: NotRequired[Literal["Prism"]]
+    type: Literal["Prism"]
     upper: float
 
 
@@ -209,8 +209,8 @@ class Ready(TypedDict):
     """Every part that a request needs answers."""
 
     checks: dict[str, Literal["ok", "failed"]]
-    reasons: NotRequired[dict[str, str]]
-    status: NotRequired[Literal["ok", "degraded"]]
+    reasons: dict[str, str]
+    status: Literal["ok", "degraded"]
 
 
 class RegistrationRequest(TypedDict):
@@ -224,16 +224,23 @@ class RegistrationRequest(TypedDict):
     min_overlap: NotRequired[float | None]
 
 
-PoseItem: TypeAlias = tuple[float, float, float, float]
+PoseItem: TypeAlias = list[float]
 
 
-Candidate: TypeAlias = tuple[float, float, float, float]
+class ScanForm(TypedDict):
+    """What may be said of one scan."""
+
+    captured_at: NotRequired[str]
+    device_id: NotRequired[str]
+    file: bytes
+    filename: NotRequired[str]
+    pose: NotRequired[str]
 
 
-MapFromScanItem: TypeAlias = tuple[float, float, float, float]
+Candidate: TypeAlias = list[float]
 
 
-PoseItem4: TypeAlias = list[float]
+MapFromScanItem: TypeAlias = list[float]
 
 
 class ScanRequest(TypedDict):
@@ -242,14 +249,21 @@ class ScanRequest(TypedDict):
     captured_at: NotRequired[str | None]
     device_id: NotRequired[str | None]
     filename: NotRequired[str | None]
-    pose: NotRequired[list[PoseItem4] | None]
+    pose: NotRequired[list[PoseItem] | None]
+
+
+class ScanUse(TypedDict):
+    """A scan that was uploaded before, with what counts in this map or survey alone."""
+
+    pose: NotRequired[list[PoseItem] | None]
+    scan_id: str
 
 
 class ScanWarning(TypedDict):
     """What is odd about a scan or a survey that was taken."""
 
     detail: str
-    numbers: NotRequired[dict[str, float]]
+    numbers: dict[str, float]
     reason: Literal[
         "unreadable",
         "damaged",
@@ -311,6 +325,17 @@ class SightingProperties(TypedDict):
     z_min: float
 
 
+class SurveyForm(TypedDict):
+    """A visit to compare with a map, of scans that were uploaded before, or come with the request."""
+
+    captured_at: NotRequired[str]
+    device_id: NotRequired[str]
+    model: NotRequired[str]
+    scan_ids: NotRequired[list[ScanId]]
+    scans: NotRequired[list[bytes]]
+    threshold: NotRequired[float]
+
+
 class SurveyRequest(TypedDict):
     """A visit to compare with a map, of scans that were uploaded before, or come with the request."""
 
@@ -318,6 +343,7 @@ class SurveyRequest(TypedDict):
     device_id: NotRequired[str | None]
     model: NotRequired[str | None]
     scan_ids: NotRequired[list[ScanId]]
+    scans: NotRequired[list[ScanUse]]
     threshold: NotRequired[float | None]
 
 
@@ -343,7 +369,7 @@ class SurveySummaryDocument(TypedDict):
     survey_id: str
     threshold: float | None
     updated: str
-    warnings: NotRequired[list[ScanWarning]]
+    warnings: list[ScanWarning]
 
 
 class TileProperties(TypedDict):
@@ -351,7 +377,7 @@ class TileProperties(TypedDict):
 
     appeared: int | None
     captured_at: str
-    center: tuple[float, float, float]
+    center: list[float]
     center_x: float
     center_y: float
     device_id: str | None
@@ -368,13 +394,13 @@ class TileProperties(TypedDict):
     p_changed: float | None
     p_different: float | None
     p_unchanged: float | None
-    probabilities: tuple[float, float, float] | None
+    probabilities: list[float] | None
     score: float | None
     state: Literal["unchanged", "changed", "inconsistent", "unobserved"]
     survey_id: str
     threshold: float | None
     tile_id: str
-    tile_index: tuple[int, int, int]
+    tile_index: list[int]
     z_max: float
     z_min: float
 
@@ -394,12 +420,23 @@ class TrainingRequest(TypedDict):
     name: NotRequired[str | None]
 
 
+class VersionForm(TypedDict):
+    """A version of a map: of further scans, or of a survey that was accepted."""
+
+    captured_at: NotRequired[str]
+    device_id: NotRequired[str]
+    scan_ids: NotRequired[list[ScanId]]
+    scans: NotRequired[list[bytes]]
+    survey_id: NotRequired[str]
+
+
 class VersionRequest(TypedDict):
     """A version of a map: of further scans, or of a survey that was accepted."""
 
     captured_at: NotRequired[str | None]
     device_id: NotRequired[str | None]
     scan_ids: NotRequired[list[ScanId]]
+    scans: NotRequired[list[ScanUse]]
     survey_id: NotRequired[str | None]
 
 
@@ -471,7 +508,7 @@ class FgObjectFeature(TypedDict):
     place: Prism
     properties: ObjectProperties
     time: Interval
-    type: NotRequired[Literal["Feature"]]
+    type: Literal["Feature"]
 
 
 class FgSightingFeature(TypedDict):
@@ -482,7 +519,7 @@ class FgSightingFeature(TypedDict):
     place: Prism
     properties: SightingProperties
     time: Time
-    type: NotRequired[Literal["Feature"]]
+    type: Literal["Feature"]
 
 
 class FgTileFeature(TypedDict):
@@ -493,7 +530,7 @@ class FgTileFeature(TypedDict):
     place: Prism
     properties: TileProperties
     time: Time
-    type: NotRequired[Literal["Feature"]]
+    type: Literal["Feature"]
 
 
 class JobDocument(TypedDict):
@@ -511,14 +548,14 @@ class JobDocument(TypedDict):
     problem: ProblemDocument | None
     processID: Literal["map", "survey", "model"]
     progress: int
-    queue_position: NotRequired[int | None]
+    queue_position: int | None
     started: str | None
     status: Literal["accepted", "running", "successful", "failed", "dismissed"]
     step: str
     survey_id: str | None
-    type: NotRequired[Literal["process"]]
+    type: Literal["process"]
     updated: str
-    waiting_s: NotRequired[float | None]
+    waiting_s: float | None
 
 
 class JobList(TypedDict):
@@ -563,7 +600,7 @@ class ObjectFeature(TypedDict):
     geometry: Footprint | None
     id: str
     properties: ObjectProperties
-    type: NotRequired[Literal["Feature"]]
+    type: Literal["Feature"]
 
 
 class ScanDocument(TypedDict):
@@ -574,11 +611,11 @@ class ScanDocument(TypedDict):
     device_id: str | None
     filename: str
     format: Literal["ply", "pcd"]
-    pose: tuple[PoseItem, PoseItem, PoseItem, PoseItem] | None
+    pose: list[PoseItem] | None
     scan_id: str
     sha256: str
     size: int
-    warnings: NotRequired[list[ScanWarning]]
+    warnings: list[ScanWarning]
 
 
 class ScanList(TypedDict):
@@ -595,17 +632,16 @@ class ScanOutcome(TypedDict):
     A scan that a release before the list of reasons left out has its `detail` alone.
     """
 
-    accepted: NotRequired[bool | None]
-    candidates: NotRequired[list[tuple[Candidate, Candidate, Candidate, Candidate]] | None]
-    confidence: NotRequired[float | None]
-    detail: NotRequired[str | None]
-    fitness: NotRequired[float | None]
-    map_from_scan: NotRequired[
-        tuple[MapFromScanItem, MapFromScanItem, MapFromScanItem, MapFromScanItem] | None
-    ]
-    numbers: NotRequired[dict[str, float] | None]
-    path: NotRequired[list[str] | None]
-    reason: NotRequired[
+    accepted: bool | None
+    candidates: list[list[Candidate]] | None
+    confidence: float | None
+    detail: str | None
+    fitness: float | None
+    map_from_scan: list[MapFromScanItem] | None
+    numbers: dict[str, float] | None
+    path: list[str] | None
+    pose: list[PoseItem] | None
+    reason: (
         Literal[
             "unreadable",
             "damaged",
@@ -631,12 +667,12 @@ class ScanOutcome(TypedDict):
             "clock",
         ]
         | None
-    ]
-    rmse: NotRequired[float | None]
-    rotation_sigma: NotRequired[float | None]
+    )
+    rmse: float | None
+    rotation_sigma: float | None
     scan_id: str
-    translation_sigma: NotRequired[float | None]
-    warnings: NotRequired[list[ScanWarning]]
+    translation_sigma: float | None
+    warnings: list[ScanWarning]
 
 
 class SightingFeature(TypedDict):
@@ -645,7 +681,7 @@ class SightingFeature(TypedDict):
     geometry: Footprint | None
     id: str
     properties: SightingProperties
-    type: NotRequired[Literal["Feature"]]
+    type: Literal["Feature"]
 
 
 class SurveyDocument(TypedDict):
@@ -671,7 +707,7 @@ class SurveyDocument(TypedDict):
     survey_id: str
     threshold: float | None
     updated: str
-    warnings: NotRequired[list[ScanWarning]]
+    warnings: list[ScanWarning]
 
 
 class SurveyList(TypedDict):
@@ -687,7 +723,7 @@ class TileFeature(TypedDict):
     geometry: Footprint | None
     id: str
     properties: TileProperties
-    type: NotRequired[Literal["Feature"]]
+    type: Literal["Feature"]
 
 
 class VersionDocument(TypedDict):
@@ -722,15 +758,15 @@ class VersionList(TypedDict):
 class FgObjectCollection(TypedDict):
     """The changed things of a map, in JSON-FG."""
 
-    conformsTo: NotRequired[list[str]]
-    coordRefSys: NotRequired[str]
+    conformsTo: list[str]
+    coordRefSys: str
     featureType: str
     features: list[FgObjectFeature]
     links: list[Link]
     numberMatched: int
     numberReturned: int
     timeStamp: str
-    type: NotRequired[Literal["FeatureCollection"]]
+    type: Literal["FeatureCollection"]
 
 
 class FgObjectHistory(TypedDict):
@@ -743,35 +779,35 @@ class FgObjectHistory(TypedDict):
     properties: ObjectProperties
     sightings: list[FgSightingFeature]
     time: Interval
-    type: NotRequired[Literal["Feature"]]
+    type: Literal["Feature"]
 
 
 class FgSightingCollection(TypedDict):
     """The things that one survey found changed, in JSON-FG."""
 
-    conformsTo: NotRequired[list[str]]
-    coordRefSys: NotRequired[str]
+    conformsTo: list[str]
+    coordRefSys: str
     featureType: str
     features: list[FgSightingFeature]
     links: list[Link]
     numberMatched: int
     numberReturned: int
     timeStamp: str
-    type: NotRequired[Literal["FeatureCollection"]]
+    type: Literal["FeatureCollection"]
 
 
 class FgTileCollection(TypedDict):
     """Tiles in JSON-FG."""
 
-    conformsTo: NotRequired[list[str]]
-    coordRefSys: NotRequired[str]
+    conformsTo: list[str]
+    coordRefSys: str
     featureType: str
     features: list[FgTileFeature]
     links: list[Link]
     numberMatched: int
     numberReturned: int
     timeStamp: str
-    type: NotRequired[Literal["FeatureCollection"]]
+    type: Literal["FeatureCollection"]
 
 
 class MapDocument(TypedDict):
@@ -797,6 +833,20 @@ class MapDocument(TypedDict):
     version: int
 
 
+class MapForm(TypedDict):
+    """A map of scans that were uploaded before, or come with the request."""
+
+    anchor: NotRequired[AnchorRequest]
+    captured_at: NotRequired[str]
+    device_id: NotRequired[str]
+    id: NotRequired[str]
+    model: NotRequired[str]
+    name: NotRequired[str]
+    scan_ids: NotRequired[list[ScanId]]
+    scans: NotRequired[list[bytes]]
+    settings: NotRequired[MapSettings]
+
+
 class MapList(TypedDict):
     """Maps, newest first."""
 
@@ -814,52 +864,53 @@ class MapRequest(TypedDict):
     model: NotRequired[str | None]
     name: NotRequired[str | None]
     scan_ids: NotRequired[list[ScanId]]
+    scans: NotRequired[list[ScanUse]]
     settings: NotRequired[MapSettings]
 
 
 class ObjectCollection(TypedDict):
     """The changed things of a map."""
 
-    crs: NotRequired[NamedCrs | None]
+    crs: NamedCrs | None
     features: list[ObjectFeature]
     links: list[Link]
     numberMatched: int
     numberReturned: int
     timeStamp: str
-    type: NotRequired[Literal["FeatureCollection"]]
+    type: Literal["FeatureCollection"]
 
 
 class ObjectHistory(TypedDict):
     """A thing over all surveys of a map, with each sighting of it."""
 
-    crs: NotRequired[NamedCrs | None]
+    crs: NamedCrs | None
     geometry: Footprint | None
     id: str
     links: list[Link]
     properties: ObjectProperties
     sightings: list[SightingFeature]
-    type: NotRequired[Literal["Feature"]]
+    type: Literal["Feature"]
 
 
 class SightingCollection(TypedDict):
     """The things that one survey found changed."""
 
-    crs: NotRequired[NamedCrs | None]
+    crs: NamedCrs | None
     features: list[SightingFeature]
     links: list[Link]
     numberMatched: int
     numberReturned: int
     timeStamp: str
-    type: NotRequired[Literal["FeatureCollection"]]
+    type: Literal["FeatureCollection"]
 
 
 class TileCollection(TypedDict):
     """Tiles."""
 
-    crs: NotRequired[NamedCrs | None]
+    crs: NamedCrs | None
     features: list[TileFeature]
     links: list[Link]
     numberMatched: int
     numberReturned: int
     timeStamp: str
-    type: NotRequired[Literal["FeatureCollection"]]
+    type: Literal["FeatureCollection"]

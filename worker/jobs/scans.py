@@ -31,12 +31,15 @@ from worker.pipeline.settings import PipelineSettings
 def scan_files(
     context: Context, scans: Sequence[ScanOutcome], stack: ExitStack, settings: PipelineSettings
 ) -> tuple[ScanFile, ...]:
-    """Return the uploads of one visit as local files for as long as the stack is open, less their carrier."""
+    """Return the uploads of one visit as local files for as long as the stack is open, less their carrier.
+
+    The pose is that of the scan's use in this map or survey, whatever the upload says by now.
+    """
     files = []
     for outcome in scans:
         scan = context.catalog.scans.get(outcome.scan_id)
         path = stack.enter_context(context.catalog.blobs.local(scan.key))
-        pose = None if scan.pose is None else np.array(scan.pose, np.float64)
+        pose = None if outcome.pose is None else np.array(outcome.pose, np.float64)
         files.append(ScanFile(name=scan.filename, path=path, pose=pose))
     return with_carrier(files, settings.carrier, max_points=settings.max_scan_points)
 

@@ -11,6 +11,7 @@ import contextlib
 from collections.abc import AsyncIterator, Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, field
+from json import dumps
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
@@ -21,6 +22,7 @@ from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import MultipartParser, parse_options_header
 
 from service.api.http.dependencies import Services
+from service.api.http.description import not_null
 from service.api.http.json_text import read_json
 from service.api.http.uploads import Incoming, Upload
 from service.catalog.disk import Disk
@@ -42,6 +44,8 @@ INCOMING = (
 JSON = "application/json"
 FORM = "multipart/form-data"
 RAW = "application/octet-stream"
+_BINARY = {"type": "string", "format": "binary"}
+_REFERENCE = "#/components/schemas/{model}"
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -114,21 +118,37 @@ def documented(
 ) -> dict[str, Any]:
     """Return the `openapi_extra` of a route that reads its body by hand; `file` is the form field of files."""
     content: dict[str, Any] = {}
-    binary = {"type": "string", "format": "binary"}
     if raw:
-        content[RAW] = {"schema": binary}
+        content[RAW] = {"schema": _BINARY}
     if json is not None:
-        content[JSON] = {"schema": _reference(json)}
+        content[JSON] = {"schema": {"$ref": _REFERENCE.format(model=json.__name__)}}
     if form is not None:
-        files = binary if file == "file" else {"type": "array", "items": binary}
-        content[FORM] = {
-            "schema": {"allOf": [_reference(form), {"type": "object", "properties": {file: files}}]}
-        }
+        content[FORM] = {"schema": _form_schema(form, file)}
     return {"requestBody": {"required": True, "content": content}}
 
 
-def _reference(model: type[BaseModel]) -> dict[str, str]:
-    return {"$ref": f"#/components/schemas/{model.__name__}"}
+def _form_schema(form: type[BaseModel], file: str) -> dict[str, Any]:
+    """Return the schema of a form: the fields of a request beside its files, one schema, for it admits no others."""
+    schema = form.model_json_schema(ref_template=_REFERENCE)
+    fields = {name: _form_field(field) for name, field in schema["properties"].items()}
+    fields[file] = _BINARY if file == "file" else {"type": "array", "items": _BINARY}
+    needed = [*schema.get("required", ()), *(["file"] if file == "file" else ())]
+    said = {"title": form.__name__.replace("Request", "Form"), "description": form.__doc__ or ""}
+    whole = {"type": "object", "additionalProperties": False, "properties": fields, **said}
+    return {**whole, "required": needed} if needed else whole
+
+
+def _form_field(schema: dict[str, Any]) -> dict[str, Any]:
+    """Return the schema of a field of a form: a list of lists comes as one text, for a list is a field repeated."""
+    field = not_null(schema)
+    if field.get("items", {}).get("type") != "array":
+        return field
+    return {
+        "type": "string",
+        "contentMediaType": JSON,
+        "description": field.get("description", ""),
+        "examples": [dumps(field["example"])] if "example" in field else [],
+    }
 
 
 def _declared(request: Request, limit: int) -> int:

@@ -27,6 +27,7 @@ SAFE_METHODS = frozenset(
 EXPOSED_HEADERS = (
     "Location",
     "Content-Disposition",
+    "Idempotency-Replayed",
     "ETag",
     "Retry-After",
     "WWW-Authenticate",
@@ -43,7 +44,7 @@ def add_cross_site_checks(app: FastAPI, settings: Settings) -> None:
             CORSMiddleware,
             allow_origins=origins,
             allow_methods=("GET", "POST", "PUT", "DELETE"),
-            allow_headers=("Authorization", "Content-Type", "X-Request-ID"),
+            allow_headers=("Authorization", "Content-Type", "Idempotency-Key", "X-Request-ID"),
             expose_headers=EXPOSED_HEADERS,
         )
     app.add_middleware(CrossSiteMiddleware, hosts=allowed_hosts(settings), origins=frozenset(origins))

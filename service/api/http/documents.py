@@ -20,7 +20,7 @@ class Request(BaseModel):
 class Document(BaseModel):
     """Base of every document; one that shows a record has the record's class as its first base."""
 
-    model_config = ConfigDict(extra="ignore", frozen=True)
+    model_config = ConfigDict(extra="ignore", frozen=True, json_schema_serialization_defaults_required=True)
 
 
 class Link(Document):

@@ -44,6 +44,9 @@ PROBLEMS: dict[str, tuple[int | None, str]] = {
     "blobs_unavailable": (503, "The blob store does not answer"),
     "unhealthy": (503, "A part of the service does not answer"),
     "method_not_allowed": (405, "The method is not allowed here"),
+    "idempotency_key_malformed": (400, "The Idempotency-Key cannot be read"),
+    "idempotency_key_reused": (422, "The Idempotency-Key came with another request"),
+    "idempotency_key_in_use": (409, "The request is being carried out"),
     "incomplete_body": (400, "The body ended early"),
     "internal": (500, "The service failed"),
     "scan_too_large": (None, "The scan has too many points"),
@@ -138,7 +141,7 @@ def documented(*codes: str) -> dict[int | str, dict[str, Any]]:
             "description": meaning if known is None else f"{known['description']}; {meaning}",
             "content": {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/ProblemDocument"}}},
         }
-        if status in (429, 503):
+        if status in (429, 503) or code == "idempotency_key_in_use":
             answers[status]["headers"] = {"Retry-After": _RETRY_AFTER}
     return answers
 

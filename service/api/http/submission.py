@@ -11,17 +11,18 @@ from dataclasses import asdict
 from typing import Annotated, ParamSpec, Self
 
 from fastapi import Request as HttpRequest
-from fastapi import Response
-from pydantic import BeforeValidator, Field
+from pydantic import BaseModel, BeforeValidator, Field
 
 from service import tracing
 from service.api.http.bodies import Body
 from service.api.http.dependencies import Services
 from service.api.http.documents import Link, Request, link
-from service.api.http.fields import MAX_LISTED, DeviceId, Id, Instant, names_from_text
+from service.api.http.fields import MAX_LISTED, DeviceId, Id, Instant, Pose, names_from_text
+from service.api.http.idempotency import answered
 from service.api.http.lanes import Lane
 from service.catalog.catalog import Catalog
-from service.catalog.records import JobRecord, ScanRecord
+from service.catalog.idempotency import ANY_TIMES, Answer, Once
+from service.catalog.records import JobRecord, Matrix, ScanRecord
 from service.dispatch import Dispatcher
 from service.errors import QueueFull, QueueUnavailable, ServiceError, Unavailable
 from service.logs import about
@@ -31,12 +32,31 @@ log = logging.getLogger(__name__)
 P = ParamSpec("P")
 
 
+class ScanUse(Request):
+    """A scan that was uploaded before, with what counts in this map or survey alone."""
+
+    scan_id: Id
+    pose: Annotated[
+        Pose | None,
+        Field(description="4x4 row-major, map_from_sensor, in place of the upload's; left out: the upload's"),
+    ] = None
+
+
 class ScansRequest(Request):
     """Scans that were uploaded before; others may come with the request."""
 
-    scan_ids: Annotated[tuple[Id, ...], BeforeValidator(names_from_text), Field(max_length=MAX_LISTED)] = ()
+    scan_ids: Annotated[tuple[Id, ...], Field(max_length=MAX_LISTED), BeforeValidator(names_from_text)] = ()
+    scans: Annotated[
+        tuple[ScanUse, ...],
+        Field(max_length=MAX_LISTED, description="further scans, each with a pose that counts here alone"),
+    ] = ()
     captured_at: Annotated[Instant | None, Field(description="of the files in this request")] = None
     device_id: Annotated[DeviceId | None, Field(description="of the files in this request")] = None
+
+    @property
+    def poses(self) -> dict[str, Matrix]:
+        """Those that count in this map or survey alone, by the id of the scan."""
+        return {use.scan_id: use.pose for use in self.scans if use.pose is not None}
 
 
 @contextlib.contextmanager
@@ -46,7 +66,7 @@ def kept_scans(catalog: Catalog, body: Body, wanted: ScansRequest) -> Iterator[t
     When the block raises, files that were new are forgotten again.
     """
     new: list[ScanRecord] = []
-    ids = list(wanted.scan_ids)
+    ids = [*wanted.scan_ids, *(use.scan_id for use in wanted.scans)]
     try:
         for upload in body.uploads:
             scan, is_new = catalog.scans.add(
@@ -63,11 +83,14 @@ def kept_scans(catalog: Catalog, body: Body, wanted: ScansRequest) -> Iterator[t
         raise
 
 
-def monitor(request: HttpRequest, response: Response, job: JobRecord) -> Link:
-    """Return the link to a job that was submitted, which the answer names in `Location` as well."""
-    here = link(request, f"/jobs/{job.job_id}", "monitor")
-    response.headers["Location"] = here.href
-    return here
+def monitor(request: HttpRequest, job: JobRecord) -> Link:
+    """Return the link to a job that was submitted."""
+    return link(request, f"/jobs/{job.job_id}", "monitor")
+
+
+def accepted(request: HttpRequest, document: BaseModel, job: JobRecord) -> Answer:
+    """Return the answer to a request that submitted a job, which `Location` names."""
+    return answered(document, status=202, location=monitor(request, job).href)
 
 
 def admit(services: Services, owner: str | None = None) -> None:
@@ -81,14 +104,19 @@ def admit(services: Services, owner: str | None = None) -> None:
         )
 
 
-def submit(services: Services, job: JobRecord, *, forget: Callable[[], None]) -> None:
-    """Have a recorded job wait for its turn. Raises QueueUnavailable after `forget` has taken the record back."""
+def submit(services: Services, job: JobRecord, *, forget: Callable[[], None], once: Once = ANY_TIMES) -> None:
+    """Have a recorded job wait for its turn. Raises QueueUnavailable after `forget` has taken the record back.
+
+    `once` is what the record was made under.
+    """
     try:
         services.queue.ping()
         services.dispatcher.hand_over()
     except BaseException:
         forget()
+        once.drop()
         raise
+    once.settle()
     tracing.link_job(job.job_id)
     with about(job_id=job.job_id):  # the one line that has the ids of request and job
         log.info("the %s job waits", job.kind)
@@ -125,12 +153,13 @@ class Ticker:
             self._over.wait(self._every_s)
 
 
-def run_again(services: Services, job_id: str) -> JobRecord:
+def run_again(services: Services, job_id: str, once: Once = ANY_TIMES) -> JobRecord:
     """Have a failed job wait for its turn again. Raises NotFound, Conflict, QueueFull, QueueUnavailable, DiskFull."""
+    once.look()
     services.catalog.disk.require()
     admit(services)
     services.queue.ping()
-    job = services.catalog.jobs.run_again(job_id)
+    job = services.catalog.jobs.run_again(job_id, once=once)
     services.dispatcher.hand_over()
     return job
 

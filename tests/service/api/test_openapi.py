@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import json
+import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from service.api import openapi
+from service.api.http.description import not_null, operations, schemas_under
 
 PROJECT = Path(__file__).resolve().parents[3]
 WRITTEN = PROJECT / openapi.FILE
+VERBS = {"create", "delete", "dismiss", "get", "list", "put", "retry", "train", "upload"}  #: of operation ids
 
 
 @pytest.fixture(scope="module")
@@ -102,6 +106,74 @@ def test_uploads_describe_their_body(document: dict[str, Any]) -> None:
         "/scans": ["application/octet-stream", "multipart/form-data"],
         "/maps": ["application/json", "multipart/form-data"],
     }
+
+
+def parts(node: object, place: str = "") -> Iterator[tuple[str, dict[str, Any]]]:
+    """Every object of the document, with the place where it stands."""
+    if isinstance(node, dict):
+        yield place, node
+    children = node.items() if isinstance(node, dict) else enumerate(node) if isinstance(node, list) else ()
+    for name, child in children:
+        yield from parts(child, f"{place}/{name}")
+
+
+def test_every_operation_bears_the_name_of_one_function_that_is_a_verb_and_a_noun(
+    document: dict[str, Any],
+) -> None:
+    ids = [operation["operationId"] for operation in operations(document)]
+    assert len(set(ids)) == len(ids)
+    for name in ids:
+        assert re.fullmatch(r"[a-z]+(_[a-z]+)+", name), name
+        assert name.split("_")[0] in VERBS, name
+
+
+def test_no_reference_stands_beside_a_type(document: dict[str, Any]) -> None:
+    wrong = [place for place, part in parts(document) if "$ref" in part and "type" in part]
+    assert wrong == []
+
+
+def test_lists_are_bounded_by_items_and_texts_by_letters(document: dict[str, Any]) -> None:
+    lists = {"minItems", "maxItems", "uniqueItems"}
+    texts = {"minLength", "maxLength", "pattern"}
+    for place, part in parts(document["components"]["schemas"]):
+        of = {"array": texts, "string": lists}.get(str(part.get("type")), set())
+        assert not of & part.keys(), place
+
+
+def test_no_request_has_to_send_what_has_a_default(document: dict[str, Any]) -> None:
+    sent = [operation["requestBody"] for operation in operations(document) if "requestBody" in operation]
+    for name, schema in schemas_under(sent, document).items():
+        for field, described in schema.get("properties", {}).items():
+            assert "default" not in described, f"{name}.{field}: generators take it for always there"
+
+
+def test_answers_have_every_member_that_the_service_writes(document: dict[str, Any]) -> None:
+    schemas = document["components"]["schemas"]
+    assert "warnings" in schemas["ScanOutcome"]["required"]
+    assert "queue_position" in schemas["JobDocument"]["required"]
+    assert "errors" not in schemas["ProblemDocument"]["required"]
+
+
+def test_parameters_are_left_out_and_never_null(document: dict[str, Any]) -> None:
+    for operation in operations(document):
+        for parameter in operation.get("parameters", ()):
+            assert not_null(parameter["schema"]) == parameter["schema"], (operation, parameter["name"])
+
+
+def test_forms_admit_their_own_files_and_no_other_field(document: dict[str, Any]) -> None:
+    forms = {
+        operation["operationId"]: operation["requestBody"]["content"]["multipart/form-data"]["schema"]
+        for operation in operations(document)
+        if "multipart/form-data" in operation.get("requestBody", {}).get("content", {})
+    }
+    assert len(forms) >= 4
+    for name, reference in forms.items():
+        schema = next(iter(schemas_under(reference, document).values()))
+        files = "file" if name == "upload_scan" else "scans"
+        binary = schema["properties"][files]
+        assert (binary if files == "file" else binary["items"])["format"] == "binary"
+        assert schema["additionalProperties"] is False
+        assert "allOf" not in schema
 
 
 @pytest.mark.slow

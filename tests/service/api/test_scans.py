@@ -211,16 +211,17 @@ def test_the_same_bytes_with_another_pose_or_time_correct_a_scan_that_nothing_re
     assert (again.status_code, again.json()) == (200, scan)  # what is not said stays
 
 
-def test_the_same_bytes_with_another_pose_are_refused_once_a_map_rests_on_the_scan(
+def test_the_same_bytes_with_another_pose_are_taken_and_a_map_of_them_stays_as_it_was_asked_for(
     client: TestClient,
 ) -> None:
     scan = client.post("/scans", content=ply(), headers=RAW, params={"pose": TURNED}).json()
-    client.post("/maps", json={"scan_ids": [scan["scan_id"]]})
-    refused = client.post("/scans", content=ply(), headers=RAW, params={"pose": MOVED})
-    assert (refused.status_code, refused.json()["type"]) == (409, "urn:spicd:problem:conflict")
-    assert "another pose," in refused.json()["detail"]
-    same = client.post("/scans", content=ply(), headers=RAW, params={"pose": TURNED})
-    assert (same.status_code, same.json()) == (200, scan)
+    before = client.post("/maps", json={"scan_ids": [scan["scan_id"]]}).json()["map_id"]
+    again = client.post("/scans", content=ply(), headers=RAW, params={"pose": MOVED, "captured_at": LATER})
+    assert (again.status_code, again.json()["scan_id"]) == (200, scan["scan_id"])
+    assert (again.json()["pose"], again.json()["captured_at"]) == (json.loads(MOVED), LATER)
+    after = client.post("/maps", json={"scan_ids": [scan["scan_id"]]}).json()["map_id"]
+    poses = [client.get(f"/maps/{map_id}").json()["scans"][0]["pose"] for map_id in (before, after)]
+    assert poses == [json.loads(TURNED), json.loads(MOVED)]
 
 
 def test_an_upload_that_was_acknowledged_outlives_a_request_that_brought_the_same_bytes_and_failed(

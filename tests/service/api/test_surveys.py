@@ -9,9 +9,9 @@ from fastapi.testclient import TestClient
 
 from service.catalog import blob_keys
 from service.catalog.catalog import Catalog
-from service.catalog.records import Placement, Problem
+from service.catalog.records import Placement, Problem, ScanOutcome
 from service.settings import Settings
-from tests.support.samples import NOON, RememberingQueue, add_map, add_scan, add_survey, ply, tile
+from tests.support.samples import IDENTITY, NOON, RememberingQueue, add_map, add_scan, add_survey, ply, tile
 
 
 def test_a_survey_of_files_is_accepted_and_its_job_submitted(
@@ -37,6 +37,29 @@ def test_a_survey_of_known_scans_takes_the_model_of_the_map(client: TestClient, 
     add_map(catalog)
     answer = client.post("/maps/lobby/surveys", json={"scan_ids": [add_scan(catalog).scan_id]})
     assert catalog.surveys.get(answer.json()["survey_id"]).model == catalog.maps.get("lobby").model
+
+
+def test_a_pose_of_a_survey_counts_there_alone(client: TestClient, catalog: Catalog) -> None:
+    add_map(catalog)
+    named, turned, plain = (add_scan(catalog, name, pose=IDENTITY).scan_id for name in ("a", "b", "c"))
+    moved = [[1, 0, 0, 4], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+    body = {"scan_ids": [named], "scans": [{"scan_id": turned, "pose": moved}, {"scan_id": plain}]}
+    survey_id = client.post("/maps/lobby/surveys", json=body).json()["survey_id"]
+    scans = client.get(f"/surveys/{survey_id}").json()["scans"]
+    assert [scan["scan_id"] for scan in scans] == [named, turned, plain]
+    assert [scan["pose"] for scan in scans] == [[list(row) for row in IDENTITY], moved, scans[0]["pose"]]
+    assert catalog.scans.get(turned).pose == IDENTITY
+    outcome = ScanOutcome(scan_id=turned, accepted=True)
+    catalog.surveys.save_outcomes(survey_id, [outcome])
+    assert client.get(f"/surveys/{survey_id}").json()["scans"][1]["pose"] == moved
+
+
+def test_a_scan_is_named_once_with_a_pose_or_without(client: TestClient, catalog: Catalog) -> None:
+    add_map(catalog)
+    scan_id = add_scan(catalog).scan_id
+    body = {"scan_ids": [scan_id], "scans": [{"scan_id": scan_id}]}
+    answer = client.post("/maps/lobby/surveys", json=body)
+    assert (answer.status_code, answer.json()["type"]) == (422, "urn:spicd:problem:bad_request")
 
 
 def test_a_survey_before_its_map_is_ready_is_refused_unread(

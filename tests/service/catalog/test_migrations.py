@@ -96,6 +96,16 @@ def test_a_sentence_of_the_last_build_is_the_detail_of_a_scan_without_a_reason(o
     assert (map_scan.reason, map_scan.detail, map_scan.confidence) == (None, None, None)
 
 
+def test_each_use_of_a_scan_of_the_last_build_has_the_pose_of_its_upload(old: Settings) -> None:
+    run(old, f"UPDATE scans SET pose = '{[list(row) for row in IDENTITY]}' WHERE id = 'scan-1'")
+    catalog = open_catalog(old)
+    (map_scan,), (survey_scan,) = catalog.maps.get("lobby").scans, catalog.surveys.get("survey-1").scans
+    told = [catalog.scans.get(scan.scan_id).pose for scan in (map_scan, survey_scan)]
+    catalog.close()
+    assert (map_scan.pose, survey_scan.pose) == (told[0], told[1])
+    assert map_scan.pose == IDENTITY
+
+
 def test_of_a_survey_of_the_last_build_nobody_judged_the_placement(opened: Catalog) -> None:
     assert opened.surveys.get("survey-1").placement is None
 

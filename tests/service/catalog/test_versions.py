@@ -12,6 +12,7 @@ from service.catalog.records import Problem, ScanOutcome
 from service.errors import Conflict, NotFound, NotReady
 from tests.support.samples import BOUNDS, IDENTITY, add_map, add_scan, add_survey, add_version, tile
 
+MOVED = ((1, 0, 0, 4), *IDENTITY[1:])
 SURE = ScanOutcome(
     scan_id="",
     accepted=True,
@@ -129,3 +130,15 @@ def test_an_anchor_moves_when_the_map_was_last_changed_and_nothing_else(catalog:
     assert after.updated > before.updated
     assert after.model_copy(update={"updated": before.updated, "anchor": None}) == before
     assert after.anchor == anchor
+
+
+def test_a_version_keeps_the_poses_of_its_base_beside_those_of_its_own(catalog: Catalog) -> None:
+    first, further = (add_scan(catalog, name, pose=IDENTITY).scan_id for name in ("first", "further"))
+    _, job = catalog.maps.create(scan_ids=[first], poses={first: MOVED}, model="spicd-net/1", map_id="hall")
+    catalog.versions.save_result(
+        job.job_id, outcomes=[SURE.model_copy(update={"scan_id": first})], bounds=BOUNDS, counts={}
+    )
+    catalog.jobs.succeed(job.job_id)
+    catalog.scans.correct(first, pose=IDENTITY)
+    version, _ = catalog.versions.create("hall", scan_ids=[further], poses={further: MOVED})
+    assert [scan.pose for scan in version.scans] == [MOVED, MOVED]

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack, nullcontext
 from pathlib import Path
-from typing import get_args
+from types import SimpleNamespace
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -11,7 +13,7 @@ import pytest
 from service.catalog.records import Placement, ScanOutcome, ScanReason
 from tests.support.samples import IDENTITY
 from worker.errors import ScanError
-from worker.jobs.scans import kept_placement, recorded_placement, scan_outcomes, unread
+from worker.jobs.scans import kept_placement, recorded_placement, scan_files, scan_outcomes, unread
 from worker.pipeline.registration.diagnosis import MEANING, REASONS, Diagnosis
 from worker.pipeline.registration.results import (
     RegistrationResult,
@@ -20,6 +22,7 @@ from worker.pipeline.registration.results import (
     ScanResult,
     SurveyPlacement,
 )
+from worker.pipeline.settings import PipelineSettings
 
 ASKED = (ScanOutcome(scan_id="scan-1"),)
 
@@ -102,3 +105,23 @@ def test_of_files_that_cannot_be_read_each_has_its_own_sentence(tmp_path: Path) 
     results = unread(files, ScanError("a.ply: neither PLY nor PCD"), max_points=100)
     assert [str(result.reason).partition(":")[0] for result in results] == ["a.ply", "b.ply"]
     assert {result.diagnosis.reason for result in results if result.diagnosis} == {"unreadable"}
+
+
+def test_a_scan_is_registered_from_the_pose_of_its_use_and_not_from_that_of_its_upload(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "hall.ply"
+    path.write_bytes(b"ply")
+    upload = SimpleNamespace(key="a", filename="hall.ply", pose=IDENTITY)
+    catalog: Any = SimpleNamespace(
+        scans=SimpleNamespace(get=lambda _: upload), blobs=SimpleNamespace(local=lambda _: nullcontext(path))
+    )
+    moved = ((1, 0, 0, 4), *IDENTITY[1:])
+    asked = [ScanOutcome(scan_id="scan-1", pose=moved), ScanOutcome(scan_id="scan-2")]
+    settings = PipelineSettings.model_validate({})
+    with ExitStack() as stack:
+        context: Any = SimpleNamespace(catalog=catalog)
+        one, other = scan_files(context, asked, stack, settings)
+    assert one.pose is not None
+    np.testing.assert_array_equal(one.pose, moved)
+    assert other.pose is None

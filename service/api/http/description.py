@@ -1,0 +1,109 @@
+"""The OpenAPI document where FastAPI's own says what does not hold, or what generators of clients trip over."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+from fastapi.routing import APIRoute
+
+Schema = dict[str, Any]  #: JSON Schema (draft 2020-12), as OpenAPI 3.1 has it
+
+_SCHEMAS = "#/components/schemas/"
+
+
+def operation_id(route: APIRoute) -> str:
+    """Return the id of an operation, which names a function of each generated client: that of ours."""
+    return route.name
+
+
+def mended(document: dict[str, Any]) -> dict[str, Any]:
+    """Return an OpenAPI document that admits what the service takes, and no more; the one that is given changes."""
+    for operation in operations(document):
+        for parameter in operation.get("parameters", ()):
+            parameter["schema"] = not_null(parameter["schema"])
+        for answer in operation["responses"].values():
+            _mend_answer(answer)
+    for schema in _only_sent(document):
+        _leave_out_defaults(schema)
+    _name_forms(document)
+    _join_equal_items(document)
+    return document
+
+
+def operations(document: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    """Yield each operation of a document."""
+    for methods in document["paths"].values():
+        yield from methods.values()
+
+
+def not_null(schema: Schema) -> Schema:
+    """Return a schema without null: parameters and fields of forms are left out, never null."""
+    options = [option for option in schema.get("anyOf", ()) if option.get("type") != "null"]
+    if len(options) != 1:
+        return schema
+    rest = {name: value for name, value in schema.items() if name != "anyOf"}
+    return {**options[0], **{name: value for name, value in rest.items() if value is not None}}
+
+
+def schemas_under(node: Any, document: dict[str, Any]) -> dict[str, Schema]:
+    """Return the named schemas that a part of the document leads to, by their names."""
+    found: dict[str, Schema] = {}
+    waiting = [node]
+    while waiting:
+        part = waiting.pop()
+        if isinstance(part, list):
+            waiting += part
+        elif isinstance(part, dict):
+            waiting += part.values()
+            name = str(part.get("$ref", "")).removeprefix(_SCHEMAS)
+            if name and name not in found:
+                found[name] = document["components"]["schemas"][name]
+                waiting.append(found[name])
+    return found
+
+
+def _mend_answer(answer: dict[str, Any]) -> None:
+    """Drop the type that FastAPI supposes of an answer which is written by hand, beside the schema that it has."""
+    for content in answer.get("content", {}).values():
+        if "$ref" in content.get("schema", {}):
+            content["schema"].pop("type", None)
+
+
+def _only_sent(document: dict[str, Any]) -> list[Schema]:
+    """Return the schemas that stand in bodies of requests alone, named or not."""
+    bodies = [operation["requestBody"] for operation in operations(document) if "requestBody" in operation]
+    answers = schemas_under([operation["responses"] for operation in operations(document)], document)
+    named = [schema for name, schema in schemas_under(bodies, document).items() if name not in answers]
+    return named + [content["schema"] for body in bodies for content in body["content"].values()]
+
+
+def _leave_out_defaults(schema: Schema) -> None:
+    """Say a property's default in words: generators of TypeScript take what has a default for always there."""
+    for field in schema.get("properties", {}).values():
+        default = field.pop("default", None)
+        if isinstance(default, int | float | str):
+            said = field.get("description")
+            field["description"] = f"{said}; left out: {default}" if said else f"left out: {default}"
+
+
+def _join_equal_items(node: Any) -> None:
+    """Describe a row of equal members, such as a matrix or a point, as a list of that length.
+
+    Tuples of sixteen numbers, each with a schema of its own, are more than some programs follow.
+    """
+    for child in node.values() if isinstance(node, dict) else node if isinstance(node, list) else ():
+        _join_equal_items(child)
+    members = node.get("prefixItems", []) if isinstance(node, dict) else []
+    if members and isinstance(members, list) and all(member == members[0] for member in members):
+        node["items"] = node.pop("prefixItems")[0]
+
+
+def _name_forms(document: dict[str, Any]) -> None:
+    """Give schemas of bodies that stand in an operation a name of their own, by which generators call them."""
+    for operation in operations(document):
+        for content in operation.get("requestBody", {}).get("content", {}).values():
+            if "title" in content["schema"]:
+                schema = content["schema"]
+                document["components"]["schemas"][schema["title"]] = schema
+                content["schema"] = {"$ref": _SCHEMAS + schema["title"]}
