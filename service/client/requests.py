@@ -39,6 +39,11 @@ def given(**values: Any) -> dict[str, Any]:
     return {name: value for name, value in values.items() if value is not None}
 
 
+def keyed(idempotency_key: str | None) -> dict[str, str]:
+    """Return the header of a key that the caller keeps; without one each call has its own."""
+    return given(**{"Idempotency-Key": idempotency_key})
+
+
 def scans_of(scan_ids: Sequence[str], poses: Mapping[str, Pose] | None) -> dict[str, Any]:
     """Return the members of a request that name its scans, in their order, those of `poses` with a pose of their own.
 

@@ -28,7 +28,7 @@ from service.client.documents import (
     VersionSummaryDocument,
 )
 from service.client.errors import Document, JobFailed, retry_after_s
-from service.client.requests import Body, OnSent, Pose, csv_lines, given, quoted, scans_of
+from service.client.requests import Body, OnSent, Pose, csv_lines, given, keyed, quoted, scans_of
 from service.client.synchronous.feeds import Feeds
 
 SLOWEST_LOOK_S = 2.0  #: between two looks at a job that takes long
@@ -96,13 +96,17 @@ class Client(Feeds):
         settings: Document | None = None,
         anchor: Document | None = None,
         poses: Mapping[str, Pose] | None = None,
+        idempotency_key: str | None = None,
     ) -> AcceptedMap:
         """Build a reference map; returns `map_id` and `job_id`.
 
         `poses` are map_from_sensor by the id of the scan, and count in this map alone; others are those of the upload.
+        `idempotency_key` is for who may be killed before the answer comes, and asks again then: one a map; left out:
+        one a call.
         """
         about = given(id=map_id, name=name, model=model, settings=settings, anchor=anchor)
-        return self._json(AcceptedMap, "POST", "/maps", json={**about, **scans_of(scan_ids, poses)})
+        body = {**about, **scans_of(scan_ids, poses)}
+        return self._json(AcceptedMap, "POST", "/maps", json=body, headers=keyed(idempotency_key))
 
     def maps(self) -> list[MapSummaryDocument]:
         """Return every map in short; `map` has its scans."""
@@ -130,13 +134,15 @@ class Client(Feeds):
         *,
         survey_id: str | None = None,
         poses: Mapping[str, Pose] | None = None,
+        idempotency_key: str | None = None,
     ) -> AcceptedVersion:
         """Go on from a map's version in use, with further scans or a survey; returns `version` and `job_id`.
 
-        `poses` as in `create_map`.
+        `poses` and `idempotency_key` as in `create_map`.
         """
         body = {**given(survey_id=survey_id), **(scans_of(scan_ids, poses) if scan_ids else {})}
-        return self._json(AcceptedVersion, "POST", f"/maps/{quoted(map_id)}/versions", json=body)
+        path, headers = f"/maps/{quoted(map_id)}/versions", keyed(idempotency_key)
+        return self._json(AcceptedVersion, "POST", path, json=body, headers=headers)
 
     def versions(self, map_id: str) -> list[VersionSummaryDocument]:
         """Return every version of a map in short, newest first; `version` has its scans."""
@@ -162,11 +168,13 @@ class Client(Feeds):
         model: str | None = None,
         threshold: float | None = None,
         poses: Mapping[str, Pose] | None = None,
+        idempotency_key: str | None = None,
     ) -> AcceptedSurvey:
-        """Compare scans with a map; returns `survey_id` and `job_id`. `poses` as in `create_map`."""
+        """Compare scans with a map; returns `survey_id` and `job_id`. `poses` and `idempotency_key` as in `create_map`."""
         about = given(captured_at=captured_at, device_id=device_id, model=model, threshold=threshold)
         body = {**about, **scans_of(scan_ids, poses)}
-        return self._json(AcceptedSurvey, "POST", f"/maps/{quoted(map_id)}/surveys", json=body)
+        path, headers = f"/maps/{quoted(map_id)}/surveys", keyed(idempotency_key)
+        return self._json(AcceptedSurvey, "POST", path, json=body, headers=headers)
 
     def surveys(self, map_id: str) -> list[SurveySummaryDocument]:
         """Return every survey of a map in short; `survey` has its scans."""

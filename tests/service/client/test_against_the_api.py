@@ -84,3 +84,14 @@ def test_the_csv_of_changes_is_what_the_service_writes(parts: tuple[Client, Cata
     names, *rows = client.changes_csv("hall", limit=1)
     assert {"tile_id", "score", "survey_id"} <= set(names.split(","))
     assert len(rows) == 3 == client.changes("hall")["numberMatched"]
+
+
+def test_a_key_that_the_caller_keeps_makes_one_thing_in_two_processes(
+    parts: tuple[Client, Catalog, Losing],
+) -> None:
+    client, catalog, _ = parts
+    add_map(catalog, "hall")
+    scan_id = client.upload_scan(ply("a"))["scan_id"]
+    first, again = (client.submit_survey("hall", [scan_id], idempotency_key="visit-7") for _ in range(2))
+    assert first == again
+    assert len(catalog.surveys.page("hall").items) == 1
