@@ -88,6 +88,7 @@ GROUPS: dict[str, tuple[str, dict[Callable[..., None], str]]] = {
             webhooks.list_: "list",
             webhooks.ping: "ping webhook-7a01",
             webhooks.deliveries: "deliveries webhook-7a01",
+            webhooks.repeat: "repeat webhook-7a01 delivery-88a0",
             webhooks.rotate: "rotate webhook-7a01",
             webhooks.remove: "remove webhook-7a01",
         },

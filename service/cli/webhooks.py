@@ -50,10 +50,8 @@ def ping(ctx: typer.Context, webhook_id: str) -> None:
     """Have an event sent that says nothing but that it arrives."""
     terminal: Terminal = ctx.obj
     with terminal.client() as client:
-        client.ping_webhook(webhook_id)
-    terminal.show(
-        {"webhook_id": webhook_id, "pinged": True}, lambda _: f"a ping is on its way to {webhook_id}"
-    )
+        sent = client.ping_webhook(webhook_id)
+    terminal.show(sent, lambda _: f"a ping is on its way to webhook {webhook_id}")
 
 
 def rotate(ctx: typer.Context, webhook_id: str) -> None:
@@ -70,17 +68,27 @@ def deliveries(ctx: typer.Context, webhook_id: str) -> None:
     terminal.ask(lambda client: client.deliveries(webhook_id), _delivery_table)
 
 
+def repeat(ctx: typer.Context, webhook_id: str, delivery_id: str) -> None:
+    """Have an event sent once more, under the same id."""
+    terminal: Terminal = ctx.obj
+    with terminal.client() as client:
+        sent = client.repeat_delivery(webhook_id, delivery_id)
+    terminal.show(sent, lambda _: f"event {sent['event_id']} is on its way to webhook {webhook_id}")
+
+
 def _about(webhook: Document) -> dict[str, str]:
     return {
         "webhook": webhook["webhook_id"],
         "url": webhook["url"],
         "types": ", ".join(webhook.get("types") or ()) or "all",
         "map": webhook.get("map_id") or "all",
+        "status": webhook.get("status") or "",
+        "reason": webhook.get("reason") or "",
     }
 
 
 def _table(webhooks: Sequence[Document]) -> Table:
-    table = columns("webhook", "url", "types", "map")
+    table = columns("webhook", "url", "types", "map", "status", "reason")
     for webhook in webhooks:
         table.add_row(*_about(webhook).values())
     return table
@@ -92,8 +100,8 @@ def _whole(webhook: Document) -> Group:
 
 
 def _delivery_table(deliveries: Sequence[Document]) -> Table:
-    names = ("event_id", "type", "status", "attempts")
-    table = columns("event", *names[1:])
+    names = ("delivery_id", "event_id", "kind", "type", "status", "attempts", "answered", "error")
+    table = columns("delivery", "event", *names[2:])
     for delivery in deliveries:
-        table.add_row(*(str(delivery.get(name, "")) for name in names))
+        table.add_row(*(str(delivery.get(name) or "") for name in names))
     return table

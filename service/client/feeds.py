@@ -44,7 +44,11 @@ class Webhook(TypedDict):
     webhook_id: str
     url: str
     types: list[str] | None  #: None: all
-    map_id: str | None  #: None: of all maps
+    map_id: str | None  #: None: of all maps, and of none
+    status: Literal["active", "disabled"]
+    reason: str | None  #: why it is disabled, or what it missed
+    position: int  #: `sequence` of the last event that it needs no more
+    attempts: int  #: that failed, at the event behind that
 
 
 class NewWebhook(Webhook):
@@ -54,12 +58,17 @@ class NewWebhook(Webhook):
 
 
 class Delivery(TypedDict):
-    """One event on its way to a webhook."""
+    """One event that was sent to a webhook, or is to be."""
 
+    delivery_id: str
+    webhook_id: str
+    kind: Literal["event", "ping", "repeat"]
     event_id: str
     type: str
-    status: str
+    status: Literal["pending", "delivered", "failed"]
     attempts: int
+    answered: int | None  #: HTTP status of the last answer
+    error: str | None  #: why the last attempt failed
 
 
 def event_of(told: ServerSentEvent) -> Event:

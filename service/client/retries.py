@@ -1,7 +1,8 @@
 """When a call is tried again, and after how long: what both clients know of it, without doing any of it.
 
 A call is tried again where it may be: GET, HEAD, PUT and DELETE mean the same however often they are sent (RFC 9110,
-Section 9.2.2), and every POST carries an `Idempotency-Key` of its own, the same in each attempt.
+Section 9.2.2), and every POST carries an `Idempotency-Key` of its own, the same in each attempt. POST of webhooks
+takes no key (a secret is not kept for a second answer), and is tried again where it surely did not arrive.
 """
 
 from __future__ import annotations
@@ -17,6 +18,8 @@ from service.client.errors import ClientError, RequestRefused, Unreachable
 
 #: Statuses that pass: too many requests, and a service (or what stands in front of it) that is not up.
 PASSING = frozenset({429, 502, 503, 504})
+UNTOUCHED = frozenset({429, 503})  #: those of them that are sent before anything is done
+NO_CONNECTION = (httpx.ConnectError, httpx.ConnectTimeout)
 CONFLICT = 409  #: passes where it names a time: the first request of the same key is still under way
 WRONG = (httpx.UnsupportedProtocol, httpx.LocalProtocolError)  #: of the caller's making, and so for good
 FIRST_CONTACT_S = 2.0  #: where nobody has answered yet, the address is more likely wrong than the network bad
@@ -63,6 +66,13 @@ def passes(error: BaseException) -> bool:
     if isinstance(error, RequestRefused):
         return error.status in PASSING or (error.status == CONFLICT and error.retry_after_s is not None)
     return isinstance(error, Unreachable) and not isinstance(error.__cause__, WRONG)
+
+
+def never_arrived(error: BaseException) -> bool:
+    """Tell the same of a request that may be carried out once alone: whether it surely was not, and may be later."""
+    if isinstance(error, RequestRefused):
+        return error.status in UNTOUCHED
+    return isinstance(error, Unreachable) and isinstance(error.__cause__, NO_CONNECTION)
 
 
 def error_of(state: RetryCallState) -> BaseException:

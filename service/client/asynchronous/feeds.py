@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import AsyncGenerator, AsyncIterator, Sequence
 from contextlib import aclosing
-from typing import Any
+from typing import Any, Literal
 
 import anyio
 import httpx
@@ -84,8 +84,8 @@ class AsyncFeeds(AsyncConnection):
         self, url: str, *, types: Sequence[str] | None = None, map_id: str | None = None
     ) -> NewWebhook:
         """Have events sent to an address; the answer tells the secret of the signatures, now and never again."""
-        body = given(url=url, types=None if types is None else list(types), map_id=map_id)
-        return await self._json(NewWebhook, "POST", "/webhooks", json=body)
+        body = given(url=url, types=None if types is None else list(types), map=map_id)
+        return await self._json(NewWebhook, "POST", "/webhooks", json=body, keyed=False)
 
     async def webhooks(self) -> list[Webhook]:
         """Return every webhook."""
@@ -99,14 +99,31 @@ class AsyncFeeds(AsyncConnection):
         """Have no more events sent."""
         await self._delete(f"/webhooks/{quoted(webhook_id)}")
 
-    async def ping_webhook(self, webhook_id: str) -> None:
+    async def change_webhook(
+        self,
+        webhook_id: str,
+        *,
+        url: str | None = None,
+        types: Sequence[str] | None = None,
+        status: Literal["active", "disabled"] | None = None,
+    ) -> Webhook:
+        """Change what is given; `types` of none are all. Switched on again, it gets what it missed meanwhile."""
+        body = given(url=url, types=None if types is None else list(types), status=status)
+        return await self._json(Webhook, "PATCH", f"/webhooks/{quoted(webhook_id)}", json=body)
+
+    async def ping_webhook(self, webhook_id: str) -> Delivery:
         """Have an event sent that says nothing but that it arrives."""
-        await self._send("POST", f"/webhooks/{quoted(webhook_id)}/ping")
+        return await self._json(Delivery, "POST", f"/webhooks/{quoted(webhook_id)}/ping", keyed=False)
 
     async def rotate_webhook(self, webhook_id: str) -> NewWebhook:
         """Change the secret; for a day what is sent bears the signatures of both."""
-        return await self._json(NewWebhook, "POST", f"/webhooks/{quoted(webhook_id)}/rotate")
+        return await self._json(NewWebhook, "POST", f"/webhooks/{quoted(webhook_id)}/rotate", keyed=False)
 
     async def deliveries(self, webhook_id: str) -> list[Delivery]:
         """Return what was sent to a webhook, and what is still to be, newest first."""
         return await self._all(Delivery, f"/webhooks/{quoted(webhook_id)}/deliveries", "deliveries")
+
+    async def repeat_delivery(self, webhook_id: str, delivery_id: str) -> Delivery:
+        """Have an event sent once more, under the same id."""
+        path = f"/webhooks/{quoted(webhook_id)}/deliveries/{quoted(delivery_id)}/repeat"
+        return await self._json(Delivery, "POST", path, keyed=False)

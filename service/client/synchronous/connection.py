@@ -22,7 +22,7 @@ from service.client.requests import (
     next_href,
     strong_tag,
 )
-from service.client.retries import Retries, error_of, passes, was_done
+from service.client.retries import Retries, error_of, never_arrived, passes, was_done
 
 T = TypeVar("T")
 
@@ -70,13 +70,15 @@ class Connection:
     def _send(self, method: str, path: str, **request: Any) -> httpx.Response:
         """Return a successful answer; tried again as `retries` says.
 
-        `stream`: its body is still to be read; `earlier`: a list that takes what went wrong in the attempts before.
+        `stream`: its body is still to be read; `earlier`: a list that takes what went wrong in the attempts before;
+        `keyed`: False for a POST that takes no key, and is sent again only where it surely did not arrive.
         """
-        if method == "POST":
+        keyed = request.pop("keyed", True)
+        if method == "POST" and keyed:
             request["headers"] = {"Idempotency-Key": str(uuid4()), **request.get("headers", {})}
         errors: list[BaseException] = request.pop("earlier", [])
         retrying = Retrying(
-            retry=retry_if_exception(passes),
+            retry=retry_if_exception(passes if keyed else never_arrived),
             wait=self.retries.wait,
             stop=self.retries.stop(lambda: self._answered),
             before_sleep=lambda state: errors.append(error_of(state)),

@@ -6,7 +6,7 @@ from __future__ import annotations
 import time
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import closing
-from typing import Any
+from typing import Any, Literal
 
 import httpx
 from httpx_sse import EventSource, ServerSentEvent
@@ -85,8 +85,8 @@ class Feeds(Connection):
         self, url: str, *, types: Sequence[str] | None = None, map_id: str | None = None
     ) -> NewWebhook:
         """Have events sent to an address; the answer tells the secret of the signatures, now and never again."""
-        body = given(url=url, types=None if types is None else list(types), map_id=map_id)
-        return self._json(NewWebhook, "POST", "/webhooks", json=body)
+        body = given(url=url, types=None if types is None else list(types), map=map_id)
+        return self._json(NewWebhook, "POST", "/webhooks", json=body, keyed=False)
 
     def webhooks(self) -> list[Webhook]:
         """Return every webhook."""
@@ -100,14 +100,31 @@ class Feeds(Connection):
         """Have no more events sent."""
         self._delete(f"/webhooks/{quoted(webhook_id)}")
 
-    def ping_webhook(self, webhook_id: str) -> None:
+    def change_webhook(
+        self,
+        webhook_id: str,
+        *,
+        url: str | None = None,
+        types: Sequence[str] | None = None,
+        status: Literal["active", "disabled"] | None = None,
+    ) -> Webhook:
+        """Change what is given; `types` of none are all. Switched on again, it gets what it missed meanwhile."""
+        body = given(url=url, types=None if types is None else list(types), status=status)
+        return self._json(Webhook, "PATCH", f"/webhooks/{quoted(webhook_id)}", json=body)
+
+    def ping_webhook(self, webhook_id: str) -> Delivery:
         """Have an event sent that says nothing but that it arrives."""
-        self._send("POST", f"/webhooks/{quoted(webhook_id)}/ping")
+        return self._json(Delivery, "POST", f"/webhooks/{quoted(webhook_id)}/ping", keyed=False)
 
     def rotate_webhook(self, webhook_id: str) -> NewWebhook:
         """Change the secret; for a day what is sent bears the signatures of both."""
-        return self._json(NewWebhook, "POST", f"/webhooks/{quoted(webhook_id)}/rotate")
+        return self._json(NewWebhook, "POST", f"/webhooks/{quoted(webhook_id)}/rotate", keyed=False)
 
     def deliveries(self, webhook_id: str) -> list[Delivery]:
         """Return what was sent to a webhook, and what is still to be, newest first."""
         return self._all(Delivery, f"/webhooks/{quoted(webhook_id)}/deliveries", "deliveries")
+
+    def repeat_delivery(self, webhook_id: str, delivery_id: str) -> Delivery:
+        """Have an event sent once more, under the same id."""
+        path = f"/webhooks/{quoted(webhook_id)}/deliveries/{quoted(delivery_id)}/repeat"
+        return self._json(Delivery, "POST", path, keyed=False)

@@ -240,7 +240,8 @@ def test_webhooks_are_added_with_their_secret_listed_pinged_and_removed(
     service.answers = {
         "POST /webhooks": {**hook, "secret": "whsec_abc"},
         "GET /webhooks": {"webhooks": [hook], "links": []},
-        "POST /webhooks/webhook-1/ping": httpx.Response(202, json={}),
+        "POST /webhooks/webhook-1/ping": delivery,
+        "POST /webhooks/webhook-1/deliveries/delivery-1/repeat": delivery,
         "POST /webhooks/webhook-1/rotate": {**hook, "secret": "whsec_def"},
         "GET /webhooks/webhook-1/deliveries": {"deliveries": [delivery], "links": []},
         "DELETE /webhooks/webhook-1": httpx.Response(204),
@@ -252,16 +253,18 @@ def test_webhooks_are_added_with_their_secret_listed_pinged_and_removed(
         ["ping", "webhook-1"],
         ["rotate", "webhook-1"],
         ["deliveries", "webhook-1"],
+        ["repeat", "webhook-1", "delivery-1"],
         ["remove", "webhook-1"],
     ):
         assert spicd("webhooks", *words) == 0
         said[words[0]] = capsys.readouterr().out
-    asked = {"url": "https://here.example", "types": ["survey.ready"], "map_id": "lobby"}
+    asked = {"url": "https://here.example", "types": ["survey.ready"], "map": "lobby"}
     assert json.loads(service.requests[0].content) == asked
     assert "whsec_abc" in said["add"]
     assert "whsec" not in said["list"]
     assert "whsec_def" in said["rotate"]
     assert "delivered" in said["deliveries"]
+    assert "event-1" in said["repeat"]
     assert "is deleted" in said["remove"]
 
 

@@ -38,6 +38,7 @@ NAMES = {
 }
 #: Methods, with the parameters that may be named.
 METHODS = {
+    "change_webhook": "webhook_id url types status",
     "changes": "map_id filters",
     "changes_csv": "map_id filters",
     "create_map": "scan_ids map_id name model settings anchor poses idempotency_key",
@@ -63,6 +64,7 @@ METHODS = {
     "object": "map_id object_id",
     "objects": "map_id filters",
     "ping_webhook": "webhook_id",
+    "repeat_delivery": "webhook_id delivery_id",
     "retry": "job_id",
     "rotate_webhook": "webhook_id",
     "scan": "scan_id",

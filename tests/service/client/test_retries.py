@@ -174,3 +174,23 @@ def test_waiting_looks_less_and_less_often_and_heeds_retry_after(monkeypatch: py
     assert pauses[1:] == sorted(pauses[1:])
     assert pauses[1] < 0.4
     assert pauses[-1] == 2
+
+
+@pytest.mark.parametrize(
+    ("ending", "sent"),
+    [
+        (httpx.ReadError("the answer is lost"), 1),
+        (httpx.Response(502), 1),
+        (httpx.Response(429), 4),
+        (httpx.ConnectError("refused"), 4),
+    ],
+)
+def test_what_makes_a_secret_is_sent_again_only_where_it_surely_did_not_arrive(
+    monkeypatch: pytest.MonkeyPatch, ending: httpx.Response | Exception, sent: int
+) -> None:
+    monkeypatch.setattr("time.sleep", lambda seconds: None)
+    transport, requests = counting(ending)
+    with Client(transport=transport, retries=Retries(attempts=4)) as client, pytest.raises(ClientError):
+        client.rotate_webhook("webhook-1")
+    assert len(requests) == sent
+    assert "Idempotency-Key" not in requests[0].headers
