@@ -6,7 +6,7 @@ INSTALLED := $(VENV)/.installed
 SERVERS := build/servers
 TOOLS := build/tools
 
-.PHONY: help servers tools demo up test test-fast acceptance-shared check format bench chaos fuzz schemathesis load soak openapi clean
+.PHONY: help servers tools demo up test test-fast acceptance-shared check format bench chaos fuzz schemathesis load soak openapi client clean
 help: ## this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
 
@@ -62,6 +62,9 @@ soak: $(INSTALLED) ## two hours of light work; fails where a process grows
 
 openapi: $(INSTALLED) ## write openapi/openapi.json anew
 	$(BIN)/python -m service.api.openapi
+
+client: $(INSTALLED) $(TOOLS)/.installed ## write anew what service/client has of the API's description and of its async source
+	$(BIN)/python .ci/client.py
 
 clean: ## remove the environment and everything made
 	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache *.egg-info build demo bench

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Annotated
 
 import typer
@@ -9,7 +10,8 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
-from service.cli.tables import columns, facts
+from service.cli import completion
+from service.cli.tables import columns, facts, stage
 from service.cli.terminal import Terminal
 from service.client import ClientError, Document, sentence
 
@@ -18,7 +20,9 @@ _STYLES = {"successful": "green", "failed": "red", "dismissed": "yellow", "runni
 
 def jobs(
     ctx: typer.Context,
-    job_id: Annotated[str | None, typer.Argument(help="One job; left out: all.")] = None,
+    job_id: Annotated[
+        str | None, typer.Argument(help="One job; left out: all.", autocompletion=completion.jobs)
+    ] = None,
     cancel: Annotated[bool, typer.Option("--cancel", help="Stop it for good.")] = False,
     retry: Annotated[bool, typer.Option("--retry", help="Run a failed one again.")] = False,
     wait: Annotated[bool, typer.Option("--wait", help="Follow it to its end.")] = False,
@@ -41,18 +45,21 @@ def jobs(
         terminal.ask(lambda client: client.job(job_id), _whole)
 
 
-def _table(jobs: list[Document]) -> Table:
+def _table(jobs: Sequence[Document]) -> Table:
     table = columns("job", "kind", "status", "progress", "message", "created")
     for job in jobs:
         status = Text(job["status"], style=_STYLES.get(job["status"], ""))
-        message = Text(job.get("message") or "")
+        message = Text(stage(job) if job.get("queue_position") else job.get("message") or "")
         table.add_row(job["jobID"], job.get("processID"), status, _percent(job), message, job.get("created"))
     return table
 
 
 def _whole(job: Document) -> Group:
     shown = {**job, "job": job["jobID"], "progress": _percent(job)}
-    about = facts(shown, "job", "status", "progress", "message", "created", "started", "finished")
+    about = facts(
+        {**shown, "queue": stage(job) if job.get("queue_position") else None},
+        *("job", "status", "progress", "message", "queue", "created", "started", "finished"),
+    )
     problem = job.get("problem")
     return Group(about, Text(sentence(problem), style="red")) if problem else Group(about)
 

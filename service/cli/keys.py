@@ -50,7 +50,7 @@ def add(
     expires = None if days is None else datetime.now(UTC) + timedelta(days=days)
     with _keys(data_dir) as keys:
         record, secret = keys.add(name, scopes=scope, maps=map_id or None, expires=expires, secret=secret)
-    document = _document(record) | ({"secret": secret} if secret_file is None else {})
+    document = {**_document(record), **({"secret": secret} if secret_file is None else {})}
     if secret_file is None:
         terminal.note("keep the secret now: only its digest is stored")
     terminal.show(document, _whole)

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from importlib.metadata import version
 from typing import Annotated
 
 import typer
 
 from service.cli import (
     backups,
+    events,
     from_bag,
     jobs,
     keys,
@@ -22,11 +24,92 @@ from service.cli import (
     up,
     versions,
     watch,
+    webhooks,
 )
 from service.cli.terminal import Terminal
 from service.client import DEFAULT_URL, ClientError
 from service.up.embedded_redis import LaunchFailed
 
+#: Each command with an example of its use.
+ALONE: dict[Callable[..., None], str] = {
+    up.up: "up --port 8000 --data-dir data",
+    surveys.changes: "changes lobby --min-score 0.8 --csv > changes.csv",
+    objects.objects: "objects lobby --status new",
+    jobs.jobs: "jobs job-5f0c --wait",
+    sweep.sweep: "sweep --dry-run",
+    backups.backup: "backup /mnt/backup/monday",
+    backups.restore: "restore /mnt/backup/monday",
+}
+GROUPS: dict[str, tuple[str, dict[Callable[..., None], str]]] = {
+    "scans": (
+        "Scans: upload them, list them.",
+        {
+            scans.add: "add monday.pcd --device-id robot-7",
+            scans.list_: "list",
+            scans.show: "show scan-19df",
+            scans.delete: "delete scan-19df",
+            watch.watch: "watch /data/visits --map lobby",
+            from_bag.from_bag: "from-bag patrol.mcap --to /data/scans",
+        },
+    ),
+    "maps": (
+        "Reference maps.",
+        {
+            maps.create: "create monday.pcd --id lobby --wait",
+            maps.list_: "list",
+            maps.show: "show lobby",
+            maps.anchor: "anchor lobby --longitude 13.3777 --latitude 52.5163 --height 76 --heading 12.5",
+            maps.delete: "delete lobby",
+        },
+    ),
+    "versions": (
+        "Versions of a map.",
+        {
+            versions.add: "add lobby --survey survey-91c4 --wait",
+            versions.list_: "list lobby",
+            versions.show: "show lobby 2",
+            versions.delete: "delete lobby 1",
+        },
+    ),
+    "surveys": (
+        "Later visits of a mapped space.",
+        {
+            surveys.submit: "submit lobby tuesday.pcd --wait",
+            surveys.list_: "list lobby",
+            surveys.show: "show survey-91c4",
+            surveys.download: "download survey-91c4 --to tuesday",
+            surveys.delete: "delete survey-91c4",
+        },
+    ),
+    "events": (
+        "What happens, as it happens.",
+        {events.follow: "follow --type survey.ready --map lobby"},
+    ),
+    "webhooks": (
+        "Addresses that events are sent to.",
+        {
+            webhooks.add: "add https://dashboard.example.org/spicd --type survey.ready",
+            webhooks.list_: "list",
+            webhooks.ping: "ping webhook-7a01",
+            webhooks.deliveries: "deliveries webhook-7a01",
+            webhooks.repeat: "repeat webhook-7a01 delivery-88a0",
+            webhooks.rotate: "rotate webhook-7a01",
+            webhooks.remove: "remove webhook-7a01",
+        },
+    ),
+    "keys": (
+        "API keys: who may ask the service.",
+        {
+            keys.add: "add 'robot 7' --scope scans:write --scope surveys:write --map lobby --days 365",
+            keys.list_: "list",
+            keys.revoke: "revoke key-5d20",
+        },
+    ),
+    "models": (
+        "Models that score tiles; alone, it lists them.",
+        {models.train: "train lobby --minutes 10 --wait"},
+    ),
+}
 _GLOBAL_FLAGS = ("--json",)
 _GLOBAL_OPTIONS = ("--url",)
 
@@ -45,38 +128,32 @@ def _commands() -> typer.Typer:
     commands = typer.Typer(
         name="spicd",
         no_args_is_help=True,
-        add_completion=False,
         pretty_exceptions_enable=False,
         help="Says what changed in a building: LiDAR scans in, changed objects and tiles out.",
+        epilog="Example: spicd --install-completion, then spicd maps show and the tabulator key",
     )
     commands.callback()(_options)
-    commands.command()(up.up)
-    commands.command()(sweep.sweep)
-    commands.command()(backups.backup)
-    commands.command()(backups.restore)
-    _add_group(commands, "scans", "Upload scans.", scans.add, watch.watch, from_bag.from_bag)
-    _add_group(commands, "maps", "Reference maps.", maps.create, maps.list_, maps.show, maps.delete)
-    of_versions = (versions.add, versions.list_, versions.show, versions.delete)
-    _add_group(commands, "versions", "Versions of a map.", *of_versions)
-    of_surveys = (surveys.submit, surveys.list_, surveys.show)
-    _add_group(commands, "surveys", "Later visits of a mapped space.", *of_surveys)
-    commands.command()(surveys.changes)
-    commands.command()(objects.objects)
-    commands.command()(jobs.jobs)
-    _add_group(commands, "keys", "API keys: who may ask the service.", keys.add, keys.list_, keys.revoke)
-    of_models = _add_group(commands, "models", "Models that score tiles; alone, it lists them.", models.train)
-    of_models.info.no_args_is_help = False
-    of_models.callback(invoke_without_command=True)(models.list_)
+    for function, example in ALONE.items():
+        _add(commands, function, example)
+    for name, (help_text, functions) in GROUPS.items():
+        group = typer.Typer(no_args_is_help=name != "models", help=help_text)
+        for function, example in functions.items():
+            _add(group, function, f"{name} {example}")
+        commands.add_typer(group, name=name)
+        if name == "models":
+            group.callback(invoke_without_command=True)(models.list_)
     return commands
 
 
-def _add_group(commands: typer.Typer, name: str, help_text: str, *group: Callable[..., None]) -> typer.Typer:
-    """Add a group of commands to the command line, each under the name of its function."""
-    added = typer.Typer(no_args_is_help=True, help=help_text)
-    for command in group:
-        added.command(command.__name__.rstrip("_").replace("_", "-"))(command)
-    commands.add_typer(added, name=name)
-    return added
+def _add(group: typer.Typer, function: Callable[..., None], example: str) -> None:
+    """Add a command under the name of its function, with an example below its help."""
+    group.command(function.__name__.rstrip("_").replace("_", "-"), epilog=f"Example: spicd {example}")(function)
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"spicd {version('spicd')}")
+        raise typer.Exit
 
 
 def _options(
@@ -84,6 +161,12 @@ def _options(
     url: Annotated[str, typer.Option(envvar="SPICD_URL", help="Address of the service.")] = DEFAULT_URL,
     as_json: Annotated[
         bool, typer.Option("--json", help="Results as JSON on stdout, nothing else there.")
+    ] = False,
+    _: Annotated[
+        bool,
+        typer.Option(
+            "--version", callback=_version, is_eager=True, help="What is installed, and nothing else."
+        ),
     ] = False,
 ) -> None:
     ctx.obj = Terminal(url=url, as_json=as_json)

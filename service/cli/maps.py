@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Annotated
 
 import typer
 from rich.console import Group
 from rich.table import Table
 
+from service.cli.completion import MapId
 from service.cli.tables import columns, counts, facts, point, scan_table
 from service.cli.terminal import Captured, Device, Model, Scans, Terminal, Wait
-from service.client import Document
+from service.client import ClientError, Document
 
 
 def create(
@@ -43,24 +45,58 @@ def list_(ctx: typer.Context) -> None:
     terminal.ask(lambda client: client.maps(), _table)
 
 
-def show(ctx: typer.Context, map_id: str) -> None:
+def show(ctx: typer.Context, map_id: MapId) -> None:
     """One map with its scans."""
     terminal: Terminal = ctx.obj
     terminal.ask(lambda client: client.map(map_id), _whole)
 
 
-def delete(ctx: typer.Context, map_id: str) -> None:
+def anchor(
+    ctx: typer.Context,
+    map_id: MapId,
+    longitude: Annotated[float | None, typer.Option(help="Of the map's origin, WGS 84, degrees.")] = None,
+    latitude: Annotated[float | None, typer.Option(help="Likewise.")] = None,
+    height: Annotated[float, typer.Option(help="Metres above the ellipsoid.")] = 0.0,
+    heading: Annotated[
+        float, typer.Option(help="Degrees, clockwise from true north to the map's x axis.")
+    ] = 0.0,
+    remove: Annotated[bool, typer.Option("--remove", help="Nobody knows where it lies.")] = False,
+) -> None:
+    """Say where a map lies on the Earth, so that answers have longitude and latitude; alone: show it."""
+    terminal: Terminal = ctx.obj
+    if (longitude is None) != (latitude is None) or (remove and longitude is not None):
+        raise ClientError(
+            "give --longitude and --latitude, or --remove, or neither to see where the map lies"
+        )
+    with terminal.client() as client:
+        if remove:
+            client.set_anchor(map_id, None)
+        elif longitude is not None:
+            place = {"longitude": longitude, "latitude": latitude, "height": height, "heading": heading}
+            client.set_anchor(map_id, place)
+        placed = client.map(map_id)["anchor"]
+    terminal.show({"map_id": map_id, "anchor": placed}, _anchor)
+
+
+def delete(ctx: typer.Context, map_id: MapId) -> None:
     """Remove a map with its versions and surveys."""
     terminal: Terminal = ctx.obj
     terminal.delete(lambda client: client.delete_map(map_id), f"map {map_id}", map_id=map_id)
 
 
-def _table(maps: list[Document]) -> Table:
+def _table(maps: Sequence[Document]) -> Table:
     table = columns("map", "name", "status", "scans", "counts", "created")
     for one in maps:
         scans = str(one.get("scan_count", len(one.get("scans", []))))
         table.add_row(one["map_id"], one.get("name"), one["status"], scans, counts(one), one.get("created"))
     return table
+
+
+def _anchor(document: Document) -> Table | str:
+    place = document["anchor"]
+    if place is None:
+        return f"nobody said where map {document['map_id']} lies"
+    return facts({"map": document["map_id"], **place}, "map", "longitude", "latitude", "height", "heading")
 
 
 def _whole(document: Document) -> Group:
@@ -69,5 +105,6 @@ def _whole(document: Document) -> Group:
     about = {"map": document["map_id"]}
     rows = {"counts": counts(document), "objects": counts(document, "objects"), "bounds (m)": corners}
     return Group(
-        facts(about | document, "map", "name", "version", "status", "model", **rows), scan_table(document)
+        facts({**about, **document}, "map", "name", "version", "status", "model", **rows),
+        scan_table(document),
     )

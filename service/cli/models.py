@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Annotated
 
 import typer
 from rich.console import Group
 from rich.table import Table
 
+from service.cli.completion import MapId
 from service.cli.tables import columns, facts, number
 from service.cli.terminal import Terminal, Wait
 from service.client import Document
@@ -23,7 +25,7 @@ def list_(ctx: typer.Context) -> None:
 
 def train(
     ctx: typer.Context,
-    map_id: str,
+    map_id: MapId,
     name: Annotated[str | None, typer.Option(help="Left out: the map's id and `-net`.")] = None,
     base: Annotated[
         str | None, typer.Option(help="`name/version` to train further; left out: from nothing.")
@@ -40,7 +42,7 @@ def train(
         terminal.accepted(client, f"model {model}", accepted, wait, lambda: client.model(model), _whole)
 
 
-def _table(cards: list[Document]) -> Table:
+def _table(cards: Sequence[Document]) -> Table:
     table = columns("model", "detector", "threshold", "summary")
     for card in cards:
         table.add_row(_name(card), *(str(card.get(key, "")) for key in ("detector", "threshold", "summary")))

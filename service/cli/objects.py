@@ -7,6 +7,7 @@ from typing import Annotated, Any
 import typer
 from rich.console import Group
 
+from service.cli.completion import MapId
 from service.cli.tables import columns, facts, number, point
 from service.cli.terminal import Terminal
 from service.client import Client, ClientError, Document
@@ -14,7 +15,7 @@ from service.client import Client, ClientError, Document
 
 def objects(
     ctx: typer.Context,
-    map_id: str,
+    map_id: MapId,
     object_id: Annotated[str | None, typer.Argument(help="Only this one, with each sighting of it.")] = None,
     survey: Annotated[str | None, typer.Option(help="As this survey saw them.")] = None,
     kind: Annotated[str | None, typer.Option(help="appeared, disappeared or moved.")] = None,
@@ -49,7 +50,10 @@ def objects(
         _refuse("of one survey there is --kind and --min-probability", **over_time)
         terminal.ask(lambda client: _of_survey(client, map_id, survey, **common, limit=limit), _seen_table)
     else:
-        terminal.ask(lambda client: client.objects(map_id, **common, **over_time, limit=limit), _object_table)
+        # else the Earth's frame, of a map that has an anchor
+        frame = {"bbox-crs": None if bbox is None else "map"}
+        filters = {**common, **over_time, **frame}
+        terminal.ask(lambda client: client.objects(map_id, **filters, limit=limit), _object_table)
 
 
 def _refuse(why: str, **filters: Any) -> None:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
 import typer
 from rich.table import Table
 
-from service.cli.tables import columns, warnings
+from service.cli.completion import ScanId
+from service.cli.tables import columns, facts, warnings
 from service.cli.terminal import Captured, Device, Frame, Terminal, read_pose
 from service.client import ClientError, Document
 
@@ -36,7 +38,43 @@ def add(
     terminal.ask(lambda client: [terminal.upload(client, file, **about) for file in files], _table)
 
 
-def _table(scans: list[Document]) -> Table:
+def list_(ctx: typer.Context) -> None:
+    """Every scan, newest first."""
+    terminal: Terminal = ctx.obj
+    terminal.ask(lambda client: client.scans(), _list_table)
+
+
+def show(ctx: typer.Context, scan_id: ScanId) -> None:
+    """What is known of one scan."""
+    terminal: Terminal = ctx.obj
+    terminal.ask(lambda client: client.scan(scan_id), _whole)
+
+
+def delete(ctx: typer.Context, scan_id: ScanId) -> None:
+    """Remove a scan that no map and no survey is made of."""
+    terminal: Terminal = ctx.obj
+    terminal.delete(lambda client: client.delete_scan(scan_id), f"scan {scan_id}", scan_id=scan_id)
+
+
+def _list_table(scans: Sequence[Document]) -> Table:
+    table = columns("scan", "file", "bytes", "device", "captured", "pose", "warnings")
+    for scan in scans:
+        posed = "" if scan.get("pose") is None else "yes"
+        about = (scan.get(name) for name in ("device_id", "captured_at"))
+        row = (scan["scan_id"], scan["filename"], f"{scan['size']:,}", *about, posed, warnings(scan))
+        table.add_row(*row)
+    return table
+
+
+def _whole(scan: Document) -> Table:
+    pose = scan.get("pose")
+    rows = None if pose is None else "\n".join(" ".join(f"{number:9.4f}" for number in row) for row in pose)
+    shown = {"scan": scan["scan_id"], "file": scan["filename"], "bytes": f"{scan['size']:,}", **scan}
+    names = ("scan", "file", "format", "bytes", "sha256", "device_id", "captured_at", "frame", "created")
+    return facts(shown, *names, **{"pose (map_from_sensor)": rows, "warnings": warnings(scan)})
+
+
+def _table(scans: Sequence[Document]) -> Table:
     table = columns("scan", "file", "bytes", "sha256", "warnings")
     for scan in scans:
         table.add_row(

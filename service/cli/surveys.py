@@ -2,21 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Annotated
+import itertools
+import json
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Annotated, Any
 
 import typer
 from rich.console import Group
 from rich.table import Table
 
+from service.cli.completion import MapId, SurveyId
 from service.cli.tables import columns, counts, facts, number, placement, point, scan_table, warnings
 from service.cli.terminal import Captured, Device, Model, Scans, Terminal, Wait
-from service.client import Document
+from service.client import Client, ClientError, Document
+from service.client.documents import SurveyDocument
+
+CSV_PAGE = OBJECTS_PAGE = 1000  #: in one answer
 
 
 def submit(
     ctx: typer.Context,
-    map_id: str,
+    map_id: MapId,
     scans: Scans,
     model: Model = None,
     threshold: Annotated[float | None, typer.Option(help="Probability of change, 0 to 1.")] = None,
@@ -26,7 +33,7 @@ def submit(
 ) -> None:
     """Compare scans with a map."""
     terminal: Terminal = ctx.obj
-    about = {"device_id": device_id, "captured_at": captured_at}
+    about: dict[str, Any] = {"device_id": device_id, "captured_at": captured_at}
     with terminal.client() as client:
         ids = terminal.scan_ids(client, scans, **about)
         accepted = client.submit_survey(map_id, ids, model=model, threshold=threshold, **about)
@@ -41,37 +48,106 @@ def submit(
         )
 
 
-def list_(ctx: typer.Context, map_id: str) -> None:
+def list_(ctx: typer.Context, map_id: MapId) -> None:
     """Every survey of a map."""
     terminal: Terminal = ctx.obj
     terminal.ask(lambda client: client.surveys(map_id), _table)
 
 
-def show(ctx: typer.Context, survey_id: str) -> None:
+def show(ctx: typer.Context, survey_id: SurveyId) -> None:
     """One survey with its placement, its scans and counts."""
     terminal: Terminal = ctx.obj
     terminal.ask(lambda client: client.survey(survey_id), _whole(terminal.url))
 
 
+def delete(ctx: typer.Context, survey_id: SurveyId) -> None:
+    """Remove a survey with its results."""
+    terminal: Terminal = ctx.obj
+    name = f"survey {survey_id}"
+    terminal.delete(lambda client: client.delete_survey(survey_id), name, survey_id=survey_id)
+
+
+def download(
+    ctx: typer.Context,
+    survey_id: SurveyId,
+    to: Annotated[
+        Path | None,
+        typer.Option(help="Folder; left out: one that is named like the survey.", file_okay=False),
+    ] = None,
+) -> None:
+    """Fetch what a survey found: cloud, picture, tiles and objects. A connection that breaks is taken up."""
+    terminal: Terminal = ctx.obj
+    folder = to or Path(survey_id)
+    with terminal.client() as client:
+        survey = client.survey(survey_id)
+        refused = survey["status"] == "failed" and _placed(survey) == "refused"
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            names = ("picture.png",) if refused else ("cloud.ply", "picture.png")
+            files = [
+                terminal.download(client, f"/surveys/{survey_id}/{name}", folder / name) for name in names
+            ]
+            if not refused:
+                files += _features(client, survey, folder)
+        except OSError as error:
+            raise ClientError(f"{folder}: cannot be written ({error.strerror})") from error
+    document: dict[str, Any] = {"survey_id": survey_id, "files": {path.name: str(path) for path in files}}
+    terminal.show(document, lambda told: "\n".join(told["files"].values()))
+
+
+def _features(client: Client, survey: SurveyDocument, folder: Path) -> Iterator[Path]:
+    """Write tiles and, where the survey tells any, objects as GeoJSON, all pages in one. Raises OSError."""
+    pages: dict[str, Document] = {"tiles": client.tiles(survey["survey_id"])}
+    if survey["objects"] is not None:
+        pages["objects"] = client.survey_objects(survey["survey_id"], limit=OBJECTS_PAGE)
+    for name, first in pages.items():
+        features = list(first["features"])
+        page: Document | None = first
+        while page := client.next_page(page):
+            features += page["features"]
+        whole = {**first, "features": features, "numberReturned": len(features), "links": []}
+        path = folder / f"{name}.geojson"
+        path.write_text(json.dumps(whole))
+        yield path
+
+
 def changes(
     ctx: typer.Context,
-    map_id: str,
+    map_id: MapId,
     survey: Annotated[str | None, typer.Option(help="Of this survey only.")] = None,
     bbox: Annotated[str | None, typer.Option(help="4 or 6 numbers with commas, map frame, metres.")] = None,
     datetime: Annotated[str | None, typer.Option(help="Instant or interval, `..` for open.")] = None,
     min_score: Annotated[float | None, typer.Option("--min-score", help="Probability of change.")] = None,
     repeats: Annotated[bool, typer.Option("--repeats", help="Once for each visit that saw it.")] = False,
-    limit: Annotated[int, typer.Option(help="At most so many.")] = 100,
+    limit: Annotated[int | None, typer.Option(min=1, help="At most so many; 100, of --csv all.")] = None,
+    csv: Annotated[bool, typer.Option("--csv", help="As CSV on stdout, the names of columns first.")] = False,
 ) -> None:
     """The changed tiles of a map, each change once, newest first."""
     terminal: Terminal = ctx.obj
-    filters = {"survey": survey, "bbox": bbox, "datetime": datetime, "min_score": min_score, "limit": limit}
+    if csv and terminal.as_json:
+        raise ClientError("--csv and --json are two forms of the same; leave one out")
+    most = CSV_PAGE if csv else 100
+    frame = None if bbox is None else "map"  # else the Earth's, of a map that has an anchor
+    filters = {
+        "survey": survey,
+        "bbox": bbox,
+        "bbox-crs": frame,
+        "datetime": datetime,
+        "min_score": min_score,
+    }
+    filters["limit"] = most if limit is None else min(limit, most) if csv else limit
     if repeats:
         filters["repeats"] = True
+    if csv:
+        with terminal.client() as client:
+            rows = client.changes_csv(map_id, **filters)
+            for line in itertools.islice(rows, None if limit is None else limit + 1):
+                terminal.line(line)
+        return
     terminal.ask(lambda client: client.changes(map_id, **filters), _change_table)
 
 
-def _table(surveys: list[Document]) -> Table:
+def _table(surveys: Sequence[Document]) -> Table:
     table = columns("survey", "status", "captured", "scans", "placement", "counts")
     for one in surveys:
         scans = str(one.get("scan_count", len(one.get("scans", []))))
@@ -106,12 +182,17 @@ def _whole(url: str) -> Callable[[Document], Group]:
             }
             if survey.get("objects") is not None:
                 rows["things"] = f"{here}/objects"
-        elif (survey.get("placement") or {}).get("state") == "refused":
+        elif _placed(survey) == "refused":
             rows["picture"] = f"{here}/picture.png"
         names = ("survey", "map", "status", "captured", "model", "threshold")
-        return Group(facts(survey | about, *names, **rows), scan_table(survey))
+        return Group(facts({**survey, **about}, *names, **rows), scan_table(survey))
 
     return draw
+
+
+def _placed(survey: Document) -> str | None:
+    """Return the state of a survey's placement, of a refused one the picture tells why."""
+    return (survey.get("placement") or {}).get("state")
 
 
 def _change_table(collection: Document) -> Group:

@@ -70,6 +70,15 @@ def placement(survey: Document) -> str:
     return words(told["state"]) + ("" if confidence is None else f" (confidence {confidence:.2f})")
 
 
+def stage(job: Document) -> str:
+    """Write what a job does, or how long it has waited and which one it is in its queue."""
+    position, waited_s = job.get("queue_position"), job.get("waiting_s")
+    if position is None:
+        return str(job.get("message") or job["status"])
+    waited = "" if waited_s is None else f", for {waited_s:.0f} s so far"
+    return f"waiting, number {position} in the queue{waited}"
+
+
 def words(name: str) -> str:
     """Write a value of a list as words: `in_doubt` as `in doubt`."""
     return name.replace("_", " ")

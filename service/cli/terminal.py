@@ -25,6 +25,7 @@ from rich.progress import (
     TimeElapsedColumn,
 )
 
+from service.cli.tables import stage
 from service.client import Client, ClientError, Document, JobFailed, OnProgress, Pose
 from service.resumable import OnSent, default_memory
 from service.sidecars import SidecarError, read_pose_text, read_sidecar
@@ -102,6 +103,11 @@ class Terminal:
                 accepted, lambda _: f"{name}: job {job_id} is on its way, `spicd jobs {job_id}` shows it"
             )
 
+    def line(self, text: str) -> None:
+        """Print one line of a result that comes line by line, as it is."""
+        sys.stdout.write(f"{text}\n")
+        sys.stdout.flush()
+
     def note(self, text: str) -> None:
         """Tell a person something that is no result."""
         self.err.print(text, highlight=False, soft_wrap=True)
@@ -109,6 +115,14 @@ class Terminal:
     def fail(self, text: str) -> None:
         """Say in one line what went wrong."""
         self.err.print(text, style="bold red", highlight=False, soft_wrap=True)
+
+    def download(self, client: Client, path: str, to: Path) -> Path:
+        """Fetch one file under a progress bar. Raises `ClientError`, and OSError where it cannot be written."""
+        with self._bar(_title(), BarColumn(), DownloadColumn()) as bar:
+            task = bar.add_task(to.name, total=None)
+            return client.download(
+                path, to, lambda received, size: bar.update(task, completed=received, total=size)
+            )
 
     def upload(self, client: Client, path: Path, **about: Any) -> Document:
         """Send one file under a progress bar, resumed where it was broken off; what its sidecar says counts as said.
@@ -187,7 +201,7 @@ def _advance(bar: Progress) -> OnProgress:
     task = bar.add_task("waiting", total=100)
 
     def advance(job: Document) -> None:
-        bar.update(task, description=job.get("message") or job["status"], completed=job.get("progress") or 0)
+        bar.update(task, description=stage(job), completed=job.get("progress") or 0)
 
     return advance
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Annotated
 
 import typer
 from rich.console import Group
 from rich.table import Table
 
+from service.cli.completion import MapId
 from service.cli.tables import columns, counts, facts, scan_table
 from service.cli.terminal import Captured, Device, Terminal, Wait
 from service.client import Document
@@ -19,7 +21,7 @@ Further = Annotated[
 
 def add(
     ctx: typer.Context,
-    map_id: str,
+    map_id: MapId,
     scans: Further = None,
     survey: Annotated[str | None, typer.Option(help="Take over what this survey found changed.")] = None,
     device_id: Device = None,
@@ -36,19 +38,19 @@ def add(
         terminal.accepted(client, name, accepted, wait, lambda: client.version(map_id, version), _whole)
 
 
-def list_(ctx: typer.Context, map_id: str) -> None:
+def list_(ctx: typer.Context, map_id: MapId) -> None:
     """Every version of a map."""
     terminal: Terminal = ctx.obj
     terminal.ask(lambda client: client.versions(map_id), _table)
 
 
-def show(ctx: typer.Context, map_id: str, version: int) -> None:
+def show(ctx: typer.Context, map_id: MapId, version: int) -> None:
     """One version with its scans."""
     terminal: Terminal = ctx.obj
     terminal.ask(lambda client: client.version(map_id, version), _whole)
 
 
-def delete(ctx: typer.Context, map_id: str, version: int) -> None:
+def delete(ctx: typer.Context, map_id: MapId, version: int) -> None:
     """Remove a version that is not in use; surveys compared with it stay."""
     terminal: Terminal = ctx.obj
     name = f"version {version} of map {map_id}"
@@ -64,7 +66,7 @@ def _made_from(one: Document) -> str:
     return f"version {base} and {f'survey {survey_id}' if survey_id else 'further scans'}"
 
 
-def _table(versions: list[Document]) -> Table:
+def _table(versions: Sequence[Document]) -> Table:
     table = columns("version", "status", "made from", "scans", "counts", "created")
     for one in versions:
         scans = str(one.get("scan_count", len(one.get("scans", []))))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from typing import Any
@@ -73,7 +73,7 @@ def grid_of(manifest: dict[str, Any]) -> TileGrid:
 
 
 def judge(
-    features: Sequence[dict[str, Any]], truth: TileTruth, edits: Sequence[tuple[str, TileTruth]]
+    features: Sequence[Mapping[str, Any]], truth: TileTruth, edits: Sequence[tuple[str, TileTruth]]
 ) -> Judgement:
     """Compare every feature of `/surveys/{id}/tiles` with the truth; `edits` names each edit with its own truth."""
     tiles = [feature["properties"] for feature in features]

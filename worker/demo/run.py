@@ -125,8 +125,8 @@ def _through_the_service(
         with _step(progress, "upload the first visit") as step:
             first = _uploaded(client, story.first, step)
         with _step(progress, "build the map") as step:
-            accepted = client.create_map(first, map_id=MAP_ID, name="The demo's office", model=settings.model)
-            client.wait(accepted["job_id"], step.follow)
+            building = client.create_map(first, map_id=MAP_ID, name="The demo's office", model=settings.model)
+            client.wait(building["job_id"], step.follow)
         with _step(progress, "upload the second visit") as step:
             second = _uploaded(client, story.second, step)
         with _step(progress, "compare it with the map") as step:

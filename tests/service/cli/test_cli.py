@@ -107,7 +107,7 @@ def service(monkeypatch: pytest.MonkeyPatch) -> Service:
     monkeypatch.delenv("SPICD_URL", raising=False)
     monkeypatch.setenv("COLUMNS", "200")
     monkeypatch.setattr(terminal, "Client", lambda url: Client(url, transport=httpx.MockTransport(service)))
-    monkeypatch.setattr("service.client.time.sleep", lambda seconds: None)
+    monkeypatch.setattr("time.sleep", lambda seconds: None)
     return service
 
 
@@ -364,6 +364,7 @@ def test_changes_passes_its_filters_on_and_lists_the_tiles(
     )
     assert dict(service.requests[0].url.params) == {
         "bbox": "0,0,3,3",
+        "bbox-crs": "map",
         "min_score": "0.5",
         "datetime": "2026-03-01T00:00:00Z/..",
         "limit": "100",
@@ -411,6 +412,7 @@ def test_objects_passes_its_filters_on_and_lists_the_things(
         "transient": "true",
         "min_probability": "0.5",
         "bbox": "0,0,3,3",
+        "bbox-crs": "map",
         "limit": "100",
     }
     shown = " ".join(capsys.readouterr().out.split())

@@ -1,0 +1,97 @@
+"""The client and the API together, behind a network that loses every second answer of what it brought there."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import httpx
+import pytest
+
+from service.catalog.catalog import Catalog
+from service.client import Client, RequestRefused, Retries
+from tests.support.samples import (
+    RememberingQueue,
+    add_map,
+    add_survey,
+    catalog_of,
+    ply,
+    running,
+    settings_in,
+    tile,
+)
+
+QUICK = Retries(first_pause_s=0.001)
+
+
+class Losing(httpx.BaseTransport):
+    """Hands every request on to the service, and loses every second answer."""
+
+    def __init__(self, way: httpx.BaseTransport) -> None:
+        self.way, self.sent = way, 0
+
+    def handle_request(self, request: httpx.Request) -> httpx.Response:
+        self.sent += 1
+        answer = self.way.handle_request(request)
+        if self.sent % 2:
+            raise httpx.ReadError("the link is gone", request=request)
+        return answer
+
+
+@pytest.fixture
+def parts(tmp_path: Path) -> Iterator[tuple[Client, Catalog, Losing]]:
+    with running(settings_in(tmp_path), RememberingQueue()) as service:
+        losing = Losing(service._transport)
+        with Client("http://localhost", transport=losing, retries=QUICK) as client:
+            yield client, catalog_of(service), losing
+
+
+def test_each_thing_is_made_once_though_every_answer_is_lost_at_first(
+    parts: tuple[Client, Catalog, Losing],
+) -> None:
+    client, catalog, losing = parts
+    add_map(catalog, "hall")
+    scans = [client.upload_scan(ply(name), filename=f"{name}.ply")["scan_id"] for name in "abc"]
+    for scan_id in scans:
+        client.create_map([scan_id])
+        client.submit_survey("hall", [scan_id])
+    client.create_version("hall", [scans[0]])  # one builds at a time
+    assert losing.sent == 2 * 10
+    assert len(catalog.maps.page().items) == 1 + 3
+    assert len(catalog.surveys.page("hall").items) == 3
+    assert len(catalog.versions.page("hall").items) == 1 + 1
+    assert {scan["scan_id"] for scan in client.scans()} > set(scans)
+
+
+def test_what_is_deleted_is_gone_without_an_error(parts: tuple[Client, Catalog, Losing]) -> None:
+    client, catalog, _ = parts
+    scan_id = client.upload_scan(ply("alone"))["scan_id"]
+    add_map(catalog, "hall")
+    survey_id, _ = add_survey(catalog, map_id="hall")
+    client.delete_scan(scan_id)
+    client.delete_survey(survey_id)
+    client.delete_map("hall")
+    assert client.maps() == []
+    with pytest.raises(RequestRefused, match="hall"):
+        client.map("hall")
+
+
+def test_the_csv_of_changes_is_what_the_service_writes(parts: tuple[Client, Catalog, Losing]) -> None:
+    client, catalog, _ = parts
+    add_map(catalog, "hall")
+    tiles = [tile(number, 0) for number in range(3)]
+    add_survey(catalog, tiles, map_id="hall")
+    names, *rows = client.changes_csv("hall", limit=1)
+    assert {"tile_id", "score", "survey_id"} <= set(names.split(","))
+    assert len(rows) == 3 == client.changes("hall")["numberMatched"]
+
+
+def test_a_key_that_the_caller_keeps_makes_one_thing_in_two_processes(
+    parts: tuple[Client, Catalog, Losing],
+) -> None:
+    client, catalog, _ = parts
+    add_map(catalog, "hall")
+    scan_id = client.upload_scan(ply("a"))["scan_id"]
+    first, again = (client.submit_survey("hall", [scan_id], idempotency_key="visit-7") for _ in range(2))
+    assert first == again
+    assert len(catalog.surveys.page("hall").items) == 1
