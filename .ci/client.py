@@ -29,6 +29,7 @@ NAMES = {
     "anyio": "time",  # of which there is `sleep` alone
     "aread": "read",
     "asynchronous": "synchronous",
+    "in_pieces_async": "in_pieces",
 }
 NOTE = "# Made of asynchronous/{name} by `make client`: change that one.\n"
 GENERATOR = ROOT / "build" / "tools" / "bin" / "datamodel-codegen"

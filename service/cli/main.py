@@ -147,7 +147,9 @@ def _commands() -> typer.Typer:
 
 def _add(group: typer.Typer, function: Callable[..., None], example: str) -> None:
     """Add a command under the name of its function, with an example below its help."""
-    group.command(function.__name__.rstrip("_").replace("_", "-"), epilog=f"Example: spicd {example}")(function)
+    group.command(function.__name__.rstrip("_").replace("_", "-"), epilog=f"Example: spicd {example}")(
+        function
+    )
 
 
 def _version(wanted: bool) -> None:

@@ -30,6 +30,8 @@ from service.client.documents import (
 from service.client.errors import Document, JobFailed, retry_after_s
 from service.client.requests import Body, OnSent, Pose, csv_lines, given, keyed, quoted, scans_of
 from service.client.synchronous.feeds import Feeds
+from service.client.uploads import in_pieces
+from service.resumable import Memory, OnWait, Persistence
 
 SLOWEST_LOOK_S = 2.0  #: between two looks at a job that takes long
 
@@ -71,6 +73,24 @@ class Client(Feeds):
         body = Body(source, on_sent)
         headers = {"Content-Type": "application/octet-stream", "Content-Length": str(body.size)}
         return self._json(ScanDocument, "POST", "/scans", params=query, headers=headers, content=body)
+
+    def upload_scan_resumable(
+        self,
+        path: Path,
+        *,
+        memory: Memory | None = None,
+        persistence: Persistence | None = None,
+        on_sent: OnSent | None = None,
+        on_wait: OnWait | None = None,
+        **said: Any,
+    ) -> ScanDocument:
+        """Send one PLY or PCD in as many pieces as it takes, and go on where an earlier attempt ended.
+
+        `said` are `filename device_id captured_at pose frame`. Raises `RequestRefused`, and `Unreachable` where nothing
+        goes on for longer than `persistence` says.
+        """
+        how = {"memory": memory, "persistence": persistence, "on_sent": on_sent, "on_wait": on_wait}
+        return in_pieces(self._http, path, said=said, **how)
 
     def scans(self) -> list[ScanDocument]:
         """Return every scan, newest first."""

@@ -77,6 +77,7 @@ METHODS = {
     "tiles": "survey_id",
     "train_model": "map_id name base minutes epochs",
     "upload_scan": "source filename device_id captured_at pose frame on_sent",
+    "upload_scan_resumable": "path memory persistence on_sent on_wait said",
     "version": "map_id version",
     "versions": "map_id",
     "wait": "job_id on_progress every_s",
