@@ -53,6 +53,45 @@ class CarrierRequest(TypedDict):
     radius: float
 
 
+class CloudEvent(TypedDict):
+    """An event (CloudEvents 1.0)."""
+
+    data: dict[str, Any]
+    datacontenttype: Literal["application/json"]
+    id: str
+    sequence: str
+    source: str
+    specversion: Literal["1.0"]
+    subject: str
+    time: str
+    type: Literal[
+        "scan.uploaded",
+        "scan.deleted",
+        "job.ended",
+        "map.deleted",
+        "version.ready",
+        "version.failed",
+        "survey.ready",
+        "survey.failed",
+        "survey.deleted",
+        "model.ready",
+        "model.failed",
+        "change.told",
+        "change.withdrawn",
+        "object.told",
+        "object.gone_again",
+        "object.seen_again",
+        "object.accepted",
+        "object.withdrawn",
+    ]
+
+
+class Conformance(TypedDict):
+    """The standards that the answers keep to, each by the name of its conformance class."""
+
+    conformsTo: list[str]
+
+
 class CrsName(TypedDict):
     """The map's frame as GDAL, GeoPandas and QGIS read it (WKT 2)."""
 
@@ -120,6 +159,49 @@ class NamedCrs(TypedDict):
 
     properties: CrsName
     type: Literal["name"]
+
+
+class NewWebhook(TypedDict):
+    """A webhook with its secret, which is not shown again."""
+
+    attempts: int
+    created: str
+    links: list[Link]
+    map_id: str | None
+    next_attempt: str
+    position: int
+    previous_until: str | None
+    reason: str | None
+    secret: str
+    status: Literal["active", "disabled"]
+    types: (
+        list[
+            Literal[
+                "scan.uploaded",
+                "scan.deleted",
+                "job.ended",
+                "map.deleted",
+                "version.ready",
+                "version.failed",
+                "survey.ready",
+                "survey.failed",
+                "survey.deleted",
+                "model.ready",
+                "model.failed",
+                "change.told",
+                "change.withdrawn",
+                "object.told",
+                "object.gone_again",
+                "object.seen_again",
+                "object.accepted",
+                "object.withdrawn",
+            ]
+        ]
+        | None
+    )
+    updated: str
+    url: str
+    webhook_id: str
 
 
 class ObjectProperties(TypedDict):
@@ -205,6 +287,32 @@ class ProblemDocument(TypedDict):
     type: str
 
 
+class ProcessDocument(TypedDict):
+    """A kind of job with its inputs and outputs, each with a JSON Schema (process)."""
+
+    description: str
+    id: str
+    inputs: dict[str, Any]
+    jobControlOptions: list[Literal["async-execute", "dismiss"]]
+    links: list[Link]
+    outputTransmission: list[Literal["reference"]]
+    outputs: dict[str, Any]
+    title: str
+    version: str
+
+
+class ProcessSummary(TypedDict):
+    """What a kind of job does (processSummary)."""
+
+    description: str
+    id: str
+    jobControlOptions: list[Literal["async-execute", "dismiss"]]
+    links: list[Link]
+    outputTransmission: list[Literal["reference"]]
+    title: str
+    version: str
+
+
 class Ready(TypedDict):
     """Every part that a request needs answers."""
 
@@ -224,6 +332,10 @@ class RegistrationRequest(TypedDict):
     min_overlap: NotRequired[float | None]
 
 
+Results: TypeAlias = dict[str, Link]
+"""What a job made, each output by a link (results)."""
+
+
 PoseItem: TypeAlias = list[float]
 
 
@@ -234,7 +346,8 @@ class ScanForm(TypedDict):
     device_id: NotRequired[str]
     file: bytes
     filename: NotRequired[str]
-    pose: NotRequired[str]
+    frame: NotRequired[str]
+    pose: NotRequired[list[PoseItem] | list[float]]
 
 
 Candidate: TypeAlias = list[float]
@@ -249,13 +362,14 @@ class ScanRequest(TypedDict):
     captured_at: NotRequired[str | None]
     device_id: NotRequired[str | None]
     filename: NotRequired[str | None]
-    pose: NotRequired[list[PoseItem] | None]
+    frame: NotRequired[str | None]
+    pose: NotRequired[list[PoseItem] | list[float] | None]
 
 
 class ScanUse(TypedDict):
     """A scan that was uploaded before, with what counts in this map or survey alone."""
 
-    pose: NotRequired[list[PoseItem] | None]
+    pose: NotRequired[list[PoseItem] | list[float] | None]
     scan_id: str
 
 
@@ -380,6 +494,7 @@ class TileProperties(TypedDict):
     center: list[float]
     center_x: float
     center_y: float
+    change_id: str | None
     device_id: str | None
     disappeared: int | None
     first_seen: str | None
@@ -418,6 +533,21 @@ class TrainingRequest(TypedDict):
     epochs: NotRequired[int | None]
     minutes: NotRequired[float | None]
     name: NotRequired[str | None]
+
+
+class UploadDocument(TypedDict):
+    """One upload: how far it is, and the scan that it became or why it became none."""
+
+    created: str
+    expires: str
+    format: Literal["ply", "pcd"] | None
+    length: int
+    links: list[Link]
+    metadata: dict[str, str]
+    offset: int
+    problem: ProblemDocument | None
+    scan_id: str | None
+    upload_id: str
 
 
 class VersionForm(TypedDict):
@@ -459,6 +589,126 @@ class VersionSummaryDocument(TypedDict):
     version: int
 
 
+class WebhookChange(TypedDict):
+    """What of a webhook becomes something else; what is left out stays."""
+
+    status: NotRequired[Literal["active", "disabled"] | None]
+    types: NotRequired[
+        list[
+            Literal[
+                "scan.uploaded",
+                "scan.deleted",
+                "job.ended",
+                "map.deleted",
+                "version.ready",
+                "version.failed",
+                "survey.ready",
+                "survey.failed",
+                "survey.deleted",
+                "model.ready",
+                "model.failed",
+                "change.told",
+                "change.withdrawn",
+                "object.told",
+                "object.gone_again",
+                "object.seen_again",
+                "object.accepted",
+                "object.withdrawn",
+            ]
+        ]
+        | None
+    ]
+    url: NotRequired[str | None]
+
+
+class WebhookDocument(TypedDict):
+    """A webhook, without its secret."""
+
+    attempts: int
+    created: str
+    links: list[Link]
+    map_id: str | None
+    next_attempt: str
+    position: int
+    previous_until: str | None
+    reason: str | None
+    status: Literal["active", "disabled"]
+    types: (
+        list[
+            Literal[
+                "scan.uploaded",
+                "scan.deleted",
+                "job.ended",
+                "map.deleted",
+                "version.ready",
+                "version.failed",
+                "survey.ready",
+                "survey.failed",
+                "survey.deleted",
+                "model.ready",
+                "model.failed",
+                "change.told",
+                "change.withdrawn",
+                "object.told",
+                "object.gone_again",
+                "object.seen_again",
+                "object.accepted",
+                "object.withdrawn",
+            ]
+        ]
+        | None
+    )
+    updated: str
+    url: str
+    webhook_id: str
+
+
+class WebhookList(TypedDict):
+    """Webhooks, newest first."""
+
+    links: list[Link]
+    webhooks: list[WebhookDocument]
+
+
+class WebhookRequest(TypedDict):
+    """Where to send what."""
+
+    map: NotRequired[str | None]
+    types: NotRequired[
+        list[
+            Literal[
+                "scan.uploaded",
+                "scan.deleted",
+                "job.ended",
+                "map.deleted",
+                "version.ready",
+                "version.failed",
+                "survey.ready",
+                "survey.failed",
+                "survey.deleted",
+                "model.ready",
+                "model.failed",
+                "change.told",
+                "change.withdrawn",
+                "object.told",
+                "object.gone_again",
+                "object.seen_again",
+                "object.accepted",
+                "object.withdrawn",
+            ]
+        ]
+        | None
+    ]
+    url: str
+
+
+class WithdrawnDocument(TypedDict):
+    """Something that is told no more: a survey was deleted, or a late visit joined two into one."""
+
+    id: str
+    merged_into: str | None
+
+
 class AcceptedMap(TypedDict):
     """A map that is going to be built."""
 
@@ -498,6 +748,38 @@ class AcceptedVersion(TypedDict):
     map_id: str
     status: Literal["building", "ready", "failed"]
     version: int
+
+
+class DeliveryDocument(TypedDict):
+    """A delivery."""
+
+    answered: int | None
+    attempts: int
+    created: str
+    delivery_id: str
+    error: str | None
+    event_id: str
+    kind: Literal["event", "ping", "repeat"]
+    links: list[Link]
+    status: Literal["pending", "delivered", "failed"]
+    type: str
+    updated: str
+    webhook_id: str
+
+
+class DeliveryList(TypedDict):
+    """Deliveries of a webhook, newest first."""
+
+    deliveries: list[DeliveryDocument]
+    links: list[Link]
+
+
+class EventList(TypedDict):
+    """Events in the order of publication."""
+
+    cursor: str
+    events: list[CloudEvent]
+    links: list[Link]
 
 
 class FgObjectFeature(TypedDict):
@@ -565,6 +847,14 @@ class JobList(TypedDict):
     links: list[Link]
 
 
+class LandingPage(TypedDict):
+    """What the service is, and where all that it has begins."""
+
+    description: str
+    links: list[Link]
+    title: str
+
+
 class MapSettings(TypedDict):
     """What of a map can be set. Voxel and tile size belong to the model, and so to its card."""
 
@@ -603,6 +893,13 @@ class ObjectFeature(TypedDict):
     type: Literal["Feature"]
 
 
+class ProcessList(TypedDict):
+    """All processes (processList)."""
+
+    links: list[Link]
+    processes: list[ProcessSummary]
+
+
 class ScanDocument(TypedDict):
     """One uploaded scan."""
 
@@ -611,6 +908,7 @@ class ScanDocument(TypedDict):
     device_id: str | None
     filename: str
     format: Literal["ply", "pcd"]
+    frame: str | None
     pose: list[PoseItem] | None
     scan_id: str
     sha256: str
@@ -760,6 +1058,7 @@ class FgObjectCollection(TypedDict):
 
     conformsTo: list[str]
     coordRefSys: str
+    cursor: str | None
     featureType: str
     features: list[FgObjectFeature]
     links: list[Link]
@@ -767,6 +1066,7 @@ class FgObjectCollection(TypedDict):
     numberReturned: int
     timeStamp: str
     type: Literal["FeatureCollection"]
+    withdrawn: list[WithdrawnDocument] | None
 
 
 class FgObjectHistory(TypedDict):
@@ -801,6 +1101,7 @@ class FgTileCollection(TypedDict):
 
     conformsTo: list[str]
     coordRefSys: str
+    cursor: str | None
     featureType: str
     features: list[FgTileFeature]
     links: list[Link]
@@ -808,6 +1109,7 @@ class FgTileCollection(TypedDict):
     numberReturned: int
     timeStamp: str
     type: Literal["FeatureCollection"]
+    withdrawn: list[WithdrawnDocument] | None
 
 
 class MapDocument(TypedDict):
@@ -872,12 +1174,14 @@ class ObjectCollection(TypedDict):
     """The changed things of a map."""
 
     crs: NamedCrs | None
+    cursor: str | None
     features: list[ObjectFeature]
     links: list[Link]
     numberMatched: int
     numberReturned: int
     timeStamp: str
     type: Literal["FeatureCollection"]
+    withdrawn: list[WithdrawnDocument] | None
 
 
 class ObjectHistory(TypedDict):
@@ -908,9 +1212,11 @@ class TileCollection(TypedDict):
     """Tiles."""
 
     crs: NamedCrs | None
+    cursor: str | None
     features: list[TileFeature]
     links: list[Link]
     numberMatched: int
     numberReturned: int
     timeStamp: str
     type: Literal["FeatureCollection"]
+    withdrawn: list[WithdrawnDocument] | None
