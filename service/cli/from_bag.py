@@ -88,7 +88,7 @@ def _written(
 ) -> list[Document]:
     folder.mkdir(parents=True, exist_ok=True)
     with Recording(bag) as recording:
-        made = [
+        made: list[Document] = [
             {"file": str(write(scan, folder, _name(bag, number), device_id=device_id)), **_about(scan)}
             for number, scan in enumerate(recording.scans(options), 1)
         ]

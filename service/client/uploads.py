@@ -11,13 +11,13 @@ import httpx
 
 from service import resumable
 from service.client.documents import ScanDocument
-from service.client.errors import RequestRefused, Unreachable
+from service.client.errors import ClientError, RequestRefused, Unreachable
 
 
 def in_pieces(http: httpx.Client, path: Path, **how: Any) -> ScanDocument:
     """Send a file, and go on where an earlier attempt ended; `how` as in `resumable.upload`.
 
-    Raises `RequestRefused`, `Unreachable` where nothing goes on for too long, and OSError where it cannot be read.
+    Raises `RequestRefused`, `Unreachable` where nothing goes on for too long, `ClientError` and OSError where it cannot be read.
     """
     try:
         return cast(ScanDocument, resumable.upload(http, path, **how))
@@ -25,6 +25,8 @@ def in_pieces(http: httpx.Client, path: Path, **how: Any) -> ScanDocument:
         raise RequestRefused(refused.problem, refused.status) from refused
     except resumable.UploadStalled as stalled:
         raise Unreachable(str(stalled)) from stalled
+    except resumable.UploadError as error:
+        raise ClientError(str(error)) from error
 
 
 async def in_pieces_async(http: httpx.AsyncClient, path: Path, **how: Any) -> ScanDocument:
