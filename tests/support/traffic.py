@@ -40,16 +40,16 @@ class Room:
 
     def map_uploads(self) -> list[Upload]:
         """Return the scans that the map is built of; their poses are exact."""
-        return [_upload(f"map-{k}", scan.points, scan.prior) for k, scan in enumerate(self._first)]
+        return [as_upload(f"map-{k}", scan.points, scan.prior) for k, scan in enumerate(self._first)]
 
     def survey_upload(self, number: int) -> Upload:
         """Return the scan of a survey: another file for each number."""
         scan = self._later[number % len(self._later)]
         noise = np.random.default_rng([number, 7]).normal(0, _NOISE, scan.points.shape)
-        return _upload(f"survey-{number}", scan.points + noise.astype(np.float32), scan.prior)
+        return as_upload(f"survey-{number}", scan.points + noise.astype(np.float32), scan.prior)
 
 
-def _upload(name: str, points: Any, pose: Any) -> Upload:
+def as_upload(name: str, points: Any, pose: Any) -> Upload:
     with TemporaryDirectory() as folder:
         path = Path(folder) / f"{name}.pcd"
         write_pcd(path, points)

@@ -292,7 +292,10 @@ def test_events_are_a_line_each(service: Service, capsys: pytest.CaptureFixture[
 def each_command() -> list[tuple[str, str]]:
     commands = [(function.__name__, example) for function, example in ALONE.items()]
     for name, (_, functions) in GROUPS.items():
-        commands += [(f"{name} {one.__name__.rstrip('_')}", f"{name} {ex}") for one, ex in functions.items()]
+        commands += [
+            (f"{name} {one.__name__.rstrip('_').replace('_', '-')}", f"{name} {ex}")
+            for one, ex in functions.items()
+        ]
     return commands
 
 
