@@ -134,7 +134,7 @@ class Scenario:
     def by_webhook(self, follower: Follower) -> Iterator[None]:
         """Follow by a webhook, whose receiver refuses each seventh delivery."""
         with _receiver(follower, self.findings) as (url, set_secret):
-            answer = self.service.http.post("/webhooks", json={"url": url, "map_id": MAP})
+            answer = self.service.http.post("/webhooks", json={"url": url, "map": MAP})
             answer.raise_for_status()
             set_secret(answer.json()["secret"])
             yield
@@ -149,7 +149,7 @@ def main(arguments: list[str] | None = None) -> int:
         room = random_room(5)
         scans = _visits(room, options.robots, rng)
         service = Service(
-            folder, ROOT / "model_store", webhook_allowed_networks='["127.0.0.0/8"]', min_free_bytes=0
+            folder, ROOT / "model_store", webhook_allowed_networks="127.0.0.0/8", min_free_bytes=0
         )
         stack.callback(service.end)
         _build_map(service, room)
@@ -314,12 +314,18 @@ def _receiver(follower: Follower, findings: Findings) -> Iterator[tuple[str, Any
 
 
 def _visits(room: Scene, count: int, rng: random.Random) -> list[SimulatedScan]:
-    """Return one scan of each visit, in which crates come and go."""
-    x, y = free_place(room)
-    furnished, _ = room.with_added("crate", crate(0.7, 0.5, 0.6).at(x, y))
+    """Return one scan of each visit, in which crates stand at some of several places."""
+    low, high = room.rooms[0].low, room.rooms[0].high
+    corners = [(x, y) for x in (low[0] + 0.8, high[0] - 0.8) for y in (low[1] + 0.8, high[1] - 0.8)]
+    places = sorted({free_place(room, around=(float(x), float(y))) for x, y in corners})
     scans = []
     for number in range(count):
-        scene = furnished if rng.random() < 0.6 else room
+        scene = room
+        for place in places:
+            if rng.random() < 0.5:
+                scene, _ = scene.with_added(
+                    f"crate-{place[0]:.2f}-{place[1]:.2f}", crate(0.7, 0.5, 0.6).at(*place)
+                )
         scans.append(visit(scene, 1, seed=10 + number, prior_error=(0.05, 1.0), duration_s=5.0)[0])
     return scans
 
