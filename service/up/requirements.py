@@ -94,7 +94,7 @@ def require_device(settings: Settings, environment: Mapping[str, str]) -> None:
         return
     command = [sys.executable, "-m", "worker", "check", "inference"]
     try:
-        asked = subprocess.run(  # noqa: S603 - our own program
+        asked = subprocess.run(  # noqa: S603  # nosec B603 - our own program
             command, env=dict(environment), capture_output=True, text=True, timeout=_CHECK_S, check=False
         )
     except subprocess.TimeoutExpired:
