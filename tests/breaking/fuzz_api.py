@@ -270,6 +270,9 @@ def things(catalog: Catalog) -> dict[str, list[str]]:
         "name": ["spicd-net/1", "no-such/1"],
         "model": ["spicd-net/1", "no-such/1"],
         "process_id": ["map", "survey", "none"],
+        "upload_id": [32 * "0", "none"],
+        "webhook_id": ["webhook-1", "none"],
+        "delivery_id": ["delivery-1", "none"],
     }
 
 

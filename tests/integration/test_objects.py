@@ -127,7 +127,7 @@ def test_the_cloud_bears_the_number_of_each_object(seeing: House, put: Crate) ->
     survey = compared(seeing, put.scan)
     with seeing.catalog.blobs.local(blob_keys.survey_cloud(survey.survey_id)) as path:
         cloud = o3d.t.io.read_point_cloud(path).point
-    numbers, kinds = (cloud[name].numpy().ravel() for name in ("object_id", "kind"))
+    numbers, kinds = (cloud[f"scalar_{name}"].numpy().ravel() for name in ("object_id", "kind"))
     for thing in things(seeing, survey):
         for place, kind in ((thing.now, PointKind.APPEARED), (thing.before, PointKind.DISAPPEARED)):
             if place is not None:

@@ -123,7 +123,8 @@ def test_a_trained_model_stands_among_the_models_and_may_be_named_by_surveys_and
     job_id = add_model(catalog)
     assert [card["name"] for card in client.get("/models").json()["models"]] == ["spicd-net", "lobby-net"]
     assert client.get("/models/lobby-net").json() == CARD
-    (_, result) = client.get(f"/jobs/{job_id}").json()["links"]
+    links = {link["rel"]: link for link in client.get(f"/jobs/{job_id}").json()["links"]}
+    result = links["related"]
     assert result["href"] == "/models/lobby-net?version=1"
     assert client.get(result["href"]).json() == CARD
     survey = {"scan_ids": [add_scan(catalog, "tuesday").scan_id], "model": "lobby-net/1"}

@@ -61,18 +61,18 @@ def test_the_line_has_the_route_and_sizes_and_nothing_that_a_client_sent(
 ) -> None:
     add_map(catalog)
     headers = {"Authorization": "Bearer s3cret", "Accept-Encoding": "identity"}
-    answer = client.get("/maps/lobby?token=s3cret", headers=headers)
+    answer = client.get("/maps/lobby/changes?survey=s3cret", headers=headers)
     (line,) = lines.of("spicd.requests")
     assert line.levelno == logging.INFO
     assert {**line.fields, "ms": 1} == {
         "method": "GET",
-        "route": "/maps/{map_id}",
-        "status": 200,
+        "route": "/maps/{map_id}/changes",
+        "status": 404,
         "ms": 1,
         "received_bytes": 0,
         "sent_bytes": len(answer.content),
     }
-    assert line.getMessage().startswith("GET /maps/{map_id} 200, ")
+    assert line.getMessage().startswith("GET /maps/{map_id}/changes 404, ")
     ours = [record for record in lines.records if record.name.startswith(("spicd", "service"))]
     assert "s3cret" not in "".join(record.getMessage() + str(vars(record)) for record in ours)
 
