@@ -126,8 +126,18 @@ class Api(FastAPI):
                 schemas.pop(replaced, None)
             add_conditions(document)
             secured(document, problems.documented("unauthorized", "forbidden"))
+            _refusing_unknown(document)
             self.openapi_schema = mended(document)
         return self.openapi_schema
+
+
+def _refusing_unknown(document: dict[str, Any]) -> None:
+    """Have every operation name the answer to a query parameter that it does not know."""
+    refusal = problems.documented("invalid_request")
+    for path in document["paths"].values():
+        for operation in path.values():
+            for status, answer in refusal.items():
+                operation["responses"].setdefault(str(status), answer)
 
 
 def create_app(settings: Settings, *, queue: Queue | None = None) -> FastAPI:

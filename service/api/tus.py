@@ -118,6 +118,7 @@ def _takes(*headers: dict[str, Any], piece: bool | None = None) -> dict[str, Any
 def get_upload_options(services: Provided) -> Response:
     """Versions, extensions, checksums and the largest file, as headers (tus 1.0.0, OPTIONS)."""
     headers = {
+        "Allow": "OPTIONS, POST",
         "Tus-Version": tus.VERSION,
         "Tus-Extension": ",".join(tus.EXTENSIONS),
         "Tus-Checksum-Algorithm": ",".join(tus.ALGORITHMS),

@@ -129,6 +129,8 @@ async def _one(
         begun = time.perf_counter()
         await asked(app, request)
         seconds = min(seconds, time.perf_counter() - begun)
+    asked_s = re.search(r"(?:^|&)wait=(\d{1,2})(?:&|$)", request.query)
+    seconds -= float(asked_s[1]) if asked_s else 0.0  # GET /events waits for as long as it is told to
     found.cases += 1
     found.outcomes[str(answer.status)] += 1
     found.slowest_s = max(found.slowest_s, seconds)
@@ -151,8 +153,10 @@ def wrongs(answer: Answer, request: Request, document: dict[str, Any]) -> list[t
         allowed = {204, 404}
     elif answer.operation is not None:
         method, path = answer.operation
-        method = "GET" if method == "HEAD" else method  # the same without its content
-        operation = document["paths"].get(path, {}).get(method.lower())
+        operations = document["paths"].get(path, {})
+        if method == "HEAD" and "head" not in operations:  # the same as GET without its content
+            method = "GET"
+        operation = operations.get(method.lower())
         allowed = {int(status) for status in operation["responses"]} if operation else _NO_OPERATION
     found = []
     if answer.status >= 500 and not (answer.status == 503 and 503 in allowed):

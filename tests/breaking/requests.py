@@ -183,7 +183,8 @@ class Requests:
         if schema.get("type") == "array":
             if "example" in schema:
                 return schema["example"]
-            count = rng.randint(max(1, schema.get("minItems", 0)), min(schema.get("maxItems", 3), 6))
+            fewest = max(1, schema.get("minItems", 0))
+            count = rng.randint(fewest, max(fewest, min(schema.get("maxItems", 3), 6)))
             return [self.value(schema.get("items", {}), rng, name) for _ in range(count)]
         if known and rng.random() < 0.8:
             return rng.choice(known)

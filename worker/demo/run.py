@@ -62,7 +62,10 @@ def run(out: Path, settings: DemoSettings, *, out_console: Console, err_console:
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
     try:
-        with _progress(err_console) as progress, ServiceChild(fresh[0], out / "service.log") as child:
+        with (
+            _progress(err_console) as progress,
+            ServiceChild(fresh[0], out / "service.log", model=settings.model) as child,
+        ):
             result, story = _through_the_service(child, out, settings, progress)
     except ClientError as error:
         raise DemoFailed(str(error)) from error

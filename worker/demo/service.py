@@ -37,7 +37,9 @@ class ServiceChild:
     It starts at once and answers from `await_ready` on, so that other work can be done meanwhile.
     """
 
-    def __init__(self, data_dir: Path, log: Path) -> None:
+    def __init__(self, data_dir: Path, log: Path, *, model: str | None = None) -> None:
+        """`model` is made the service's default; None leaves that as it is."""
+        self._model = model
         self._ready = data_dir / "ready.json"
         self._data_dir = data_dir
         self._log = log
@@ -50,6 +52,8 @@ class ServiceChild:
         command += ["--data-dir", str(self._data_dir), "--ready-file", str(self._ready)]
         hidden = {f"SPICD_{name}" for name in _OWN}
         environment = {name: value for name, value in os.environ.items() if name not in hidden}
+        if self._model is not None:
+            environment["SPICD_MODEL"] = self._model
         with self._log.open("wb") as log:
             # A session of its own: Ctrl-C reaches the demo alone, which then ends the service in order.
             # a list of ours: no shell reads it
