@@ -126,9 +126,19 @@ class Api(FastAPI):
                 schemas.pop(replaced, None)
             add_conditions(document)
             secured(document, problems.documented("unauthorized", "forbidden"))
+            _leaving_out(schemas)
             _refusing_unknown(document)
             self.openapi_schema = mended(document)
         return self.openapi_schema
+
+
+def _leaving_out(schemas: dict[str, Any]) -> None:
+    """Require of collections, which are written by hand, no member that comes with one parameter alone."""
+    for schema in schemas.values():
+        members = schema.get("properties", {})
+        if "features" in members:
+            alone = {name for name, member in members.items() if member.get("default", "") is None}
+            schema["required"] = [name for name in schema["required"] if name not in alone]
 
 
 def _refusing_unknown(document: dict[str, Any]) -> None:

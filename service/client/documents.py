@@ -1058,7 +1058,7 @@ class FgObjectCollection(TypedDict):
 
     conformsTo: list[str]
     coordRefSys: str
-    cursor: str | None
+    cursor: NotRequired[str | None]
     featureType: str
     features: list[FgObjectFeature]
     links: list[Link]
@@ -1066,7 +1066,7 @@ class FgObjectCollection(TypedDict):
     numberReturned: int
     timeStamp: str
     type: Literal["FeatureCollection"]
-    withdrawn: list[WithdrawnDocument] | None
+    withdrawn: NotRequired[list[WithdrawnDocument] | None]
 
 
 class FgObjectHistory(TypedDict):
@@ -1101,7 +1101,7 @@ class FgTileCollection(TypedDict):
 
     conformsTo: list[str]
     coordRefSys: str
-    cursor: str | None
+    cursor: NotRequired[str | None]
     featureType: str
     features: list[FgTileFeature]
     links: list[Link]
@@ -1109,7 +1109,7 @@ class FgTileCollection(TypedDict):
     numberReturned: int
     timeStamp: str
     type: Literal["FeatureCollection"]
-    withdrawn: list[WithdrawnDocument] | None
+    withdrawn: NotRequired[list[WithdrawnDocument] | None]
 
 
 class MapDocument(TypedDict):
@@ -1173,15 +1173,15 @@ class MapRequest(TypedDict):
 class ObjectCollection(TypedDict):
     """The changed things of a map."""
 
-    crs: NamedCrs | None
-    cursor: str | None
+    crs: NotRequired[NamedCrs | None]
+    cursor: NotRequired[str | None]
     features: list[ObjectFeature]
     links: list[Link]
     numberMatched: int
     numberReturned: int
     timeStamp: str
     type: Literal["FeatureCollection"]
-    withdrawn: list[WithdrawnDocument] | None
+    withdrawn: NotRequired[list[WithdrawnDocument] | None]
 
 
 class ObjectHistory(TypedDict):
@@ -1199,7 +1199,7 @@ class ObjectHistory(TypedDict):
 class SightingCollection(TypedDict):
     """The things that one survey found changed."""
 
-    crs: NamedCrs | None
+    crs: NotRequired[NamedCrs | None]
     features: list[SightingFeature]
     links: list[Link]
     numberMatched: int
@@ -1211,12 +1211,12 @@ class SightingCollection(TypedDict):
 class TileCollection(TypedDict):
     """Tiles."""
 
-    crs: NamedCrs | None
-    cursor: str | None
+    crs: NotRequired[NamedCrs | None]
+    cursor: NotRequired[str | None]
     features: list[TileFeature]
     links: list[Link]
     numberMatched: int
     numberReturned: int
     timeStamp: str
     type: Literal["FeatureCollection"]
-    withdrawn: list[WithdrawnDocument] | None
+    withdrawn: NotRequired[list[WithdrawnDocument] | None]
