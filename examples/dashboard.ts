@@ -37,6 +37,9 @@ async function changed(mapId: string): Promise<string[]> {
   if (error !== undefined) {
     throw new Error(error.detail);
   }
+  if (typeof data === "string") {
+    throw new Error("a table, which was not asked for");
+  }
   return data.features.map((change) => `${change.properties.tile_id} ${change.properties.state}`);
 }
 
