@@ -102,7 +102,8 @@ _TAKES = documented(
 _NUMBER = {"type": "integer", "minimum": 0}
 _VERSION = tus.documented("Tus-Resumable", {"type": "string", "enum": [tus.VERSION]}, required=True)
 _METADATA = tus.documented("Upload-Metadata", {"type": "string", "examples": ["filename aGFsbC5wbHk="]})
-_CHECKSUM = tus.documented("Upload-Checksum", {"type": "string", "pattern": "^sha(1|256) [A-Za-z0-9+/]+=*$"})
+_DIGEST = "^(sha1 [A-Za-z0-9+/]{27}=|sha256 [A-Za-z0-9+/]{43}=)$"
+_CHECKSUM = tus.documented("Upload-Checksum", {"type": "string", "pattern": _DIGEST})
 _LENGTH = tus.documented("Upload-Length", _NUMBER, required=True)
 _OFFSET = tus.documented("Upload-Offset", _NUMBER, required=True)
 _PIECE = {"content": {tus.PIECE_TYPE: {"schema": {"type": "string", "format": "binary"}}}}

@@ -11,3 +11,4 @@ _SCANS = st.integers(0, 10**6).map(
 
 schemathesis.openapi.format("binary", _SCANS)
 schemathesis.openapi.media_type("application/octet-stream", _SCANS)
+schemathesis.openapi.media_type("application/offset+octet-stream", _SCANS)  # a piece of an upload (tus 1.0.0)
