@@ -79,8 +79,8 @@ class Settings(BaseSettings):
     step_memory_bytes: int | None = Field(
         None,
         ge=0,
-        description="most that each process of a geometry step may allocate; 0: no limit, "
-        "unset: four fifths of the machine's or the container's memory",
+        description="most that each process of a geometry step, and an inference worker without a GPU, may allocate; "
+        "0: no limit, unset: four fifths of the machine's or the container's memory",
     )
     min_free_bytes: int = Field(
         1024**3,

@@ -188,6 +188,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
         "service.queue",
         "worker.scratch",
         "worker.jobs",
+        "worker.memory",
         "worker.rq_workers",
         "worker.threads",
     ),

@@ -34,6 +34,7 @@ from service.settings import Settings
 from service.up.embedded_redis import LaunchFailed
 from service.up.lifetime import end_with_parent
 from service.up.requirements import require_model, require_queue
+from worker.memory import limit_memory
 from worker.rq_workers import GeometryWorker, InferenceWorker
 from worker.scratch import sweep
 from worker.threads import wait_passively
@@ -75,6 +76,8 @@ def main(arguments: list[str] | None = None) -> int:
     wait_passively()
     for module in WARM_MODULES[options.queue]:
         importlib.import_module(module)
+    if options.queue == "inference":
+        limit_inference(settings)
     log.info("%s worker is ready", options.queue)
     records = CatalogRecords(settings)
     kind = GeometryWorker if options.queue == "geometry" else InferenceWorker
@@ -140,6 +143,18 @@ def _require_device(settings: Settings, queue: str) -> None:
             raise LaunchFailed(
                 "SPICD_DEVICE is cuda, but torch finds no CUDA GPU; set it to auto or cpu, or mend the driver"
             )
+
+
+def limit_inference(settings: Settings) -> int:
+    """Limit what an inference worker may allocate, as each geometry step is; returns the limit in bytes, 0 for none.
+
+    Not where it has a GPU: CUDA maps far more than it uses. The limit is of the process, which outlives its steps.
+    """
+    from worker.jobs.models import finds_gpu  # noqa: PLC0415  # torch takes seconds
+
+    if settings.device != "cpu" and finds_gpu():
+        return 0
+    return limit_memory(settings.step_memory_bytes)
 
 
 def _host(queue: str) -> str:

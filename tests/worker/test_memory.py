@@ -8,7 +8,9 @@ from pathlib import Path
 
 import pytest
 
+from service.settings import Settings
 from worker import memory
+from worker.__main__ import limit_inference
 from worker.errors import OutOfMemory
 
 GIB = 1024**3
@@ -99,3 +101,28 @@ def test_an_allocation_that_failed_is_told_with_what_to_do(error: Exception) -> 
 def test_another_error_stays_what_it_is() -> None:
     with pytest.raises(RuntimeError, match="shapes differ"), memory.as_out_of_memory("a step"):
         raise RuntimeError("shapes differ")
+
+
+def test_an_inference_worker_is_limited_as_a_step_is() -> None:
+    code = f"""
+import numpy as np, torch
+from service.settings import Settings
+from worker.__main__ import limit_inference
+from worker.errors import OutOfMemory
+from worker.memory import as_out_of_memory
+print(limit_inference(Settings(device="cpu", step_memory_bytes={2 * GIB})))
+try:
+    with as_out_of_memory("a step"):
+        torch.ones(800_000_000)
+except OutOfMemory:
+    print("refused")
+"""
+    assert in_a_process(code).split() == [str(2 * GIB), "refused"]
+
+
+def test_an_inference_worker_with_a_gpu_is_not_limited(monkeypatch: pytest.MonkeyPatch) -> None:
+    limited: list[object] = []
+    monkeypatch.setattr("worker.__main__.limit_memory", limited.append)
+    monkeypatch.setattr("worker.jobs.models.finds_gpu", lambda: True)
+    assert limit_inference(Settings(device="auto", step_memory_bytes=GIB)) == 0
+    assert not limited
