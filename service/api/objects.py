@@ -347,7 +347,7 @@ def get_survey_objects(
     survey = catalog.surveys.ready(survey_id)
     if survey.objects is None:
         raise NotFound(_why_none(survey))
-    anchor = catalog.maps.get(survey.map_id).anchor
+    anchor = catalog.maps.summary(survey.map_id).anchor
     form = form_of(request, asked, anchor)
     wanted = SightingFilter(
         survey_id=survey_id,

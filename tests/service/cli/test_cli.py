@@ -260,6 +260,22 @@ def test_names_that_look_like_markup_are_printed_as_they_are(
         assert name in capsys.readouterr().out
 
 
+def test_maps_show_tells_of_every_scan_where_the_document_has_the_first_alone(
+    service: Service, capsys: pytest.CaptureFixture[str]
+) -> None:
+    every = [{**MAP["scans"][0], "scan_id": f"scan-{number}"} for number in range(3)]
+    more = {"version": 1, "links": [{"rel": "next", "href": "/maps/lobby/scans?cursor=c"}]}
+    last = {"version": 1, "links": []}
+    service.on("GET /maps/lobby", {**MAP, "scan_count": 3})
+    service.on("GET /maps/lobby/scans", {**more, "scans": every[:2]}, {**last, "scans": every[2:]})
+    assert spicd("--json", "maps", "show", "lobby") == 0
+    assert json.loads(capsys.readouterr().out)["scans"] == every
+    service.on("GET /maps/lobby/versions/1", {**MAP, "version": 1, "scan_count": 3})
+    service.on("GET /maps/lobby/versions/1/scans", {**last, "scans": every})
+    assert spicd("versions", "show", "lobby", "1") == 0
+    assert "scan-2" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize("name", ["a[/]b.ply", "[old].ply"])
 def test_a_bar_shows_a_file_name_that_looks_like_markup_as_it_is(name: str) -> None:
     shown = Terminal(url="", as_json=False, err=Console(file=io.StringIO(), force_terminal=True))
