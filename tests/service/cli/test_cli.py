@@ -391,6 +391,14 @@ def test_changes_passes_its_filters_on_and_lists_the_tiles(
     assert "1 of 7" in shown
 
 
+def test_changes_takes_each_filter_of_the_api(service: Service) -> None:
+    service.on("GET /maps/lobby/changes", CHANGES)
+    filters = {"survey": "survey-1", "state": "inconsistent", "kind": "appeared", "device_id": "robot-7"}
+    words = [word for name, value in filters.items() for word in (f"--{name.replace('_', '-')}", value)]
+    assert spicd("changes", "lobby", *words) == 0
+    assert dict(service.requests[0].url.params) == {**filters, "limit": "100"}
+
+
 def test_changes_may_be_told_again_for_each_visit(service: Service) -> None:
     service.on("GET /maps/lobby/changes", CHANGES)
     assert spicd("changes", "lobby", "--repeats") == 0
