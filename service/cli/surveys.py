@@ -75,7 +75,7 @@ def download(
         typer.Option(help="Folder; left out: one that is named like the survey.", file_okay=False),
     ] = None,
 ) -> None:
-    """Fetch what a survey found: cloud, picture, tiles and objects. A connection that breaks is taken up."""
+    """Fetch what a survey found: cloud, picture, tiles and objects. What was broken off is taken up, also by another run."""
     terminal: Terminal = ctx.obj
     folder = to or Path(survey_id)
     with terminal.client() as client:

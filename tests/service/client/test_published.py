@@ -51,7 +51,7 @@ METHODS = {
     "delete_webhook": "webhook_id",
     "deliveries": "webhook_id",
     "dismiss": "job_id",
-    "download": "path to on_received",
+    "download": "path to on_received resume",
     "events": "types map_id after",
     "follow_changes": "map_id after every_s filters",
     "job": "job_id",
