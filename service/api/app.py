@@ -221,7 +221,7 @@ def _lifespan(settings: Settings, queue: Queue | None) -> Any:
         await run_in_threadpool(app.state.monitor.start)
         ticker = Ticker(dispatcher)
         await run_in_threadpool(ticker.__enter__)
-        sender = Sender(allowed=settings.webhook_networks())
+        sender = Sender(allowed=settings.webhook_networks(), root=settings.root_path or "")
         deliverer = Deliverer(catalog.deliveries, sender)
         await run_in_threadpool(deliverer.__enter__)
         try:

@@ -13,7 +13,7 @@ from pydantic import Field
 from service.api import features
 from service.api.boxes import bounds_of
 from service.api.features import FeatureResponse, FeaturesRequest, collection_response, form_of
-from service.api.feeds import After, feed_members, feed_next, require_alone
+from service.api.feeds import After, feed_response, require_alone
 from service.api.http.dependencies import Provided
 from service.api.http.documents import link
 from service.api.http.fields import DeviceId, Id, instant, readable
@@ -147,16 +147,7 @@ def get_changes(
             state=asked.state != "changed",
         )
         feed = catalog.changes.published(wanted, after=FeedCursor.read(asked.after), limit=asked.limit)
-        return collection_response(
-            request,
-            form,
-            TILES,
-            [feature(change, form) for change in feed.items],
-            matched=feed.matched,
-            following=feed_next(request, feed.cursor, form.media_type),
-            links=[of_map],
-            members=feed_members(feed.cursor, feed.withdrawn),
-        )
+        return feed_response(request, form, TILES, feed, feature, links=[of_map])
     sort, order = asked.sortby, change_order(wanted, asked.sortby)
     after = decoded_values(asked.cursor, sort or "", [key.type for key in order])
     page = catalog.changes.page(wanted, sort=sort, after=after, limit=asked.limit)

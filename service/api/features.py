@@ -233,8 +233,8 @@ def collection_response(
 ) -> Response:
     """Answer with features, JSON-FG ones as `service.tile_features` makes them; `matched` counts those of every page.
 
-    `cursor` is that of the next page; or `following` leads there. `members` stand beside the features. How many there are, and where to go on, stands in headers too, for a table has no
-    other place for it.
+    `cursor` is that of the next page; or `following` leads there. `members` stand beside the features. How many there
+    are, and where to go on, stands in headers too, for a table has no other place for it.
     """
     if cursor is not None:
         following = next_link(request, cursor, form.media_type)

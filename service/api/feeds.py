@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from typing import Annotated, Any
+from collections.abc import Callable, Iterable, Mapping
+from typing import Annotated, Any, TypeVar
 
 from fastapi import Request as HttpRequest
+from fastapi.responses import Response
 from pydantic import AfterValidator, Field
 
+from service.api.features import Form, Kind, collection_response
 from service.api.http.documents import Document, Link, link
-from service.catalog.events import FeedCursor, Withdrawn
+from service.catalog.events import FeedCursor, Published, Withdrawn
 from service.errors import BadRequest
+
+T = TypeVar("T")
 
 
 def _checked(text: str) -> str:
@@ -49,14 +53,36 @@ def require_alone(**asked: object) -> None:
         raise BadRequest(f"after goes in the order of publication, and not together with {others[0]}")
 
 
-def feed_next(request: HttpRequest, cursor: FeedCursor, media_type: str) -> Link:
+def feed_response(
+    request: HttpRequest,
+    form: Form,
+    kind: Kind,
+    feed: Published[T],
+    feature: Callable[[T, Form], Mapping[str, Any]],
+    *,
+    links: Iterable[Link],
+) -> Response:
+    """Answer with what was published behind a cursor, each item as `feature` makes it, and where to go on."""
+    return collection_response(
+        request,
+        form,
+        kind,
+        [feature(one, form) for one in feed.items],
+        matched=feed.matched,
+        following=_feed_next(request, feed.cursor, form.media_type),
+        links=links,
+        members=_feed_members(feed.cursor, feed.withdrawn),
+    )
+
+
+def _feed_next(request: HttpRequest, cursor: FeedCursor, media_type: str) -> Link:
     """Return the link to what comes behind an answer, which is there also where nothing is yet."""
     path = request.url.path.removeprefix(request.scope.get("root_path", ""))
     following = request.url.include_query_params(after=str(cursor))
     return link(request, f"{path}?{following.query}", "next", media_type)
 
 
-def feed_members(cursor: FeedCursor, withdrawn: Iterable[Withdrawn]) -> dict[str, Any]:
+def _feed_members(cursor: FeedCursor, withdrawn: Iterable[Withdrawn]) -> dict[str, Any]:
     """Return the members of an answer that a reader goes on by."""
     gone = [{"id": one.subject, "merged_into": one.merged_into} for one in withdrawn]
     return {"cursor": str(cursor), "withdrawn": gone}

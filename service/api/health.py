@@ -102,5 +102,6 @@ async def get_readiness(request: Request) -> Ready | Response:
 def get_metrics(request: Request, services: Provided) -> Response:
     """Requests by route, and what the catalog, the disk and the queue tell."""
     counted: Metrics = request.app.state.metrics
+    counted.listeners.set(services.listeners.count)
     text = counted.text(services.catalog, services.settings.data_dir, services.queue.snapshot)
     return Response(text, media_type=CONTENT_TYPE_LATEST)

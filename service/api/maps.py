@@ -17,7 +17,17 @@ from service.api.http.documents import Document, Link, Request, checked, link
 from service.api.http.fields import Id, Model, Text, from_text
 from service.api.http.files import blob_response
 from service.api.http.idempotency import KEYED, Keyed
-from service.api.http.paging import PageRequest, list_links
+from service.api.http.paging import (
+    Cursor,
+    Limit,
+    PageRequest,
+    count,
+    decoded,
+    encoded,
+    here,
+    list_links,
+    next_link,
+)
 from service.api.http.problems import BODY, LISTED, MADE, NAMED, JobProblem, documented
 from service.api.http.submission import (
     ScansRequest,
@@ -33,10 +43,13 @@ from service.api.http.submission import (
 )
 from service.catalog import blob_keys
 from service.catalog.idempotency import Answer, Once
-from service.catalog.records import Anchor, Built, JobRecord, MapRecord, MapStatus, MapSummary
+from service.catalog.records import Anchor, Built, JobRecord, MapRecord, MapStatus, MapSummary, ScanOutcome
+from service.catalog.versions import ScanPosition
 
 router = APIRouter(tags=["maps"])
 MapId = Annotated[Id, Path()]
+SCANS_SHOWN = 100  #: of a map or a version, in its document
+SCANS_LISTED = documented("not_found", "gone", "invalid_request", "bad_request")
 
 
 class RegistrationRequest(Request):
@@ -134,6 +147,18 @@ class MapRequest(ScansRequest):
 class BuiltDocument(Built, Document):
     """What documents of maps and versions have in common."""
 
+    scans: tuple[ScanOutcome, ...] = Field(
+        description="the first 100 of its `scan_count` scans: those of the base that were accepted, then the new ones, as "
+        "requested; the link `scans` leads to all"
+    )
+    links: list[Link]
+
+
+class ScanOutcomeList(Document):
+    """What became of the scans of a map, or of a version of one, in its order."""
+
+    version: int = Field(description="of the map, whose scans these are", examples=[1])
+    scans: list[ScanOutcome]
     links: list[Link]
 
 
@@ -148,6 +173,20 @@ class MapSummaryDocument(MapSummary, Document):
 
     problem: JobProblem  # type: ignore[assignment]  # as RFC 9457 has it
     links: list[Link]
+
+
+class ScansPageRequest(Request):
+    """Which part of the scans of a map or of a version."""
+
+    limit: Limit = 100
+    cursor: Cursor = None
+
+    def after(self) -> ScanPosition | None:
+        """Return where to go on. Raises BadRequest."""
+        if self.cursor is None:
+            return None
+        job_id, before = decoded(self.cursor, str, count)
+        return job_id, before
 
 
 class AcceptedMap(Document):
@@ -212,7 +251,18 @@ def get_map(request: HttpRequest, services: Provided, map_id: MapId) -> MapDocum
 
     A map stays `ready` while a newer version builds, and when that fails; see its versions.
     """
-    return map_document(services.catalog.maps.get(map_id), request)
+    return map_document(services.catalog.maps.get(map_id, scans=SCANS_SHOWN), request)
+
+
+@router.get("/maps/{map_id}/scans", summary="List the scans of a map", responses=SCANS_LISTED)
+def list_map_scans(
+    request: HttpRequest, services: Provided, map_id: MapId, asked: Annotated[ScansPageRequest, Query()]
+) -> ScanOutcomeList:
+    """What became of each scan of its version in use: pose, registration, warnings, and why it was left out.
+
+    `next` goes on in the same version, also where a newer one came into use meanwhile.
+    """
+    return scan_list(request, services, map_id, None, asked)
 
 
 @router.delete("/maps/{map_id}", status_code=204, summary="Delete a map", responses=NAMED)
@@ -255,8 +305,8 @@ async def put_anchor(request: HttpRequest, services: Provided, map_id: MapId) ->
     """From now on every feature of the map, old or new, carries its footprint in WGS 84 as `geometry`."""
     async with bodies.received(request, services, takes=(bodies.JSON,), needs_space=False) as body:
         wanted = checked(AnchorRequest, body.fields)
-    record = await services.writes.run(services.catalog.maps.set_anchor, map_id, wanted)
-    return map_document(record, request)
+    await services.writes.run(services.catalog.maps.set_anchor, map_id, wanted)
+    return await run_in_threadpool(get_map, request, services, map_id)
 
 
 @router.delete("/maps/{map_id}/anchor", status_code=204, summary="Take a map off the Earth", responses=NAMED)
@@ -290,7 +340,7 @@ def _create(services: Services, wanted: MapRequest, body: Body, once: Once) -> t
 
 
 def _delete(services: Services, map_id: str) -> None:
-    services.catalog.maps.get(map_id)
+    services.catalog.maps.summary(map_id)
     for job in services.catalog.jobs.unfinished(map_id):
         stop_if_open(services, job.job_id)
     services.catalog.maps.delete(map_id)
@@ -301,27 +351,40 @@ def map_document(record: MapRecord, request: HttpRequest) -> MapDocument:
     return MapDocument(**dict(record), links=_links(record, request))
 
 
+def scan_list(
+    request: HttpRequest, services: Services, map_id: str, number: int | None, asked: ScansPageRequest
+) -> ScanOutcomeList:
+    """Answer with a page of the scans of a version; of the one in use where none is named."""
+    told = services.catalog.versions.scans(map_id, number, after=asked.after(), limit=asked.limit)
+    links = [Link(href=here(request), rel="self"), link(request, f"/maps/{map_id}", "map")]
+    if told.following is not None:
+        job_id, before = told.following
+        links.append(next_link(request, encoded(job_id, str(before))))
+    return ScanOutcomeList(version=told.version, scans=list(told.items), links=links)
+
+
 def _links(record: MapSummary, request: HttpRequest) -> list[Link]:
-    here = f"/maps/{record.map_id}"
+    path = f"/maps/{record.map_id}"
     links = [
-        link(request, here, "self"),
+        link(request, path, "self"),
         link(request, f"/jobs/{record.job_id}", "monitor"),
-        link(request, f"{here}/versions", "version-history"),
+        link(request, f"{path}/scans", "scans"),
+        link(request, f"{path}/versions", "version-history"),
     ]
     if record.status == "ready":
         links += [
-            *file_links(request, here),
-            link(request, f"{here}/changes", "changes", "application/geo+json"),
-            link(request, f"{here}/objects", "objects", "application/geo+json"),
+            *file_links(request, path),
+            link(request, f"{path}/changes", "changes", "application/geo+json"),
+            link(request, f"{path}/objects", "objects", "application/geo+json"),
         ]
     return links
 
 
-def file_links(request: HttpRequest, here: str) -> list[Link]:
-    """Return the links to the files of a map, or of a version of one, that lies at `here`."""
+def file_links(request: HttpRequest, path: str) -> list[Link]:
+    """Return the links to the files of a map, or of a version of one, that lies at `path`."""
     return [
-        link(request, f"{here}/manifest", "manifest"),
-        link(request, f"{here}/cloud.ply", "cloud", bodies.RAW),
+        link(request, f"{path}/manifest", "manifest"),
+        link(request, f"{path}/cloud.ply", "cloud", bodies.RAW),
     ]
 
 

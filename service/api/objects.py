@@ -36,8 +36,7 @@ from service.api.feeds import (
     FEED_WITHDRAWN,
     After,
     WithdrawnDocument,
-    feed_members,
-    feed_next,
+    feed_response,
     require_alone,
 )
 from service.api.http.dependencies import Provided
@@ -347,7 +346,7 @@ def get_survey_objects(
     survey = catalog.surveys.ready(survey_id)
     if survey.objects is None:
         raise NotFound(_why_none(survey))
-    anchor = catalog.maps.get(survey.map_id).anchor
+    anchor = catalog.maps.summary(survey.map_id).anchor
     form = form_of(request, asked, anchor)
     wanted = SightingFilter(
         survey_id=survey_id,
@@ -400,22 +399,13 @@ def get_objects(
     """
     anchor = services.catalog.maps.ready(map_id).anchor
     form = form_of(request, asked, anchor)
-    wanted = _filter(map_id, asked, anchor)
+    wanted, of_map = _filter(map_id, asked, anchor), link(request, f"/maps/{map_id}", "map")
     if asked.after is not None:
         require_alone(after=asked.after, cursor=asked.cursor, sortby="sortby" in asked.model_fields_set)
         feed = services.catalog.objects.published(
             wanted, after=FeedCursor.read(asked.after), limit=asked.limit
         )
-        return collection_response(
-            request,
-            form,
-            OBJECTS,
-            [_object(one, form) for one in feed.items],
-            matched=feed.matched,
-            following=feed_next(request, feed.cursor, form.media_type),
-            links=[link(request, f"/maps/{map_id}", "map")],
-            members=feed_members(feed.cursor, feed.withdrawn),
-        )
+        return feed_response(request, form, OBJECTS, feed, _object, links=[of_map])
     order = object_order(asked.sortby)
     after = decoded_values(asked.cursor, asked.sortby, [key.type for key in order])
     page = services.catalog.objects.page(wanted, sort=asked.sortby, after=after, limit=asked.limit)
@@ -426,7 +416,7 @@ def get_objects(
         [_object(one, form) for one in page.items],
         matched=page.matched,
         cursor=encoded_values(asked.sortby, page.following),
-        links=[link(request, f"/maps/{map_id}", "map")],
+        links=[of_map],
     )
 
 

@@ -35,7 +35,7 @@ from service.api.http.submission import (
 )
 from service.catalog import blob_keys
 from service.catalog.idempotency import Answer, Once
-from service.catalog.records import JobRecord, MapRecord, SurveyRecord, SurveyStatus, SurveySummary
+from service.catalog.records import JobRecord, MapSummary, SurveyRecord, SurveyStatus, SurveySummary
 
 router = APIRouter(tags=["surveys"])
 MapId = Annotated[Id, Path()]
@@ -125,7 +125,7 @@ def list_surveys(
     request: HttpRequest, services: Provided, map_id: MapId, asked: Annotated[PageRequest, Query()]
 ) -> SurveyList:
     """Of one map in short, newest first."""
-    services.catalog.maps.get(map_id)
+    services.catalog.maps.summary(map_id)
     page = services.catalog.surveys.page(map_id, after=asked.after(), limit=asked.limit)
     links = list_links(request, page, lambda record: (record.created, record.survey_id))
     surveys = [SurveySummaryDocument(**dict(one), links=_links(one, request)) for one in page.items]
@@ -204,7 +204,7 @@ def _accepted(request: HttpRequest, record: SurveyRecord, job: JobRecord) -> Acc
 
 def _create(
     services: Services,
-    reference: MapRecord,
+    reference: MapSummary,
     wanted: SurveyRequest,
     body: Body,
     maps: Collection[str] | None,

@@ -183,7 +183,7 @@ def get_tiles(
 ) -> Response:
     """Unchanged, changed, inconsistent and unobserved tiles alike; all of them where no `limit` is given."""
     survey = services.catalog.surveys.ready(survey_id)
-    anchor = services.catalog.maps.get(survey.map_id).anchor
+    anchor = services.catalog.maps.summary(survey.map_id).anchor
     form = form_of(request, asked, anchor)
     wanted = TileFilter(
         survey_id=survey_id,

@@ -28,7 +28,18 @@ from service.api.http.submission import (
     monitor,
     submit,
 )
-from service.api.maps import BuiltDocument, MapId, cloud_response, file_links, manifest_response
+from service.api.maps import (
+    SCANS_LISTED,
+    SCANS_SHOWN,
+    BuiltDocument,
+    MapId,
+    ScanOutcomeList,
+    ScansPageRequest,
+    cloud_response,
+    file_links,
+    manifest_response,
+    scan_list,
+)
 from service.catalog.idempotency import Answer, Once
 from service.catalog.records import JobRecord, MapStatus, VersionRecord, VersionSummary
 
@@ -130,7 +141,23 @@ def list_versions(
 @router.get("/maps/{map_id}/versions/{number}", summary="Look at a version of a map", responses=NAMED)
 def get_version(request: HttpRequest, services: Provided, map_id: MapId, number: Number) -> VersionDocument:
     """Its state, what it was made from, what became of each scan, and its extent and counts once it is ready."""
-    return version_document(services.catalog.versions.get(map_id, number), request)
+    return version_document(services.catalog.versions.get(map_id, number, scans=SCANS_SHOWN), request)
+
+
+@router.get(
+    "/maps/{map_id}/versions/{number}/scans",
+    summary="List the scans of a version of a map",
+    responses=SCANS_LISTED,
+)
+def list_version_scans(
+    request: HttpRequest,
+    services: Provided,
+    map_id: MapId,
+    number: Number,
+    asked: Annotated[ScansPageRequest, Query()],
+) -> ScanOutcomeList:
+    """What became of each of its scans: pose, registration, warnings, and why it was left out."""
+    return scan_list(request, services, map_id, number, asked)
 
 
 @router.delete(
@@ -207,6 +234,7 @@ def _links(record: VersionSummary, request: HttpRequest) -> list[Link]:
         link(request, here, "self"),
         link(request, f"/jobs/{record.job_id}", "monitor"),
         link(request, f"/maps/{record.map_id}", "map"),
+        link(request, f"{here}/scans", "scans"),
     ]
     if record.survey_id is not None:
         links.append(link(request, f"/surveys/{record.survey_id}", "survey"))

@@ -11,7 +11,7 @@ from sqlalchemy.orm import InstrumentedAttribute, aliased
 
 from service.catalog import tables
 from service.catalog.database import Database
-from service.catalog.events import FeedCursor, Withdrawn, check_cursor, withdrawn
+from service.catalog.events import FeedCursor, Published, check_cursor, withdrawn
 from service.catalog.keyset import Key, Order, Values, behind, order_by
 from service.catalog.records import Bounds, ChangeRecord, TileRecord, TileState
 
@@ -74,16 +74,6 @@ class TileFilter:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class PublishedChanges:
-    """Some changes in the order in which they were first told."""
-
-    items: tuple[ChangeRecord, ...]
-    withdrawn: tuple[Withdrawn, ...]  #: since the cursor, of this map, whether or not a filter took it
-    matched: int  #: behind the cursor, those of later answers among them
-    cursor: FeedCursor  #: where to go on, also where nothing was told
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
 class ChangePage:
     """Some tiles of a longer list."""
 
@@ -129,7 +119,9 @@ class Changes:
         query = _with_voxels(query, wanted.kind)
         return self._page(_meeting(query, wanted.bounds), tile_order(sort), after, limit)
 
-    def published(self, wanted: ChangeFilter, *, after: FeedCursor, limit: int = 100) -> PublishedChanges:
+    def published(
+        self, wanted: ChangeFilter, *, after: FeedCursor, limit: int = 100
+    ) -> Published[ChangeRecord]:
         """Return changes behind a cursor in the order of publication, each once. Raises Gone."""
         query = _matching(wanted).where(_TOLD.published > after.told)
         with self._database.snapshot() as session:
@@ -138,7 +130,7 @@ class Changes:
             rows = session.execute(query.order_by(_TOLD.published).limit(limit)).all()
             gone = withdrawn(session, "change.withdrawn", wanted.map_id, after)
         told = rows[-1][2].published if matched > len(rows) else last
-        return PublishedChanges(
+        return Published(
             items=tuple(_record(*row) for row in rows),
             withdrawn=gone,
             matched=matched,

@@ -14,9 +14,10 @@ from dataclasses import dataclass, field
 from datetime import datetime, timedelta
 from typing import Any, cast
 
-from sqlalchemy import ColumnElement, CursorResult, Select, exists, or_, select, update
+from sqlalchemy import ColumnElement, CursorResult, Select, exists, func, or_, select, update
 from sqlalchemy.orm import Session
 
+from service.catalog import tallies
 from service.catalog.database import Database
 from service.catalog.events import EventFilter, extent
 from service.catalog.records import EventRecord, EventType
@@ -36,6 +37,7 @@ JITTER = (
     0.2  #: share by which a wait is longer at most: receivers that come back are not asked by all at once
 )
 CLAIM = timedelta(seconds=60)  #: longer than any attempt
+COUNTED = 10_000  #: events that wait for a webhook: counting more takes long, and says no more
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -63,6 +65,14 @@ class Outcome:
     def delivered(self) -> bool:
         """Whether the receiver took it."""
         return self.answered is not None and 200 <= self.answered < 300
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Backlog:
+    """What webhooks there are, and what waits for them."""
+
+    webhooks: dict[str, int]  #: by status
+    events: int  #: that active ones have still to get, COUNTED of each at most
 
 
 class Deliveries:
@@ -93,6 +103,16 @@ class Deliveries:
         for webhook_id in idle:
             self._move_on(webhook_id, waiting[webhook_id], last)
         return tuple({*found, *(waiting.keys() - set(idle))})
+
+    def backlog(self) -> Backlog:
+        """Count the webhooks, and what waits for those that are active."""
+        with self._database.snapshot() as session:
+            by_status = select(Webhook.status, func.count()).group_by(Webhook.status)
+            webhooks = dict(session.execute(by_status).tuples().all())
+            last = extent(session)[1]
+            behind = select(Webhook).where(Webhook.status == "active", Webhook.position < last)
+            events = sum(_count(session, row) for row in session.scalars(behind).all())
+        return Backlog(webhooks=webhooks, events=events)
 
     def claim(self, webhook_id: str) -> Task | None:
         """Take the next attempt at a webhook; None where there is none, or another has claimed it."""
@@ -131,6 +151,7 @@ class Deliveries:
             delivery.attempts += 1
             delivery.answered, delivery.error, delivery.updated = outcome.answered, outcome.error, instant
             row.claim = row.claimed_until = None
+            tallies.tally_delivery(session, outcome.answered, delivered=outcome.delivered)
             if outcome.delivered:
                 delivery.status = "delivered"
             elif task.kind != "event":
@@ -159,6 +180,11 @@ def _next(row: Webhook) -> Select[Event]:
         maps=None if row.map_id is None else (row.map_id,),
     )
     return select(Event).where(Event.sequence > row.position, *wanted.conditions()).order_by(Event.sequence)
+
+
+def _count(session: Session, row: Webhook) -> int:
+    waiting = _next(row).with_only_columns(Event.sequence).limit(COUNTED).subquery()
+    return session.scalar(select(func.count()).select_from(waiting)) or 0
 
 
 def _asked_for(session: Session, row: Webhook, claim: str) -> Task | None:

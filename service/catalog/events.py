@@ -6,7 +6,7 @@ import re
 from collections.abc import Collection
 from dataclasses import dataclass
 from datetime import datetime
-from typing import Any, NamedTuple, cast
+from typing import Any, Generic, NamedTuple, TypeVar, cast
 
 from sqlalchemy import ColumnElement, CursorResult, delete, func, select
 from sqlalchemy.orm import Session
@@ -16,6 +16,7 @@ from service.catalog.records import EventRecord, EventType
 from service.catalog.tables import Event, EventLog
 from service.errors import Gone
 
+T = TypeVar("T")
 _CURSOR = re.compile(r"[0-9]{1,18}(-[0-9]{1,18})?")
 
 
@@ -73,6 +74,16 @@ class Withdrawn(NamedTuple):
     merged_into: (
         str | None
     )  #: the change that it turned out to be; None: no visit sees it, or it is an object
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Published(Generic[T]):
+    """Some changes or objects in the order in which they were first told."""
+
+    items: tuple[T, ...]
+    withdrawn: tuple[Withdrawn, ...]  #: since the cursor, of this map, whether or not a filter took it
+    matched: int  #: behind the cursor, those of later answers among them
+    cursor: FeedCursor  #: where to go on, also where nothing was told
 
 
 class Events:

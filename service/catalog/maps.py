@@ -32,7 +32,8 @@ from service.catalog.versions import (
     in_use,
     map_row,
     new_version,
-    shown_version,
+    parts_of,
+    shown_in_short,
     versions_in_short,
 )
 from service.errors import Conflict
@@ -89,14 +90,20 @@ class Maps:
         except IntegrityError as error:
             raise Conflict(f"map {map_id!r} exists; choose another id or delete that map") from error
 
-    def get(self, map_id: str) -> MapRecord:
-        """Return one map, as its version in use. Raises NotFound."""
+    def get(self, map_id: str, *, scans: int | None = None) -> MapRecord:
+        """Return one map, as its version in use, with its first `scans` scans; left out: with all. Raises NotFound."""
         with self._database.read() as session:
-            return _record(shown_version(session, map_id))
+            shown = shown_in_short(session, map_id)
+            return MapRecord(**dict(_summary(shown)) | parts_of(session, shown, scans))
 
-    def ready(self, map_id: str) -> MapRecord:
-        """Return one map that has a version to use. Raises NotFound and NotReady."""
-        record = self.get(map_id)
+    def summary(self, map_id: str) -> MapSummary:
+        """Return one map in short, whatever its number of scans. Raises NotFound."""
+        with self._database.read() as session:
+            return _summary(shown_in_short(session, map_id))
+
+    def ready(self, map_id: str) -> MapSummary:
+        """Return one map that has a version to use, in short. Raises NotFound and NotReady."""
+        record = self.summary(map_id)
         check_ready(record.status, f"map {map_id!r}", record.job_id)
         return record
 

@@ -12,7 +12,7 @@ from sqlalchemy.orm import aliased
 
 from service.catalog import tables
 from service.catalog.database import Database
-from service.catalog.events import FeedCursor, Withdrawn, check_cursor, withdrawn
+from service.catalog.events import FeedCursor, Published, check_cursor, withdrawn
 from service.catalog.keyset import Key, Order, Values, behind, order_by
 from service.catalog.records import (
     Bounds,
@@ -86,16 +86,6 @@ class ObjectPage:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class PublishedObjects:
-    """Some objects in the order in which they were first told."""
-
-    items: tuple[MapObjectRecord, ...]
-    withdrawn: tuple[Withdrawn, ...]  #: since the cursor, of this map, whether or not a filter took it
-    matched: int  #: behind the cursor, those of later answers among them
-    cursor: FeedCursor  #: where to go on, also where nothing was told
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
 class SightingPage:
     """Some objects of a survey."""
 
@@ -133,7 +123,9 @@ class Objects:
             items=items, matched=matched, following=read[limit - 1][1] if len(read) > limit else None
         )
 
-    def published(self, wanted: ObjectFilter, *, after: FeedCursor, limit: int = 100) -> PublishedObjects:
+    def published(
+        self, wanted: ObjectFilter, *, after: FeedCursor, limit: int = 100
+    ) -> Published[MapObjectRecord]:
         """Return objects behind a cursor in the order of publication, each once. Raises Gone."""
         query = _matching(wanted).where(_OBJECT.published > after.told)
         with self._database.snapshot() as session:
@@ -142,7 +134,7 @@ class Objects:
             rows = session.execute(query.order_by(_OBJECT.published).limit(limit)).all()
             gone = withdrawn(session, "object.withdrawn", wanted.map_id, after)
         told = rows[-1][2].published if matched > len(rows) else last
-        return PublishedObjects(
+        return Published(
             items=tuple(_record(*row) for row in rows),
             withdrawn=gone,
             matched=matched,

@@ -107,6 +107,12 @@ SWEPT = Measure(
     help="Surveys, scans and folders of files that retention removed",
     labels=("what",),
 )
+DELIVERIES = Measure(
+    name="spicd_webhook_attempts",
+    help="Attempts at webhooks: delivered, refused by the receiver, or unanswered (no connection, none in time)",
+    labels=("outcome",),
+    expected=(("delivered",), ("refused",), ("unanswered",)),
+)
 #: Everything that is tallied, in the order of `/metrics`.
 MEASURES = (
     JOBS_ENDED,
@@ -120,6 +126,7 @@ MEASURES = (
     OBSERVED,
     TILES,
     SWEPT,
+    DELIVERIES,
 )
 
 
@@ -179,6 +186,12 @@ def tally_interruption(session: Session, *, kind: str, step: str) -> None:
 def tally_job(session: Session, *, kind: str, outcome: str) -> None:
     """Count a job that ended: its status, or the code of its problem where it has one."""
     add(session, JOBS_ENDED.name, {"kind": kind, "outcome": outcome})
+
+
+def tally_delivery(session: Session, answered: int | None, *, delivered: bool) -> None:
+    """Count an attempt at a webhook, whose receiver `answered` with this HTTP status, or not at all."""
+    outcome = "delivered" if delivered else "unanswered" if answered is None else "refused"
+    add(session, DELIVERIES.name, {"outcome": outcome})
 
 
 def tally_outcomes(session: Session, of: str, outcomes: Iterable[ScanOutcome], known: Iterable[str]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from sqlalchemy import Select, delete, exists, func, select
@@ -33,7 +34,18 @@ from service.catalog.scans import (
     write_outcomes,
 )
 from service.catalog.tables import MapVersion, now
-from service.errors import BadRequest, Conflict, NotFound, NotReady
+from service.errors import BadRequest, Conflict, Gone, NotFound, NotReady
+
+ScanPosition = tuple[str, int]  #: in a list of scans: the job of their version, and how many came before
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ScanPage:
+    """Some scans of a version, in its order."""
+
+    version: int  #: 1, 2, ... of the map
+    items: Sequence[ScanOutcome]
+    following: ScanPosition | None  #: None where there is no more
 
 
 class Versions:
@@ -81,16 +93,31 @@ class Versions:
             once.keep(session, *made, job=job)
             return made
 
-    def get(self, map_id: str, number: int) -> VersionRecord:
-        """Return one version. Raises NotFound."""
+    def get(self, map_id: str, number: int, *, scans: int | None = None) -> VersionRecord:
+        """Return one version, with its first `scans` scans; left out: with all. Raises NotFound."""
         with self._database.read() as session:
-            return VersionRecord.of_row(_row(session, map_id, number))
+            row = _row(session, map_id, number)
+            return VersionRecord(**dict(VersionSummary.of_row(row)) | parts_of(session, row, scans))
 
     def ready(self, map_id: str, number: int) -> VersionRecord:
         """Return one version that is built. Raises NotFound and NotReady."""
         version = self.get(map_id, number)
         check_ready(version.status, f"version {number} of map {map_id!r}", version.job_id)
         return version
+
+    def scans(
+        self, map_id: str, number: int | None = None, *, after: ScanPosition | None = None, limit: int = 100
+    ) -> ScanPage:
+        """Return what became of the scans of a version, in its order; of the one that the map shows where none is named.
+
+        A list goes on in the version that it began in, whichever the map shows by then. Raises NotFound, BadRequest for
+        a position in the list of another version, and Gone where its version was deleted.
+        """
+        with self._database.read() as session:
+            row, before = _listed(session, map_id, number, after)
+            scans = _scans_of(session, row.job_id, before, limit + 1)
+            following = (row.job_id, before + limit) if len(scans) > limit else None
+            return ScanPage(version=row.version, items=scans[:limit], following=following)
 
     def of_job(self, job_id: str) -> VersionRecord:
         """Return the version that a job builds. Raises NotFound, also where it was deleted since."""
@@ -201,7 +228,16 @@ def version_in_use(session: Session, map_id: str) -> MapVersion:
 
 def shown_version(session: Session, map_id: str) -> MapVersion:
     """Return the row of the version that a map shows, whatever its state. Raises NotFound."""
-    row = session.scalar(in_use(whole_versions()).where(tables.Map.map_id == map_id))
+    return _shown(session, map_id, whole_versions())
+
+
+def shown_in_short(session: Session, map_id: str) -> MapVersion:
+    """Return the same row for what a summary shows, without its scans. Raises NotFound."""
+    return _shown(session, map_id, versions_in_short())
+
+
+def _shown(session: Session, map_id: str, versions: Select[MapVersion]) -> MapVersion:
+    row = session.scalar(in_use(versions).where(tables.Map.map_id == map_id))
     if row is None:
         raise NotFound(f"no map {map_id!r}; GET /maps lists those there are")
     return row
@@ -222,6 +258,35 @@ def new_version(job: tables.Job, scans: Iterable[ScanOutcome], number: int) -> M
             for n, scan in enumerate(scans)
         ],
     )
+
+
+def parts_of(session: Session, row: MapVersion, scans: int | None) -> dict[str, Any]:
+    """Return what the record of a version has beside its summary: of its scans the first, or all for None."""
+    told = tuple(_scans_of(session, row.job_id, 0, scans))
+    return {"settings": row.settings, "registration": row.registration, "scans": told}
+
+
+def _scans_of(session: Session, job_id: str, before: int, limit: int | None) -> list[ScanOutcome]:
+    """Return scans of a version behind the first `before`."""
+    of_version = (tables.VersionScan.job_id == job_id, tables.VersionScan.ordinal >= before)
+    query = select(tables.VersionScan).where(*of_version).order_by(tables.VersionScan.ordinal).limit(limit)
+    return [ScanOutcome.of_row(row) for row in session.scalars(query)]
+
+
+def _listed(
+    session: Session, map_id: str, number: int | None, after: ScanPosition | None
+) -> tuple[MapVersion, int]:
+    """Return the version whose scans are listed, and how many of them came before. Raises as `Versions.scans` does."""
+    if after is None:
+        return shown_in_short(session, map_id) if number is None else _row(session, map_id, number), 0
+    map_row(session, map_id)
+    job_id, before = after
+    row = session.get(MapVersion, job_id)
+    if row is None:
+        raise Gone(f"the version of map {map_id!r} whose scans the cursor lists was deleted; begin anew")
+    if row.map_id != map_id or number not in (None, row.version):
+        raise BadRequest("the cursor is of the scans of another version; follow a `next` link")
+    return row, before
 
 
 def check_ready(status: str, what: str, job_id: str) -> None:

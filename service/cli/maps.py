@@ -10,9 +10,9 @@ from rich.console import Group
 from rich.table import Table
 
 from service.cli.completion import MapId
-from service.cli.tables import columns, counts, facts, point, scan_table
+from service.cli.tables import columns, counts, facts, point, scan_table, with_all_scans
 from service.cli.terminal import Captured, Device, Model, Scans, Terminal, Wait
-from service.client import ClientError, Document
+from service.client import Client, ClientError, Document
 
 
 def create(
@@ -36,7 +36,7 @@ def create(
         settings = None if alarms_per_survey is None else {"alarms_per_survey": alarms_per_survey}
         accepted = client.create_map(ids, map_id=map_id, name=name, model=model, settings=settings)
         map_id = accepted["map_id"]
-        terminal.accepted(client, f"map {map_id}", accepted, wait, lambda: client.map(map_id), _whole)
+        terminal.accepted(client, f"map {map_id}", accepted, wait, lambda: _asked(client, map_id), _whole)
 
 
 def list_(ctx: typer.Context) -> None:
@@ -48,7 +48,7 @@ def list_(ctx: typer.Context) -> None:
 def show(ctx: typer.Context, map_id: MapId) -> None:
     """One map with its scans."""
     terminal: Terminal = ctx.obj
-    terminal.ask(lambda client: client.map(map_id), _whole)
+    terminal.ask(lambda client: _asked(client, map_id), _whole)
 
 
 def anchor(
@@ -82,6 +82,10 @@ def delete(ctx: typer.Context, map_id: MapId) -> None:
     """Remove a map with its versions and surveys."""
     terminal: Terminal = ctx.obj
     terminal.delete(lambda client: client.delete_map(map_id), f"map {map_id}", map_id=map_id)
+
+
+def _asked(client: Client, map_id: str) -> Document:
+    return with_all_scans(client.map(map_id), lambda: client.map_scans(map_id))
 
 
 def _table(maps: Sequence[Document]) -> Table:

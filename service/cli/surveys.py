@@ -75,7 +75,7 @@ def download(
         typer.Option(help="Folder; left out: one that is named like the survey.", file_okay=False),
     ] = None,
 ) -> None:
-    """Fetch what a survey found: cloud, picture, tiles and objects. A connection that breaks is taken up."""
+    """Fetch what a survey found: cloud, picture, tiles and objects. What was broken off is taken up, also by another run."""
     terminal: Terminal = ctx.obj
     folder = to or Path(survey_id)
     with terminal.client() as client:
@@ -115,6 +115,11 @@ def changes(
     ctx: typer.Context,
     map_id: MapId,
     survey: Annotated[str | None, typer.Option(help="Of this survey only.")] = None,
+    state: Annotated[
+        str | None, typer.Option(help="changed, unchanged, inconsistent or unobserved; left out: changed.")
+    ] = None,
+    kind: Annotated[str | None, typer.Option(help="appeared or disappeared.")] = None,
+    device_id: Annotated[str | None, typer.Option("--device-id", help="Seen by this device.")] = None,
     bbox: Annotated[str | None, typer.Option(help="4 or 6 numbers with commas, map frame, metres.")] = None,
     datetime: Annotated[str | None, typer.Option(help="Instant or interval, `..` for open.")] = None,
     min_score: Annotated[float | None, typer.Option("--min-score", help="Probability of change.")] = None,
@@ -130,6 +135,9 @@ def changes(
     frame = None if bbox is None else "map"  # else the Earth's, of a map that has an anchor
     filters = {
         "survey": survey,
+        "state": state,
+        "kind": kind,
+        "device_id": device_id,
         "bbox": bbox,
         "bbox-crs": frame,
         "datetime": datetime,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from rich.table import Table
@@ -54,6 +55,12 @@ def scan_table(document: Document) -> Table:
             "\n".join(filter(None, [scan.get("detail"), warnings(scan)])),
         )
     return table
+
+
+def with_all_scans(document: Document, every: Callable[[], Sequence[Document]]) -> Document:
+    """Return a map or version with all of its scans: those `every` gives where its document has the first ones alone."""
+    told = document["scans"]
+    return document if len(told) >= document.get("scan_count", 0) else {**document, "scans": list(every())}
 
 
 def warnings(document: Document) -> str:

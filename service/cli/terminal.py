@@ -117,11 +117,17 @@ class Terminal:
         self.err.print(text, style="bold red", highlight=False, soft_wrap=True)
 
     def download(self, client: Client, path: str, to: Path) -> Path:
-        """Fetch one file under a progress bar. Raises `ClientError`, and OSError where it cannot be written."""
+        """Fetch one file under a progress bar, or the rest of it where an earlier attempt left a part.
+
+        Raises `ClientError`, and OSError where it cannot be written.
+        """
         with self._bar(_title(), BarColumn(), DownloadColumn()) as bar:
             task = bar.add_task(to.name, total=None)
             return client.download(
-                path, to, lambda received, size: bar.update(task, completed=received, total=size)
+                path,
+                to,
+                lambda received, size: bar.update(task, completed=received, total=size),
+                resume=True,
             )
 
     def upload(self, client: Client, path: Path, **about: Any) -> Document:

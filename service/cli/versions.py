@@ -10,9 +10,9 @@ from rich.console import Group
 from rich.table import Table
 
 from service.cli.completion import MapId
-from service.cli.tables import columns, counts, facts, scan_table
+from service.cli.tables import columns, counts, facts, scan_table, with_all_scans
 from service.cli.terminal import Captured, Device, Terminal, Wait
-from service.client import Document
+from service.client import Client, Document
 
 Further = Annotated[
     list[str] | None, typer.Argument(help="Further scans: files, which are uploaded, or ids of scans.")
@@ -35,7 +35,7 @@ def add(
         accepted = client.create_version(map_id, ids, survey_id=survey)
         version = accepted["version"]
         name = f"version {version} of map {map_id}"
-        terminal.accepted(client, name, accepted, wait, lambda: client.version(map_id, version), _whole)
+        terminal.accepted(client, name, accepted, wait, lambda: _asked(client, map_id, version), _whole)
 
 
 def list_(ctx: typer.Context, map_id: MapId) -> None:
@@ -47,7 +47,7 @@ def list_(ctx: typer.Context, map_id: MapId) -> None:
 def show(ctx: typer.Context, map_id: MapId, version: int) -> None:
     """One version with its scans."""
     terminal: Terminal = ctx.obj
-    terminal.ask(lambda client: client.version(map_id, version), _whole)
+    terminal.ask(lambda client: _asked(client, map_id, version), _whole)
 
 
 def delete(ctx: typer.Context, map_id: MapId, version: int) -> None:
@@ -57,6 +57,11 @@ def delete(ctx: typer.Context, map_id: MapId, version: int) -> None:
     terminal.delete(
         lambda client: client.delete_version(map_id, version), name, map_id=map_id, version=version
     )
+
+
+def _asked(client: Client, map_id: str, version: int) -> Document:
+    told = client.version(map_id, version)
+    return with_all_scans(told, lambda: client.version_scans(map_id, version))
 
 
 def _made_from(one: Document) -> str:

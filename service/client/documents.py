@@ -973,6 +973,14 @@ class ScanOutcome(TypedDict):
     warnings: list[ScanWarning]
 
 
+class ScanOutcomeList(TypedDict):
+    """What became of the scans of a map, or of a version of one, in its order."""
+
+    links: list[Link]
+    scans: list[ScanOutcome]
+    version: int
+
+
 class SightingFeature(TypedDict):
     """A thing as one survey saw it; its footprint is where it is now, or was before where it disappeared."""
 

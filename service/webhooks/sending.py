@@ -30,13 +30,15 @@ class Sender:
         resolve: Resolve = resolve,
         tls: ssl.SSLContext | None = None,
         limit_s: float = LIMIT_S,
+        root: str = "",
     ) -> None:
-        self._allowed, self._resolve, self._limit_s = allowed, resolve, limit_s
+        """Connect to public addresses and `allowed` networks; `root` stands before the paths of links."""
+        self._allowed, self._resolve, self._limit_s, self._root = allowed, resolve, limit_s, root
         self._tls = tls or httpcore.default_ssl_context()
 
     def send(self, task: Task) -> Outcome:
         """Make one attempt, and return what came of it; whatever goes wrong is an outcome."""
-        body = body_of(task)
+        body = body_of(task, root=self._root)
         try:
             answered = self._post(task.url, body, headers_of(task, body, now()))
         except AddressRefused as error:
@@ -78,12 +80,12 @@ class Sender:
             return answer.status
 
 
-def body_of(task: Task) -> bytes:
-    """Return what is sent; the same for each attempt."""
+def body_of(task: Task, *, root: str = "") -> bytes:
+    """Return what is sent, the same for each attempt; `root` stands before its paths."""
     if task.event is not None:
-        return to_json(cloud_event(task.event))
+        return to_json(cloud_event(task.event, root=root))
     data = {"webhook_id": task.webhook_id, "links": []}
-    source = f"/webhooks/{task.webhook_id}"
+    source = f"{root}/webhooks/{task.webhook_id}"
     return to_json(
         document(task.event_id, PING, source=source, subject=task.webhook_id, time=now(), data=data)
     )

@@ -66,7 +66,7 @@ def failed(house: House, job: JobRecord, code: str) -> str:
 
 
 def test_a_map_is_ready_with_its_counts_scans_and_files(house: House) -> None:
-    found = house.catalog.maps.ready(MAP)
+    found = house.catalog.maps.get(MAP)
     assert house.catalog.jobs.get(found.job_id).progress == 100
     assert found.counts["scans"] == found.counts["accepted"] == 2
     assert found.counts["tiles"] > 15

@@ -232,6 +232,6 @@ def test_a_build_that_is_killed_goes_on_from_its_pairs_and_leaves_none_behind(
     assert remembered[0] == 0
     assert remembered[1] > 0
     assert house.catalog.blobs.under(blob_keys.map_work(job.job_id)) == []
-    again, first = house.catalog.maps.ready("again"), version(house, 1)
+    again, first = house.catalog.maps.get("again"), version(house, 1)
     assert again.scans == first.scans
     assert again.counts == first.counts

@@ -14,14 +14,15 @@ from datetime import datetime
 from pathlib import Path
 from typing import get_args
 
-from prometheus_client import CollectorRegistry, Counter, Histogram, generate_latest
+from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric, SummaryMetricFamily
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.catalog import tallies
 from service.catalog.catalog import Catalog
+from service.catalog.deliveries import Backlog
 from service.catalog.jobs import OpenSteps
-from service.catalog.records import JobStatus
+from service.catalog.records import JobStatus, WebhookStatus
 from service.catalog.steps import STEPS
 from service.catalog.tables import now
 from service.queue import Snapshot
@@ -46,6 +47,11 @@ class Metrics:
         )
         self.seconds = Histogram(
             "spicd_request_seconds", "Time to the end of the answer", labels, registry=self.registry
+        )
+        self.listeners = Gauge(
+            "spicd_event_listeners",
+            "Streams of events that are open, and lists that wait",
+            registry=self.registry,
         )
 
         self._by_status: tuple[float, dict[str, int]] = (-_REMEMBERED_S, {})
@@ -108,6 +114,7 @@ class _Collector:
             _by_status(self._counts()),
             *_of_steps(self._catalog.jobs.open_steps(), now()),
             *_of_tallies(samples),
+            *_of_webhooks(self._catalog.deliveries.backlog()),
         ]
 
     def _disk(self) -> list[Metric]:
@@ -157,6 +164,19 @@ def _of_steps(steps: Iterable[OpenSteps], instant: datetime) -> list[Metric]:
                 number.add_metric((queue, kind), count)
                 age.add_metric((queue, kind), oldest)
     return [depth, wait, running, longest]
+
+
+def _of_webhooks(backlog: Backlog) -> list[Metric]:
+    """Tell how many webhooks there are, and what waits for them."""
+    webhooks = GaugeMetricFamily("spicd_webhooks", "Webhooks by whether they are sent to", labels=("status",))
+    for status in get_args(WebhookStatus):
+        webhooks.add_metric((status,), backlog.webhooks.get(status, 0))
+    waiting = GaugeMetricFamily(
+        "spicd_webhook_events_waiting",
+        "Events that active webhooks have still to get, of each ten thousand at most",
+        value=backlog.events,
+    )
+    return [webhooks, waiting]
 
 
 def _queue(one: OpenSteps) -> str:

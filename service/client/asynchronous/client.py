@@ -21,6 +21,7 @@ from service.client.documents import (
     ObjectCollection,
     ObjectHistory,
     ScanDocument,
+    ScanOutcome,
     SightingCollection,
     SurveyDocument,
     SurveySummaryDocument,
@@ -133,8 +134,12 @@ class AsyncClient(AsyncFeeds):
         return await self._all(MapSummaryDocument, "/maps", "maps")
 
     async def map(self, map_id: str) -> MapDocument:
-        """Return one map as its version in use, with its scans."""
+        """Return one map as its version in use, with the first hundred of its scans; `map_scans` has all."""
         return await self._json(MapDocument, "GET", f"/maps/{quoted(map_id)}")
+
+    async def map_scans(self, map_id: str) -> list[ScanOutcome]:
+        """Return what became of every scan of a map, as its version in use has them."""
+        return await self._all(ScanOutcome, f"/maps/{quoted(map_id)}/scans", "scans")
 
     async def delete_map(self, map_id: str) -> None:
         """Remove a map with its versions and surveys."""
@@ -143,7 +148,10 @@ class AsyncClient(AsyncFeeds):
     async def set_anchor(self, map_id: str, anchor: Document | None) -> None:
         """Say where a map lies on the Earth: `longitude latitude height heading`; None: nobody knows."""
         path = f"/maps/{quoted(map_id)}/anchor"
-        await self._delete(path) if anchor is None else self._send("PUT", path, json=anchor)
+        if anchor is None:
+            await self._delete(path)
+        else:
+            await self._send("PUT", path, json=anchor)
 
     # versions
 
@@ -169,8 +177,13 @@ class AsyncClient(AsyncFeeds):
         return await self._all(VersionSummaryDocument, f"/maps/{quoted(map_id)}/versions", "versions")
 
     async def version(self, map_id: str, version: int) -> VersionDocument:
-        """Return one version of a map with its scans."""
+        """Return one version of a map with the first hundred of its scans; `version_scans` has all."""
         return await self._json(VersionDocument, "GET", f"/maps/{quoted(map_id)}/versions/{version}")
+
+    async def version_scans(self, map_id: str, version: int) -> list[ScanOutcome]:
+        """Return what became of every scan of a version of a map."""
+        path = f"/maps/{quoted(map_id)}/versions/{version}/scans"
+        return await self._all(ScanOutcome, path, "scans")
 
     async def delete_version(self, map_id: str, version: int) -> None:
         """Remove a version that is not in use."""

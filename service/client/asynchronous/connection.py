@@ -11,6 +11,7 @@ import anyio
 import httpx
 from tenacity import AsyncRetrying, retry_if_exception
 
+from service.client.downloads import Part
 from service.client.errors import ClientError, Document, RequestRefused, refused, unreachable
 from service.client.requests import (
     DEFAULT_URL,
@@ -153,28 +154,29 @@ class AsyncConnection:
 
     # files
 
-    async def download(self, path: str, to: Path, on_received: OnReceived | None = None) -> Path:
+    async def download(
+        self, path: str, to: Path, on_received: OnReceived | None = None, *, resume: bool = False
+    ) -> Path:
         """Write an answer such as `/surveys/{id}/cloud.ply` to a file, streamed; nothing is left when it fails.
 
         A connection that breaks is taken up where it broke (RFC 9110, Section 14), if the file is still the same one.
+        With `resume` what came is left beside it (`.part`) when the connection does not come back or the process is
+        killed, and a later call goes on there.
         """
-        aside = to.with_name(to.name + ".part")
-        try:
-            with aside.open("wb") as file:
-                await self._receive(path, file, on_received)
-            return aside.replace(to)
-        finally:
-            aside.unlink(missing_ok=True)
+        part = Part(to, kept=resume)
+        with part.opened() as file:
+            await self._receive(path, file, part, on_received)
+        return to
 
-    async def _receive(self, path: str, file: BinaryIO, on_received: OnReceived | None) -> None:
-        """Write the whole of an answer into an empty file. Raises `Unreachable` after too many breaks without a byte."""
-        tag, fruitless = None, 0
+    async def _receive(self, path: str, file: BinaryIO, part: Part, on_received: OnReceived | None) -> None:
+        """Write the rest of an answer behind its part. Raises `Unreachable` after too many breaks without a byte."""
+        fruitless = 0
         while True:
-            answer = await self._send("GET", path, stream=True, headers=going_on(file.tell(), tag))
+            answer = await self._rest(path, file, part)
             start = file.tell() if answer.status_code == httpx.codes.PARTIAL_CONTENT else 0
             file.seek(start)
             file.truncate()
-            tag = strong_tag(answer)
+            part.of(strong_tag(answer))
             try:
                 async for piece in answer.aiter_bytes():
                     file.write(piece)
@@ -188,3 +190,12 @@ class AsyncConnection:
                 await anyio.sleep(self.retries.pause_s(fruitless))
             finally:
                 await answer.aclose()
+
+    async def _rest(self, path: str, file: BinaryIO, part: Part) -> httpx.Response:
+        """Ask for what is missing of a file; for all of it where the part has as much as the file, or more."""
+        try:
+            return await self._send("GET", path, stream=True, headers=going_on(file.tell(), part.tag))
+        except RequestRefused as refusal:
+            if refusal.status != httpx.codes.REQUESTED_RANGE_NOT_SATISFIABLE:
+                raise
+            return await self._send("GET", path, stream=True, headers=going_on(0, None))

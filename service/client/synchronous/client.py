@@ -20,6 +20,7 @@ from service.client.documents import (
     ObjectCollection,
     ObjectHistory,
     ScanDocument,
+    ScanOutcome,
     SightingCollection,
     SurveyDocument,
     SurveySummaryDocument,
@@ -133,8 +134,12 @@ class Client(Feeds):
         return self._all(MapSummaryDocument, "/maps", "maps")
 
     def map(self, map_id: str) -> MapDocument:
-        """Return one map as its version in use, with its scans."""
+        """Return one map as its version in use, with the first hundred of its scans; `map_scans` has all."""
         return self._json(MapDocument, "GET", f"/maps/{quoted(map_id)}")
+
+    def map_scans(self, map_id: str) -> list[ScanOutcome]:
+        """Return what became of every scan of a map, as its version in use has them."""
+        return self._all(ScanOutcome, f"/maps/{quoted(map_id)}/scans", "scans")
 
     def delete_map(self, map_id: str) -> None:
         """Remove a map with its versions and surveys."""
@@ -143,7 +148,10 @@ class Client(Feeds):
     def set_anchor(self, map_id: str, anchor: Document | None) -> None:
         """Say where a map lies on the Earth: `longitude latitude height heading`; None: nobody knows."""
         path = f"/maps/{quoted(map_id)}/anchor"
-        self._delete(path) if anchor is None else self._send("PUT", path, json=anchor)
+        if anchor is None:
+            self._delete(path)
+        else:
+            self._send("PUT", path, json=anchor)
 
     # versions
 
@@ -169,8 +177,13 @@ class Client(Feeds):
         return self._all(VersionSummaryDocument, f"/maps/{quoted(map_id)}/versions", "versions")
 
     def version(self, map_id: str, version: int) -> VersionDocument:
-        """Return one version of a map with its scans."""
+        """Return one version of a map with the first hundred of its scans; `version_scans` has all."""
         return self._json(VersionDocument, "GET", f"/maps/{quoted(map_id)}/versions/{version}")
+
+    def version_scans(self, map_id: str, version: int) -> list[ScanOutcome]:
+        """Return what became of every scan of a version of a map."""
+        path = f"/maps/{quoted(map_id)}/versions/{version}/scans"
+        return self._all(ScanOutcome, path, "scans")
 
     def delete_version(self, map_id: str, version: int) -> None:
         """Remove a version that is not in use."""

@@ -12,6 +12,7 @@ from uuid import uuid4
 import httpx
 from tenacity import Retrying, retry_if_exception
 
+from service.client.downloads import Part
 from service.client.errors import ClientError, Document, RequestRefused, refused, unreachable
 from service.client.requests import (
     DEFAULT_URL,
@@ -152,28 +153,29 @@ class Connection:
 
     # files
 
-    def download(self, path: str, to: Path, on_received: OnReceived | None = None) -> Path:
+    def download(
+        self, path: str, to: Path, on_received: OnReceived | None = None, *, resume: bool = False
+    ) -> Path:
         """Write an answer such as `/surveys/{id}/cloud.ply` to a file, streamed; nothing is left when it fails.
 
         A connection that breaks is taken up where it broke (RFC 9110, Section 14), if the file is still the same one.
+        With `resume` what came is left beside it (`.part`) when the connection does not come back or the process is
+        killed, and a later call goes on there.
         """
-        aside = to.with_name(to.name + ".part")
-        try:
-            with aside.open("wb") as file:
-                self._receive(path, file, on_received)
-            return aside.replace(to)
-        finally:
-            aside.unlink(missing_ok=True)
+        part = Part(to, kept=resume)
+        with part.opened() as file:
+            self._receive(path, file, part, on_received)
+        return to
 
-    def _receive(self, path: str, file: BinaryIO, on_received: OnReceived | None) -> None:
-        """Write the whole of an answer into an empty file. Raises `Unreachable` after too many breaks without a byte."""
-        tag, fruitless = None, 0
+    def _receive(self, path: str, file: BinaryIO, part: Part, on_received: OnReceived | None) -> None:
+        """Write the rest of an answer behind its part. Raises `Unreachable` after too many breaks without a byte."""
+        fruitless = 0
         while True:
-            answer = self._send("GET", path, stream=True, headers=going_on(file.tell(), tag))
+            answer = self._rest(path, file, part)
             start = file.tell() if answer.status_code == httpx.codes.PARTIAL_CONTENT else 0
             file.seek(start)
             file.truncate()
-            tag = strong_tag(answer)
+            part.of(strong_tag(answer))
             try:
                 for piece in answer.iter_bytes():
                     file.write(piece)
@@ -187,3 +189,12 @@ class Connection:
                 time.sleep(self.retries.pause_s(fruitless))
             finally:
                 answer.close()
+
+    def _rest(self, path: str, file: BinaryIO, part: Part) -> httpx.Response:
+        """Ask for what is missing of a file; for all of it where the part has as much as the file, or more."""
+        try:
+            return self._send("GET", path, stream=True, headers=going_on(file.tell(), part.tag))
+        except RequestRefused as refusal:
+            if refusal.status != httpx.codes.REQUESTED_RANGE_NOT_SATISFIABLE:
+                raise
+            return self._send("GET", path, stream=True, headers=going_on(0, None))

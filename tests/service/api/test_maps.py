@@ -11,7 +11,17 @@ from fastapi.testclient import TestClient
 from service.catalog import blob_keys
 from service.catalog.catalog import Catalog
 from service.settings import Settings
-from tests.support.samples import MODEL, RememberingQueue, add_map, add_scan, add_survey, ply, tile
+from tests.support.samples import (
+    BOUNDS,
+    IDENTITY,
+    MODEL,
+    RememberingQueue,
+    add_map,
+    add_scan,
+    add_survey,
+    ply,
+    tile,
+)
 from worker.pipeline.settings import PipelineSettings
 
 
@@ -215,3 +225,58 @@ def test_a_list_of_maps_does_not_grow_with_their_scans(client: TestClient, catal
         catalog.maps.create(scan_ids=ids, model=MODEL, map_id=name)
         sizes.append(len(str(client.get("/maps?limit=1").json()["maps"][0])))
     assert sizes[1] < sizes[0] + 50
+
+
+def test_a_map_does_not_grow_with_its_scans_beyond_the_first_hundred(
+    client: TestClient, catalog: Catalog
+) -> None:
+    ids = [add_scan(catalog, f"scan-{number}").scan_id for number in range(102)]
+    poses = {ids[101]: IDENTITY}
+    catalog.maps.create(scan_ids=ids, poses=poses, model=MODEL, map_id="hall")
+    for path in ("/maps/hall", "/maps/hall/versions/1"):
+        found = client.get(path).json()
+        assert (len(found["scans"]), found["scan_count"]) == (100, 102)
+        (every,) = [link["href"] for link in found["links"] if link["rel"] == "scans"]
+        assert every == f"{path}/scans"
+        first = client.get(every).json()
+        assert (first["version"], first["scans"]) == (1, found["scans"])
+        last = client.get(following(first)).json()
+        assert [scan["scan_id"] for scan in last["scans"]] == ids[100:]
+        assert last["scans"][1]["pose"] == [list(row) for row in IDENTITY]
+        assert following(last) == ""
+
+
+def test_a_list_of_scans_goes_on_in_the_version_that_it_began_in(
+    client: TestClient, catalog: Catalog
+) -> None:
+    first = add_scan(catalog, "first").scan_id
+    _, job = catalog.maps.create(
+        scan_ids=[first, add_scan(catalog, "second").scan_id], model=MODEL, map_id="hall"
+    )
+    finish(catalog, job.job_id)
+    page = client.get("/maps/hall/scans?limit=1").json()
+    _, job = catalog.versions.create("hall", scan_ids=[add_scan(catalog, "third").scan_id])
+    finish(catalog, job.job_id)
+    going_on = client.get(following(page)).json()
+    assert (going_on["version"], len(going_on["scans"]), following(going_on)) == (1, 1, "")
+    newer = client.get("/maps/hall/scans").json()
+    assert (newer["version"], len(newer["scans"])) == (2, 3)
+    other = following(page).replace("/maps/hall/", "/maps/hall/versions/2/")
+    refused = client.get(other)
+    assert (refused.status_code, refused.json()["type"]) == (422, "urn:spicd:problem:bad_request")
+    assert client.delete("/maps/hall/versions/1").status_code == 204
+    assert client.get(following(page)).status_code == 410
+    assert client.get("/maps/nowhere/scans").status_code == 404
+
+
+def following(page: Any) -> str:
+    """Where a page says that its list goes on; nothing where it ends."""
+    return "".join(link["href"] for link in page["links"] if link["rel"] == "next")
+
+
+def finish(catalog: Catalog, job_id: str) -> None:
+    """Have every scan of a version accepted, and the version in use."""
+    told = {"accepted": True, "map_from_scan": IDENTITY}
+    outcomes = [scan.model_copy(update=told) for scan in catalog.versions.of_job(job_id).scans]
+    catalog.versions.save_result(job_id, outcomes=outcomes, bounds=BOUNDS, counts={"tiles": 4})
+    catalog.jobs.succeed(job_id)

@@ -45,7 +45,7 @@ def run(settings: Settings, script: str) -> None:
 
 
 def test_the_map_of_the_last_build_is_read_as_it_was_written(opened: Catalog) -> None:
-    lobby = opened.maps.ready("lobby")
+    lobby = opened.maps.get("lobby")
     assert (lobby.version, lobby.job_id, lobby.counts, lobby.bounds) == (1, "job-1", {"tiles": 4}, BOUNDS)
     assert lobby.anchor is not None
     assert (lobby.anchor.longitude, lobby.anchor.heading) == (13.4, 90)

@@ -260,6 +260,22 @@ def test_names_that_look_like_markup_are_printed_as_they_are(
         assert name in capsys.readouterr().out
 
 
+def test_maps_show_tells_of_every_scan_where_the_document_has_the_first_alone(
+    service: Service, capsys: pytest.CaptureFixture[str]
+) -> None:
+    every = [{**MAP["scans"][0], "scan_id": f"scan-{number}"} for number in range(3)]
+    more = {"version": 1, "links": [{"rel": "next", "href": "/maps/lobby/scans?cursor=c"}]}
+    last = {"version": 1, "links": []}
+    service.on("GET /maps/lobby", {**MAP, "scan_count": 3})
+    service.on("GET /maps/lobby/scans", {**more, "scans": every[:2]}, {**last, "scans": every[2:]})
+    assert spicd("--json", "maps", "show", "lobby") == 0
+    assert json.loads(capsys.readouterr().out)["scans"] == every
+    service.on("GET /maps/lobby/versions/1", {**MAP, "version": 1, "scan_count": 3})
+    service.on("GET /maps/lobby/versions/1/scans", {**last, "scans": every})
+    assert spicd("versions", "show", "lobby", "1") == 0
+    assert "scan-2" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize("name", ["a[/]b.ply", "[old].ply"])
 def test_a_bar_shows_a_file_name_that_looks_like_markup_as_it_is(name: str) -> None:
     shown = Terminal(url="", as_json=False, err=Console(file=io.StringIO(), force_terminal=True))
@@ -373,6 +389,14 @@ def test_changes_passes_its_filters_on_and_lists_the_tiles(
     assert "tile_001_002_003" in shown
     assert "1.50, 2.25, 0.50" in shown
     assert "1 of 7" in shown
+
+
+def test_changes_takes_each_filter_of_the_api(service: Service) -> None:
+    service.on("GET /maps/lobby/changes", CHANGES)
+    filters = {"survey": "survey-1", "state": "inconsistent", "kind": "appeared", "device_id": "robot-7"}
+    words = [word for name, value in filters.items() for word in (f"--{name.replace('_', '-')}", value)]
+    assert spicd("changes", "lobby", *words) == 0
+    assert dict(service.requests[0].url.params) == {**filters, "limit": "100"}
 
 
 def test_changes_may_be_told_again_for_each_visit(service: Service) -> None:

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
+import anyio
 import httpx
 import pytest
 
 from service.catalog.catalog import Catalog
-from service.client import Client, RequestRefused, Retries
+from service.client import AsyncClient, Client, RequestRefused, Retries
 from tests.support.samples import (
+    MODEL,
     RememberingQueue,
     add_map,
+    add_scan,
     add_survey,
     catalog_of,
     ply,
@@ -95,3 +99,32 @@ def test_a_key_that_the_caller_keeps_makes_one_thing_in_two_processes(
     first, again = (client.submit_survey("hall", [scan_id], idempotency_key="visit-7") for _ in range(2))
     assert first == again
     assert len(catalog.surveys.page("hall").items) == 1
+
+
+def test_a_map_shows_its_first_hundred_scans_and_its_list_all_of_them(
+    parts: tuple[Client, Catalog, Losing],
+) -> None:
+    client, catalog, _ = parts
+    ids = [add_scan(catalog, f"scan-{number}").scan_id for number in range(130)]
+    catalog.maps.create(scan_ids=ids, model=MODEL, map_id="hall")
+    shown, version = client.map("hall"), client.version("hall", 1)
+    assert [scan["scan_id"] for scan in shown["scans"]] == ids[:100]
+    assert (shown["scan_count"], version["scans"]) == (130, shown["scans"])
+    assert [scan["scan_id"] for scan in client.map_scans("hall")] == ids
+    assert client.version_scans("hall", 1) == client.map_scans("hall")
+
+
+async def anchored(service: Any) -> None:
+    async with AsyncClient("http://localhost", transport=httpx.ASGITransport(service)) as client:
+        await client.set_anchor(
+            "hall", {"longitude": 13.4, "latitude": 52.5, "height": 76.0, "heading": 90.0}
+        )
+
+
+def test_the_async_client_sets_an_anchor_and_not_only_says_so(tmp_path: Path) -> None:
+    with running(settings_in(tmp_path), RememberingQueue()) as service:
+        add_map(catalog_of(service), "hall")
+        anyio.run(anchored, service.app)
+        anchor = catalog_of(service).maps.summary("hall").anchor
+    assert anchor is not None
+    assert anchor.longitude == 13.4

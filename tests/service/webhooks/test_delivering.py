@@ -18,6 +18,7 @@ from sqlalchemy import update
 from standardwebhooks import Webhook, WebhookVerificationError
 
 from service.catalog import deliveries as delivering
+from service.catalog import tallies
 from service.catalog.catalog import Catalog, open_catalog
 from service.catalog.publication import tell
 from service.catalog.records import DeliveryRecord, EventType
@@ -353,3 +354,36 @@ def test_no_secret_reaches_the_log(
     assert secret not in repr(task)
     assert secret not in caplog.text
     assert "did not take" in caplog.text
+
+
+def test_links_of_what_is_sent_bear_the_path_that_the_service_is_under(
+    catalog: Catalog, receiver: Receiver
+) -> None:
+    behind_a_proxy = Deliverer(catalog.deliveries, Sender(allowed=LOOPBACK, root="/spicd"))
+    webhook, _ = catalog.webhooks.add(receiver.url)
+    catalog.webhooks.ping(webhook.webhook_id)
+    happen(catalog, "lobby")
+    drain(catalog, behind_a_proxy)
+    ping, event = (one.event for one in receiver.received)
+    assert ping["source"] == f"/spicd/webhooks/{webhook.webhook_id}"
+    assert event["source"] == "/spicd/maps/lobby"
+
+
+def test_attempts_are_counted_by_what_came_of_them_and_what_waits_is_told(
+    catalog: Catalog, receiver: Receiver, deliverer: Deliverer
+) -> None:
+    webhook, _ = catalog.webhooks.add(receiver.url, types=["map.deleted"])
+    catalog.webhooks.add(receiver.url, types=["scan.deleted"])
+    happen(catalog, "one", "two")
+    assert (catalog.deliveries.backlog().webhooks, catalog.deliveries.backlog().events) == ({"active": 2}, 2)
+    receiver.answers = [500]
+    drain(catalog, deliverer)
+    hurry(catalog)
+    drain(catalog, deliverer)
+    assert catalog.deliveries.backlog().events == 0
+    catalog.webhooks.change(webhook.webhook_id, url="http://127.0.0.1:1/")
+    happen(catalog, "three")
+    drain(catalog, deliverer)
+    with catalog.database.read() as session:
+        counted = {one.labels["outcome"]: one.count for one in tallies.read(session) if "webhook" in one.name}
+    assert counted == {"refused": 1, "delivered": 2, "unanswered": 1}

@@ -253,7 +253,7 @@ class _Build:
         self, scans: Scans, reference: int, refined: Refined, relocalized: Mapping[int, Relocalized]
     ) -> dict[int, Relocalized]:
         """Return the scans left out for which there is a better reason: mirrored, scaled, a prior kilometres off."""
-        left_out = {
+        left_out: dict[int, Exception] = {
             index: ScanRejected(item.result.diagnosis)
             for index, item in relocalized.items()
             if index not in refined.poses and item.pose is None and item.result.diagnosis is not None
@@ -267,32 +267,40 @@ class _Build:
         priors = {index: scan.prior for index, scan in scans.items() if scan.prior is not None}
         reference_from_map = inverse(map_from_reference(refined.poses, priors, reference))
         in_reference = {index: reference_from_map @ priors[index] for index in left_out if index in priors}
-        errors: dict[int, Exception] = dict(left_out)
         tick = advancing(self.progress, "refining", _REFINEMENTS, 1.0)
-        for index in doubtful[: self.workspace.settings.placement.diagnosed]:
-            task = PlaceTask(
-                folder=self.workspace.folder,
-                map_index=map_index,
-                index=index,
-                prior=in_reference.get(index),
-                settings=self.workspace.settings,
-            )
-            found = task.run(place, tick=tick)
-            errors[index] = found if isinstance(found, ScanRejected) else left_out[index]
+        wanted = doubtful[: self.workspace.settings.placement.diagnosed]
+        errors = left_out | self._placed_again(wanted, in_reference, place, map_index, tick)
         better = explained(
-            errors,
-            self.files,
-            in_reference,
-            place,
-            self.workspace,
-            map_index=map_index,
-            tick=tick,
+            errors, self.files, in_reference, place, self.workspace, map_index=map_index, tick=tick
         )
         own = {index: error for index, error in errors.items() if _is_told(error)}
         return {
             index: Relocalized(index=index, result=ScanResult.rejected(self.files[index].name, error))
             for index, error in (own | better).items()
         }
+
+    def _placed_again(
+        self,
+        wanted: Sequence[int],
+        priors: Mapping[int, Matrix4],
+        place: Place,
+        map_index: int,
+        tick: Callable[[], None],
+    ) -> dict[int, Exception]:
+        """Place scans, by index, in the whole of what was registered, as scans of a survey are; return the refusals."""
+        refused: dict[int, Exception] = {}
+        for index in wanted:
+            task = PlaceTask(
+                folder=self.workspace.folder,
+                map_index=map_index,
+                index=index,
+                prior=priors.get(index),
+                settings=self.workspace.settings,
+            )
+            found = task.run(place, tick=tick)
+            if isinstance(found, ScanRejected):
+                refused[index] = found
+        return refused
 
     def _place_of(self, poses: Mapping[int, Matrix4]) -> Place:
         """Return what was registered as a place to hold other scans against, in the frame of the poses."""

@@ -13,7 +13,7 @@ from service.api.http.problems import PROBLEMS
 from service.catalog import tables, tallies
 from service.catalog.catalog import Catalog
 from service.queue import QueueState, Snapshot
-from tests.support.samples import RememberingQueue, add_map, add_survey
+from tests.support.samples import RememberingQueue, add_map, add_survey, services_of
 
 
 def scraped(client: TestClient) -> dict[tuple[str, ...], float]:
@@ -70,6 +70,24 @@ def test_a_request_that_waits_for_events_is_counted_and_is_not_slow(client: Test
     found = scraped(client)
     assert found["spicd_requests_total", "GET", "/events", "200"] == 1
     assert ("spicd_request_seconds_count", "GET", "/events") not in found
+
+
+def test_webhooks_and_listeners_are_told(client: TestClient, catalog: Catalog) -> None:
+    with catalog.database.write() as session:  # nobody delivers to a webhook that is claimed
+        tallies.tally_delivery(session, None, delivered=False)
+    webhook, _ = catalog.webhooks.add("https://example.org/hook")
+    with catalog.database.write() as session:
+        row = session.get_one(tables.Webhook, webhook.webhook_id)
+        row.claim, row.claimed_until = "claim-of-the-test", tables.now() + timedelta(hours=1)
+    add_map(catalog)
+    found = scraped(client)
+    assert (found["spicd_webhooks", "active"], found["spicd_webhooks", "disabled"]) == (1, 0)
+    assert found[("spicd_webhook_events_waiting",)] == catalog.events.last() > 0
+    assert found["spicd_webhook_attempts_total", "unanswered"] == 1
+    assert found["spicd_webhook_attempts_total", "delivered"] == 0
+    services_of(client).listeners.count = 3
+    assert scraped(client)[("spicd_event_listeners",)] == 3
+    services_of(client).listeners.count = 0
 
 
 def test_every_measure_is_told_of_before_anything_is_counted(client: TestClient) -> None:

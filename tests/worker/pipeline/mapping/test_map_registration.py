@@ -426,6 +426,19 @@ def test_a_scan_of_a_map_whose_prior_is_kilometres_off_is_told_so(
     assert "5.0 km" in diagnosis.detail
 
 
+def test_a_prior_a_hundred_thousand_kilometres_off_is_told_with_its_distance(
+    room: Room, drifted: tuple[ScanFile, ...]
+) -> None:
+    away = shifted(1e8, 0.0) @ room.before[3].world_from_sensor
+    found = register([*drifted[:3], replace(drifted[3], pose=away)])
+    assert [outcome.registration is not None for outcome in found.outcomes] == [True, True, True, False]
+    diagnosis = found.outcomes[3].diagnosis
+    assert diagnosis is not None
+    assert diagnosis.reason == "wrong_prior"
+    assert "over 10,000 km" in diagnosis.detail
+    assert diagnosis.numbers["outside"] == pytest.approx(1e8, rel=1e-3)
+
+
 def test_a_scan_of_a_map_with_y_up_is_turned_and_told(
     room: Room, drifted: tuple[ScanFile, ...], folder: Path
 ) -> None:

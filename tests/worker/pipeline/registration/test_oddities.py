@@ -135,3 +135,20 @@ def test_few_directions_rings_and_surfaces_are_told(hall: Scan) -> None:
     azimuth = np.degrees(np.arctan2(hall.points[:, 1], hall.points[:, 0]))
     narrow = replace(hall, points=hall.points[np.abs(azimuth - 42) < 15])
     assert "degrees about the vertical" in told(narrow)["little_coverage"]
+
+
+def test_one_ring_of_a_sensor_is_told_to_be_little(hall: Scan) -> None:
+    height = np.degrees(np.arctan2(hall.points[:, 2], np.hypot(hall.points[:, 0], hall.points[:, 1])))
+    ring = replace(hall, points=hall.points[(height > -3.9) & (height < -0.1)])
+    assert "points at 2 heights alone" in told(ring)["little_coverage"]
+
+
+def test_a_small_area_is_told_to_be_little(hall: Scan) -> None:
+    rng = np.random.default_rng(7)
+    corner = rng.uniform(0, 1.08, (30_000, 3))  # a floor and two walls, of 1.17 square metres each
+    corner[np.arange(len(corner)), np.arange(len(corner)) % 3] = 0
+    corner += (1.0, 1.0, -1.5)
+    scan = replace(hall, points=corner.astype(np.float32))
+    (found,) = oddities(scan, prepare(scan, SETTINGS))
+    assert (found.reason, "square metres of surfaces" in found.detail) == ("little_coverage", True)
+    assert found.numbers["area"] == pytest.approx(3 * 1.08**2, rel=0.1)
