@@ -108,7 +108,7 @@ class Deliveries:
         """Count the webhooks, and what waits for those that are active."""
         with self._database.snapshot() as session:
             by_status = select(Webhook.status, func.count()).group_by(Webhook.status)
-            webhooks = dict(session.execute(by_status).tuples().all())
+            webhooks = dict(session.execute(by_status).all())
             last = extent(session)[1]
             behind = select(Webhook).where(Webhook.status == "active", Webhook.position < last)
             events = sum(_count(session, row) for row in session.scalars(behind).all())

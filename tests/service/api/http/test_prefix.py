@@ -11,8 +11,10 @@ import httpx
 import pytest
 from fastapi.testclient import TestClient
 
+from service.api import app
 from service.catalog import blob_keys
 from service.catalog.catalog import Catalog
+from service.webhooks.sending import Sender
 from tests.support.samples import (
     RememberingQueue,
     add_map,
@@ -132,3 +134,18 @@ def test_methods_and_unknown_paths_are_told_under_a_prefix_too(client: TestClien
     assert client.get(PREFIX).status_code == 200
     for path in (f"{PREFIX}/nowhere", "/spicdx/maps", f"{PREFIX}{PREFIX}/maps"):
         assert client.get(path).status_code == 404
+
+
+def test_webhooks_are_sent_links_that_bear_the_prefix(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given: dict[str, Any] = {}
+
+    def sender(**options: Any) -> Sender:
+        given.update(options)
+        return Sender(**options)
+
+    monkeypatch.setattr(app, "Sender", sender)
+    settings = settings_in(tmp_path).model_copy(update={"root_path": "/spicd"})
+    with running(settings, RememberingQueue()):
+        assert given["root"] == "/spicd"
