@@ -71,6 +71,7 @@ def test_members_of_gzip_one_behind_another_are_one_body(client: TestClient) -> 
         gzip.compress(ply()) + b"behind",
         zlib.compress(ply()),
     ],
+    ids=["nothing", "no gzip", "cut off", "wrong sum", "more behind", "zlib"],  # a gzip bears its time
 )
 def test_what_is_no_whole_gzip_is_refused_and_not_kept(
     client: TestClient, catalog: Catalog, settings: Settings, body: bytes
