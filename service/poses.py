@@ -11,6 +11,7 @@ from numbers import Real
 from typing import Any
 
 UNIT_TOLERANCE = 1e-3  #: of a quaternion's norm against 1; four decimals pass
+RIGID_TOLERANCE = 1e-3  #: of R R^T against the identity; poses written with four decimals pass
 MAX_TEXT = 4000  #: letters of a pose
 
 #: How a frame may be called: as tf2 takes it, without blanks (REP 105 has `map`, `odom`, `base_link`, `earth`).
@@ -57,7 +58,35 @@ def numbers_of(text: str) -> list[float]:
     """Return the numbers of a text, with blanks or commas between. Raises ValueError."""
     if len(text) > MAX_TEXT:
         raise ValueError(f"a pose of {len(text)} letters, more than {MAX_TEXT}")
-    return [float(word) for word in text.replace(",", " ").split()]
+    return [_number(word) for word in text.replace(",", " ").split()]
+
+
+def _number(word: str) -> float:
+    try:
+        return float(word)
+    except ValueError:
+        raise ValueError(f"{word[:40]!r} is no number") from None
+
+
+def require_rigid(rows: Sequence[Sequence[float]]) -> None:
+    """Check that 4x4 rows are a rotation and a shift, within `RIGID_TOLERANCE`. Raises ValueError that says what is off."""
+    if any(not abs(a - b) <= 1e-6 for a, b in zip(rows[3], (0, 0, 0, 1), strict=True)):
+        raise ValueError("the last row of a pose is 0, 0, 0, 1; the matrix is row-major")
+    axes = [row[:3] for row in rows[:3]]
+    gram = [[sum(x * y for x, y in zip(a, b, strict=True)) for b in axes] for a in axes]
+    off = max(abs(gram[i][j] - (i == j)) for i in range(3) for j in range(3))
+    if not off <= RIGID_TOLERANCE:  # NaN as well
+        scales = [math.sqrt(gram[i][i]) for i in range(3)]
+        skewed = max(abs(gram[i][j]) for i in range(3) for j in range(i)) > RIGID_TOLERANCE
+        if skewed or max(scales) - min(scales) > RIGID_TOLERANCE:
+            lengths = ", ".join(f"{scale:.4g}" for scale in scales)
+            what = f"its rows have the lengths {lengths}" + (" and are not at right angles" if skewed else "")
+        else:
+            what = f"the matrix scales by {scales[0]:.4g}"
+        raise ValueError(f"the pose is not rigid: {what}; its rotation part must be orthonormal")
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = axes
+    if xx * (yy * zz - yz * zy) - xy * (yx * zz - yz * zx) + xz * (yx * zy - yy * zx) < 0:
+        raise ValueError("the pose mirrors: its determinant is negative")
 
 
 def rows_of(value: Any) -> Any:

@@ -20,6 +20,7 @@ import secrets
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -96,8 +97,8 @@ class Memory:
         if self._urls.pop(key, None) is not None:
             self._save()
 
-    def ended(self, key: str) -> None:
-        """Drop an upload that became a scan."""
+    def ended(self, key: str, *, known: bool = False) -> None:  # noqa: ARG002  # for who wants to tell it
+        """Drop an upload that became a scan, or a scan that was `known` before."""
         self.forget(key)
 
     def _save(self) -> None:
@@ -178,6 +179,7 @@ class _Sending:
     on_wait: OnWait
     offset: int = 0  #: bytes that the service has for sure
     scan_id: str | None = None
+    known: bool = False  #: the service had the scan before this upload was begun
     failures: int = 0  #: attempts since a byte went through last
     since: float = field(default_factory=time.monotonic)  #: when one did
 
@@ -210,7 +212,7 @@ class _Sending:
                     self.memory.forget(self.key)
                 raise
             self._check(scan)
-            self.memory.ended(self.key)
+            self.memory.ended(self.key, known=self.known)
             return scan
 
     def _attempt(self) -> Document:
@@ -220,11 +222,22 @@ class _Sending:
         self.on_sent(self.offset, self.size)
         while self.offset < self.size:
             self._send_piece(url)
-        if self.scan_id is None:
-            self.scan_id = self._ask("GET", url).json().get("scan_id")
+        upload = self._upload(url)
+        self.scan_id = self.scan_id or upload.get("scan_id")
         if self.scan_id is None:
             raise _Again("the service has all bytes and is not done with them")
-        return self._json("GET", f"/scans/{self.scan_id}")
+        scan = self._json("GET", f"/scans/{self.scan_id}")
+        self.known = _instant(scan.get("created")) < _instant(upload.get("created"))
+        return scan
+
+    def _upload(self, url: str) -> Document:
+        """Return what is known of an upload; nothing where it was a scan already and has been forgotten since."""
+        if self.scan_id is None:
+            return self._json("GET", url)
+        with contextlib.suppress(ValueError):
+            if (answer := self._send("GET", url)).is_success:
+                return dict(answer.json())
+        return {}
 
     def _begin(self) -> str:
         headers = {**_TUS, "Upload-Length": str(self.size), "Upload-Metadata": self.metadata}
@@ -279,7 +292,7 @@ class _Sending:
 
     def _wait(self, error: Exception) -> None:
         """Wait before the next attempt: longer after each, with jitter, and as long as the service asks."""
-        limits, why = self.persistence, str(error) or type(error).__name__
+        limits, why = self.persistence, self._why(error)
         idle = time.monotonic() - self.since
         if idle > limits.idle_s:
             raise UploadStalled(
@@ -292,6 +305,12 @@ class _Sending:
         self.failures += 1
         self.on_wait(seconds, why)
         time.sleep(seconds)
+
+    def _why(self, error: Exception) -> str:
+        """Return in words what went wrong, with the address where nothing answered."""
+        if isinstance(error, _Again):
+            return str(error)
+        return f"the service at {str(self.http.base_url).rstrip('/')} does not answer ({_in_words(error)})"
 
     def _check(self, scan: Document) -> None:
         """Hold what arrived against the file. Raises FileChanged, UploadRefused."""
@@ -329,6 +348,26 @@ class _Sending:
         limits = self.persistence
         timeout = httpx.Timeout(limits.silence_s, connect=limits.connect_s)
         return self.http.request(method, url, timeout=timeout, **request)
+
+
+def _in_words(error: BaseException) -> str:
+    """Return what happened to a connection, as the system says it: `connection refused`."""
+    if isinstance(error, httpx.TimeoutException):
+        return "no answer in time"
+    cause: BaseException | None = error
+    while cause is not None:
+        if isinstance(cause, OSError) and cause.strerror:
+            return cause.strerror.lower()
+        cause = cause.__cause__ or cause.__context__
+    return str(error).lower() or type(error).__name__
+
+
+def _instant(said: Any) -> datetime:
+    """Read an instant of a document; where there is none the earliest of all."""
+    try:
+        return datetime.fromisoformat(said).astimezone(UTC)
+    except (TypeError, ValueError):
+        return datetime.min.replace(tzinfo=UTC)
 
 
 def _again(answer: httpx.Response) -> _Again:

@@ -8,14 +8,18 @@ comment. The JSON is an object of the names that POST /scans has, each of which 
 
 from __future__ import annotations
 
+import contextlib
 import json
+import re
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from service.poses import matrix_of, numbers_of, rows_of
+from service.poses import matrix_of, numbers_of, require_rigid, rows_of
 
 SUFFIXES = (".pose.json", ".pose.txt")
 NAMES = ("pose", "frame", "captured_at", "device_id")
+_RFC3339 = re.compile(r"\d{4}-\d\d-\d\d[Tt ]\d\d:\d\d:\d\d(\.\d+)?([Zz]|[+-]\d\d:\d\d)")
 
 
 class SidecarError(Exception):
@@ -37,16 +41,20 @@ def read_sidecar(scan: Path) -> dict[str, Any]:
         return {}
     try:
         if path.suffix == ".txt":
-            return {"pose": read_pose_text(path.read_text())}
-        return _from_json(json.loads(path.read_text()))
-    except (OSError, ValueError) as error:
+            return {"pose": _rigid(read_pose_text(path.read_text()))}
+        return _from_json(_loaded(path.read_text()))
+    except OSError as error:
+        raise SidecarError(f"{path.name} cannot be read: {error.strerror or error}") from error
+    except UnicodeDecodeError as error:
+        raise SidecarError(f"{path.name} cannot be used: it is no text in UTF-8") from error
+    except ValueError as error:
         raise SidecarError(f"{path.name} cannot be used: {error}") from error
 
 
 def read_pose_text(text: str) -> list[list[float]]:
     """Return the pose of a text: JSON, or numbers with blanks or commas between. Raises ValueError."""
     if text.lstrip().startswith("["):
-        return _matrix(json.loads(text))
+        return _matrix(_loaded(text))
     return matrix_of(numbers_of(" ".join(line.partition("#")[0] for line in text.splitlines())))
 
 
@@ -58,8 +66,33 @@ def _from_json(said: Any) -> dict[str, Any]:
         raise ValueError(f"{', '.join(map(repr, unknown))} is none of {', '.join(NAMES)}")
     known = {name: value for name, value in said.items() if value is not None}
     if "pose" in known:
-        known["pose"] = _matrix(known["pose"])
+        known["pose"] = _rigid(_matrix(known["pose"]))
+    if "captured_at" in known:
+        _require_instant(known["captured_at"])
     return known
+
+
+def _loaded(text: str) -> Any:
+    """Return a JSON value. Raises ValueError with the place where it is none."""
+    try:
+        return json.loads(text)
+    except json.JSONDecodeError as error:
+        raise ValueError(f"no valid JSON at line {error.lineno}, column {error.colno}") from error
+
+
+def _rigid(rows: list[list[float]]) -> list[list[float]]:
+    require_rigid(rows)
+    return rows
+
+
+def _require_instant(said: Any) -> None:
+    if isinstance(said, str) and _RFC3339.fullmatch(said):
+        with contextlib.suppress(ValueError):
+            datetime.fromisoformat(said.upper())
+            return
+    raise ValueError(
+        f"captured_at {said!r} is no date and time of RFC 3339 with its zone, such as 2026-03-01T12:00:00Z"
+    )
 
 
 def _matrix(value: Any) -> list[list[float]]:
@@ -67,4 +100,6 @@ def _matrix(value: Any) -> list[list[float]]:
     is_matrix = isinstance(rows, list) and len(rows) == 4
     if not is_matrix or any(not isinstance(row, list) or len(row) != 4 for row in rows):
         raise ValueError("a pose is four rows of four numbers, or x y z qx qy qz qw")
+    if any(not isinstance(number, int | float) or isinstance(number, bool) for row in rows for number in row):
+        raise ValueError("a pose has numbers alone")
     return [[float(number) for number in row] for row in rows]

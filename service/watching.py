@@ -4,7 +4,7 @@
     FOLDER/monday/hall.ply       the scan of a visit
     FOLDER/done/...              what the service has
     FOLDER/refused/...           what it does not take, and `hall.ply.why.json` beside it
-    FOLDER/.spicd/               state: uploads that are begun, visits that are under way, and a lock
+    FOLDER/.spicd/               state: uploads that are begun, visits and surveys that are under way, and a lock
 
 Everything is written so that a watcher that was killed goes on: a file that was sent is known by its upload, and is not
 sent twice; a survey is submitted under an `Idempotency-Key` of its visit.
@@ -20,11 +20,15 @@ import secrets
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal, Self
 
 from service.client import Client, ClientError, Document, RequestRefused, Unreachable
+from service.following import Following
 from service.resumable import FileChanged, Memory, OnSent, OnWait, Persistence, write_aside
+from service.scan_files import FileNotWhole, require_whole
+from service.sidecars import SUFFIXES as SIDECARS
 from service.sidecars import SidecarError, read_sidecar, sidecar_of
 
 DONE, REFUSED, STATE = "done", "refused", ".spicd"
@@ -32,6 +36,10 @@ SUFFIXES = (".ply", ".pcd")
 SurveyEach = Literal["file", "folder"]
 _UNFINISHED = (".part", ".partial", ".tmp", ".crdownload", "~")
 _NO_FAULT_OF_THE_FILE = frozenset({401, 403, 404, 405, 412})
+_LONGEST_NAME = 255  #: letters that the service keeps of a file's name
+#: A robot whose clock was never set writes files of 1970 or of the day its image was made; that is no time of a scan.
+_CLOCKS_ARE_SET = datetime(2020, 1, 1, tzinfo=UTC).timestamp()
+_A_SCAN_OF_NO_ID = "none"
 
 
 class FolderBusy(ClientError):
@@ -45,6 +53,8 @@ class WatchOptions:
     settle_s: float = 3.0  #: so long a file has to stay as it is before it is whole
     visit_ends_s: float = 300.0  #: so long nothing is added to a sub-folder before its visit is over
     every_s: float = 1.0  #: between two looks
+    follow_s: float = 5.0  #: between two questions after surveys that are under way
+    wait: bool = False  #: `run_once` ends when the surveys have ended, too
     map_id: str | None = None  #: of the surveys; None: scans are sent and nothing more
     survey_each: SurveyEach = "folder"
     device_id: str | None = None
@@ -66,11 +76,15 @@ class Reporter:
 class UntilMoved(Memory):
     """Uploads of which the file may still lie where it was: they are known until it is moved, and not sent again."""
 
-    def ended(self, key: str) -> None:
+    was_known = False  #: of the file that was sent last: the service had it before
+
+    def ended(self, key: str, *, known: bool = False) -> None:  # noqa: ARG002  # it is the only one
         """Keep it."""
+        self.was_known = known
 
     def moved(self) -> None:
         """Drop all, once the file is where it belongs; one is sent at a time."""
+        self.was_known = False
         self._urls.clear()
         self._save()
 
@@ -92,6 +106,13 @@ class State:
         """Return the ids of the scans of a visit, in the order of their names, each once."""
         entries = self._visits.get(visit, {})
         return list(dict.fromkeys(entries[name] for name in sorted(entries)))
+
+    def files(self, visit: str) -> dict[str, list[str]]:
+        """Return the names of the files of each scan of a visit, by the scan's id."""
+        named: dict[str, list[str]] = {}
+        for name, scan_id in sorted(self._visits.get(visit, {}).items()):
+            named.setdefault(scan_id, []).append(name)
+        return named
 
     def add(self, visit: str, name: str, scan_id: str) -> None:
         """Note a scan of a visit."""
@@ -119,6 +140,7 @@ class Watcher:
             str, tuple[float, int]
         ] = {}  #: visits to be submitted again: not before, and after how many
         self._seen: dict[Path, tuple[tuple[int, int], float]] = {}  #: size and time of change, and since when
+        self._strays: set[Path] = set()  #: sidecars without a scan that were told of
         self.sent = self.refused = self.surveys = 0
 
     def __enter__(self) -> Self:
@@ -132,10 +154,39 @@ class Watcher:
             raise FolderBusy(f"another watcher is at {self._folder}") from None
         self._memory = UntilMoved(state / "uploads.json")
         self._state = State(state)
+        self._surveys = Following(self._client, state / "surveys.json", every_s=self._options.follow_s)
         return self
 
     def __exit__(self, *_: object) -> None:
         self._lock.close()
+
+    @property
+    def left(self) -> int:
+        """How many scans are there and not sent."""
+        return sum(1 for _ in self._present())
+
+    @property
+    def surveys_under_way(self) -> int:
+        """How many surveys are submitted and have not ended."""
+        return len(self._surveys)
+
+    def check(self) -> Document | None:
+        """Ask whether service, key and map are as they should be; the map, None without or where the key may not see it.
+
+        Raises ClientError; its `status` is 404 where there is no such map.
+        """
+        if self._options.map_id is not None:
+            try:
+                return self._client.map(self._options.map_id)
+            except RequestRefused as refused:
+                if refused.status != 403:
+                    raise
+        try:
+            self._client.scan(_A_SCAN_OF_NO_ID)  # a key that may send scans may ask for one
+        except RequestRefused as refused:
+            if refused.status != 404 or "type" not in refused.problem:
+                raise
+        return None
 
     def run(self) -> None:
         """Go on for ever. Raises ClientError for what no later attempt mends, such as a key that is not known."""
@@ -147,6 +198,7 @@ class Watcher:
         """Send what is there, and end once nothing is left; every visit counts as over. Raises ClientError."""
         while self.look(visits_are_over=True):
             time.sleep(self._options.every_s)
+        self._tell_strays(at_once=True)
 
     def look(self, *, visits_are_over: bool = False) -> bool:
         """Send what is whole by now, and submit what is over; whether anything is left that may become so."""
@@ -159,7 +211,10 @@ class Watcher:
         if self._options.map_id is not None:
             for visit in self._state.names():
                 left |= not (self._is_over(visit, visits_are_over) and self._submit(visit))
-        return left
+        self._tell_strays()
+        for sentence, event in self._surveys.ended():
+            self._report.event(sentence, event)
+        return left or (self._options.wait and bool(self._surveys))
 
     def _present(self) -> Iterator[Path]:
         """Yield the scans in the folder and in its sub-folders, in order of their names."""
@@ -184,8 +239,11 @@ class Watcher:
     def _take(self, path: Path) -> None:
         """Send one scan, and move it to where it belongs."""
         try:
-            said = {"device_id": self._options.device_id, "frame": self._options.frame}
-            scan = self._send(path, {**said, **read_sidecar(path)})
+            require_whole(path)
+            said = self._said(path)
+            scan = self._send(path, said)
+        except FileNotWhole as error:
+            self._refuse(path, {"title": "The file is no whole scan", "detail": str(error)})
         except SidecarError as error:
             self._refuse(path, {"title": "What lies beside the scan cannot be used", "detail": str(error)})
         except RequestRefused as refused:
@@ -201,7 +259,22 @@ class Watcher:
         except OSError as error:
             self._refuse(path, {"title": "The file cannot be read", "detail": error.strerror or str(error)})
         else:
-            self._keep(path, scan)
+            self._keep(path, scan, said)
+
+    def _said(self, path: Path) -> dict[str, Any]:
+        """Return what is said of a scan: by its sidecar, by the options, and by the file itself. Raises SidecarError."""
+        name = str(path.relative_to(self._folder))
+        written = path.stat().st_mtime
+        captured_at = None
+        if _CLOCKS_ARE_SET <= written <= time.time():
+            captured_at = datetime.fromtimestamp(int(written), UTC).isoformat().replace("+00:00", "Z")
+        return {
+            "filename": name if len(name) <= _LONGEST_NAME and name.isprintable() else path.name,
+            "captured_at": captured_at,
+            "device_id": self._options.device_id,
+            "frame": self._options.frame,
+            **read_sidecar(path),
+        }
 
     def _send(self, path: Path, said: dict[str, Any]) -> Document:
         """Send a scan, however long it takes; when the service stays away it is asked again and again."""
@@ -215,19 +288,70 @@ class Watcher:
                 **said,
             )
 
-    def _keep(self, path: Path, scan: Document) -> None:
+    def _keep(self, path: Path, scan: Document, said: dict[str, Any]) -> None:
         relative = path.relative_to(self._folder)
-        if self._options.map_id is not None:
-            of_folder = self._options.survey_each == "folder"
-            if of_folder and len(relative.parts) > 1:
-                self._state.add(relative.parts[0], relative.name, scan["scan_id"])
-            elif not of_folder:
-                self._state.add(str(relative), relative.name, scan["scan_id"])
+        visit = self._visit_of(relative)
+        if visit is not None:
+            self._state.add(visit, relative.name, scan["scan_id"])
+        was_known, has_pose = self._memory.was_known, said.get("pose") is not None
         self._move(path, DONE)
         self._memory.moved()
+        self._forget_refusal(relative)
         self.sent += 1
-        told = {"event": "scan", "file": str(relative), "scan_id": scan["scan_id"], "size": scan.get("size")}
-        self._report.event(f"{relative}: {scan['scan_id']}", told)
+        remarks = [] if has_pose else ["no pose"]
+        if was_known:
+            remarks.append(
+                "already there" + ("; its pose is now the one beside this file" if has_pose else "")
+            )
+        if visit is None and self._options.map_id is not None:
+            remarks.append(
+                "no survey: it lies in no sub-folder; use --survey-each file, or one folder for each visit"
+            )
+        told = {
+            "event": "scan",
+            "file": str(relative),
+            "scan_id": scan["scan_id"],
+            "size": scan.get("size"),
+            "has_pose": has_pose,
+            "was_known": was_known,
+            "visit": visit,
+        }
+        self._report.event("; ".join([f"{relative}: sent, {scan['scan_id']}", *remarks]), told)
+
+    def _visit_of(self, relative: Path) -> str | None:
+        """Return the visit that a scan is of; None where no survey is asked for with it."""
+        if self._options.map_id is None:
+            return None
+        if self._options.survey_each == "file":
+            return str(relative)
+        return relative.parts[0] if len(relative.parts) > 1 else None
+
+    def _forget_refusal(self, relative: Path) -> None:
+        """Remove why a scan was refused before, once it is sent: it was mended and moved back."""
+        refused = self._folder / REFUSED / relative
+        if not refused.exists():
+            refused.with_name(f"{refused.name}.why.json").unlink(missing_ok=True)
+            with contextlib.suppress(OSError):  # others lie there
+                refused.parent.rmdir()
+
+    def _tell_strays(self, visit: str | None = None, *, at_once: bool = False) -> None:
+        """Say once of each sidecar that it belongs to no scan, as soon as none is likely to come."""
+        folders = [self._folder / visit] if visit else [self._folder, *self._visits()]
+        for folder in folders:
+            for path in sorted(folder.glob("*.pose.*")) if folder.is_dir() else ():
+                is_due = at_once or time.time() - path.stat().st_mtime >= self._options.visit_ends_s
+                if is_due and path not in self._strays and _is_stray(path):
+                    self._strays.add(path)
+                    name = str(path.relative_to(self._folder))
+                    self._report.event(f"{name} belongs to no scan", {"event": "stray", "file": name})
+
+    def _visits(self) -> list[Path]:
+        """Return the sub-folders that scans are written into."""
+        return [
+            path
+            for path in sorted(self._folder.iterdir())
+            if path.is_dir() and not path.name.startswith(".") and path.name not in (DONE, REFUSED)
+        ]
 
     def _refuse(self, path: Path, problem: Document) -> None:
         relative = path.relative_to(self._folder)
@@ -286,8 +410,11 @@ class Watcher:
             self._later[visit] = (time.monotonic() + wait, failures + 1)
             self._report.waiting(wait, f"{visit}: {error}")
             return False
+        self._surveys.add(answer["survey_id"], visit, self._state.files(visit))
         self._state.end(visit)
         self._later.pop(visit, None)
+        if self._options.survey_each == "folder":
+            self._tell_strays(visit, at_once=True)
         with contextlib.suppress(OSError):  # not empty: something that is no scan lies there
             (self._folder / visit).rmdir()
         self.surveys += 1
@@ -304,6 +431,16 @@ def key_of(map_id: str, visit: str, scans: list[str]) -> str:
 def _may_pass(refused: RequestRefused) -> bool:
     """Whether a wait may mend a refusal: a map that still builds, a full queue, a part of the service that is away."""
     return refused.status in (408, 409, 423, 425, 429) or refused.status >= 500
+
+
+def _is_stray(path: Path) -> bool:
+    """Whether a file is a sidecar beside which no scan lies, whole or not."""
+    suffix = next((suffix for suffix in SIDECARS if path.name.endswith(suffix)), None)
+    if suffix is None or path.name.startswith("."):
+        return False
+    stem = path.name.removesuffix(suffix)
+    beside = (other.name for other in path.parent.iterdir() if other.name.startswith(f"{stem}."))
+    return all(name.endswith(SIDECARS) for name in beside)
 
 
 def _is_scan(path: Path) -> bool:

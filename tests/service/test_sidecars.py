@@ -54,7 +54,7 @@ def test_without_one_nothing_is_said(scan: Path) -> None:
         ("hall.pose.txt", "1 2 3", "3 numbers"),
         ("hall.pose.txt", "1 2 3 0 0 0 nan", "norm nan"),
         ("hall.pose.txt", "1 2 3 0 0 1 1", "norm 1.414"),
-        ("hall.pose.txt", "one", "could not convert"),
+        ("hall.pose.txt", "one", "'one' is no number"),
         ("hall.pose.json", "[1]", "no JSON object"),
         ("hall.pose.json", '{"poses": []}', "'poses' is none of pose"),
         ("hall.pose.json", '{"pose": [[1, 2], [3, 4]]}', "four rows"),

@@ -16,15 +16,30 @@ import httpx
 import pytest
 from fastapi.testclient import TestClient
 
+from service.catalog.records import Problem, ScanOutcome
 from service.client import Client, RequestRefused
 from service.resumable import Persistence
-from service.watching import FolderBusy, Watcher, WatchOptions
+from service.watching import FolderBusy, Reporter, Watcher, WatchOptions
 from tests.support.api_process import ROOT, ApiProcess
 from tests.support.bad_link import bad_link
 from tests.support.processes import until
-from tests.support.samples import add_map, catalog_of, ply
+from tests.support.samples import add_map, catalog_of
 
 NOW = WatchOptions(settle_s=0, every_s=0)
+
+
+def ply(content: str = "hall", points: int = 1) -> bytes:
+    """A whole PLY in ASCII."""
+    head = f"ply\nformat ascii 1.0\ncomment {content}\nelement vertex {points}\n"
+    return (
+        head + "property float x\nproperty float y\nproperty float z\nend_header\n" + "1 2 3\n" * points
+    ).encode()
+
+
+def pcd() -> bytes:
+    """A whole PCD."""
+    head = "# .PCD v.7\nVERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 1\nHEIGHT 1\nPOINTS 1\n"
+    return f"{head}DATA ascii\n1 2 3\n".encode()
 
 
 class Through(httpx.BaseTransport):
@@ -43,7 +58,10 @@ class Through(httpx.BaseTransport):
         answer = self._client.request(
             request.method, str(request.url.raw_path, "ascii"), content=body, headers=dict(request.headers)
         )
-        return httpx.Response(answer.status_code, headers=answer.headers, content=answer.content)
+        headers = {
+            name: value for name, value in answer.headers.items() if name.lower() != "content-encoding"
+        }
+        return httpx.Response(answer.status_code, headers=headers, content=answer.content)
 
 
 @pytest.fixture
@@ -81,7 +99,7 @@ def test_what_is_there_is_sent_and_moved_with_what_lies_beside_it(
 ) -> None:
     put(folder / "hall.ply")
     (folder / "hall.pose.txt").write_text("1 2 3 0 0 0 1 # at the door\n")
-    put(folder / "monday" / "b.pcd", b"# .PCD v.7\nVERSION .7\n")
+    put(folder / "monday" / "b.pcd", pcd())
     said = {"pose": [1, 0, 0, 0, 0, 0, 1], "frame": "odom", "captured_at": "2026-03-01T12:00:00Z"}
     (folder / "monday" / "b.pose.json").write_text(json.dumps(said))
     with Watcher(service, folder, WatchOptions(settle_s=0, every_s=0, device_id="robot-7")) as watcher:
@@ -89,7 +107,7 @@ def test_what_is_there_is_sent_and_moved_with_what_lies_beside_it(
     assert names(folder) == [
         "done/hall.ply", "done/hall.pose.txt", "done/monday/b.pcd", "done/monday/b.pose.json",
     ]  # fmt: skip
-    b, hall = sorted(client.get("/scans").json()["scans"], key=lambda scan: str(scan["filename"]))
+    hall, b = sorted(client.get("/scans").json()["scans"], key=lambda scan: str(scan["filename"]))
     assert (hall["device_id"], hall["frame"], [row[3] for row in hall["pose"]]) == (
         "robot-7",
         None,
@@ -235,6 +253,141 @@ def test_a_folder_has_one_watcher(service: Client, folder: Path) -> None:
         Watcher(service, folder, NOW),
     ):
         pass
+
+
+def events_of(service: Client, folder: Path, **options: Any) -> list[tuple[str, dict[str, Any]]]:
+    """Send what is there once; what the watcher told."""
+    told: list[Any] = []
+    report = Reporter(event=lambda sentence, event: told.append((sentence, dict(event))))
+    with Watcher(
+        service, folder, WatchOptions(settle_s=0, every_s=0, follow_s=0, **options), report
+    ) as watcher:
+        watcher.run_once()
+    return told
+
+
+def test_a_scan_that_no_survey_comes_of_is_told_so(service: Client, client: TestClient, folder: Path) -> None:
+    add_map(catalog_of(client))
+    put(folder / "top.ply")
+    ((sentence, event),) = events_of(service, folder, map_id="lobby")
+    assert "no survey: it lies in no sub-folder; use --survey-each file" in sentence
+    assert event["visit"] is None
+    put(folder / "top.ply", ply("other"))
+    ((sentence, _),) = events_of(service, folder)
+    assert "no survey" not in sentence
+
+
+def test_a_file_that_is_cut_off_is_refused_before_it_is_sent(
+    service: Client, through: Through, folder: Path
+) -> None:
+    put(folder / "cut.ply", ply(points=5)[:-9])
+    put(folder / "none.ply", ply(points=0))
+    (cut, _), (none, _) = events_of(service, folder)
+    assert "5 points, 3 of them are there; copy or record it again" in cut
+    assert "no points" in none
+    assert through.requests == []
+    assert "cut off" in json.loads((folder / "refused/cut.ply.why.json").read_text())["detail"]
+
+
+def test_a_survey_that_has_ended_is_told_with_its_files(
+    service: Client, client: TestClient, folder: Path
+) -> None:
+    catalog = catalog_of(client)
+    add_map(catalog)
+    for name in ("a.ply", "elsewhere.ply"):
+        put(folder / "monday" / name, ply(name))
+    told = events_of(service, folder, map_id="lobby")
+    survey = told[-1][1]
+    a, elsewhere = survey["scans"]
+    outcomes = [
+        ScanOutcome(scan_id=a, accepted=True),
+        ScanOutcome(scan_id=elsewhere, accepted=False, reason="no_fit", detail="it does not fit"),
+    ]
+    catalog.surveys.save_outcomes(survey["survey_id"], outcomes)
+    ended: list[Any] = []
+    report = Reporter(event=lambda sentence, event: ended.append((sentence, dict(event))))
+    options = WatchOptions(settle_s=0, every_s=0, follow_s=0, map_id="lobby", wait=True)
+    with Watcher(service, folder, options, report) as watcher:  # another process
+        assert watcher.look()
+        assert (ended, watcher.surveys_under_way) == ([], 1)
+        catalog.jobs.fail(survey["job_id"], Problem(code="no_scan_accepted", detail="none fits"))
+        watcher.run_once()
+        assert watcher.surveys_under_way == 0
+    ((sentence, event),) = ended
+    assert f"monday: survey {survey['survey_id']} failed, 1 of 2 scans placed" in sentence
+    assert "elsewhere.ply: no fit" in sentence
+    assert (event["event"], event["status"]) == ("survey_ended", "failed")
+    assert [one["file"] for one in event["scans"]] == ["a.ply", "elsewhere.ply"]
+
+
+def test_a_survey_that_was_deleted_is_followed_no_more(
+    service: Client, client: TestClient, folder: Path
+) -> None:
+    catalog = catalog_of(client)
+    add_map(catalog)
+    put(folder / "monday" / "a.ply")
+    survey = events_of(service, folder, map_id="lobby")[-1][1]
+    catalog.jobs.fail(survey["job_id"], Problem(code="internal", detail="none"))
+    catalog.surveys.delete(survey["survey_id"])
+    ((sentence, _),) = events_of(service, folder, map_id="lobby", wait=True)
+    assert sentence.endswith("was deleted")
+
+
+def test_a_scan_bears_the_name_of_its_visit_and_the_time_it_was_written(
+    service: Client, client: TestClient, folder: Path
+) -> None:
+    os.utime(put(folder / "monday" / "b.ply"), (1_772_366_400, 1_772_366_400))
+    os.utime(put(folder / "never.ply", ply("of a clock that was never set")), (1000, 1000))
+    events_of(service, folder)
+    monday, never = sorted(client.get("/scans").json()["scans"], key=lambda scan: str(scan["filename"]))
+    assert (monday["filename"], monday["captured_at"]) == ("monday/b.ply", "2026-03-01T12:00:00Z")
+    assert (never["filename"], never["captured_at"]) == ("never.ply", None)
+
+
+def test_a_sidecar_of_another_name_is_told_and_stays(
+    service: Client, client: TestClient, folder: Path
+) -> None:
+    add_map(catalog_of(client))
+    put(folder / "bad" / "typo_name.ply")
+    put(folder / "bad" / "typo_nmae.pose.txt", b"1 2 3 0 0 0 1")
+    (sent, scan), (stray, _), _ = events_of(service, folder, map_id="lobby")
+    assert "no pose" in sent
+    assert scan["has_pose"] is False
+    assert stray == "bad/typo_nmae.pose.txt belongs to no scan"
+    assert (folder / "bad/typo_nmae.pose.txt").exists()
+
+
+def test_a_sidecar_whose_scan_is_still_written_is_no_stray(service: Client, folder: Path) -> None:
+    put(folder / "hall.pose.txt", b"1 2 3 0 0 0 1")
+    put(folder / "hall.ply.part")
+    assert events_of(service, folder) == []
+
+
+def test_a_refused_scan_that_is_mended_and_moved_back_leaves_nothing_behind(
+    service: Client, folder: Path
+) -> None:
+    put(folder / "monday" / "hall.ply")
+    (folder / "monday/hall.pose.txt").write_text("2.O 0 0 0 0 0 1")
+    ((sentence, _),) = events_of(service, folder)
+    assert "hall.pose.txt cannot be used: '2.O' is no number" in sentence
+    for path in sorted((folder / "refused/monday").glob("hall.p*")):
+        if not path.name.endswith(".why.json"):
+            path.replace(folder / "monday" / path.name)
+    (folder / "monday/hall.pose.txt").write_text("2.0 0 0 0 0 0 1")
+    events_of(service, folder)
+    assert names(folder) == ["done/monday/hall.ply", "done/monday/hall.pose.txt"]
+
+
+def test_the_same_bytes_with_another_pose_are_told(service: Client, folder: Path) -> None:
+    put(folder / "hall.ply")
+    ((first, event),) = events_of(service, folder)
+    assert "already" not in first
+    assert event["was_known"] is False
+    put(folder / "hall.ply")
+    (folder / "hall.pose.txt").write_text("1 2 3 0 0 0 1")
+    ((second, event),) = events_of(service, folder)
+    assert "already there; its pose is now the one beside this file" in second
+    assert event["was_known"] is True
 
 
 @pytest.mark.slow

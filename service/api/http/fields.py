@@ -12,9 +12,8 @@ from pydantic import AfterValidator, BeforeValidator, Field, WithJsonSchema
 
 from service.api.http.json_text import read_json
 from service.catalog.records import Matrix
-from service.poses import FRAME, numbers_of, rows_of
+from service.poses import FRAME, numbers_of, require_rigid, rows_of
 
-RIGID_TOLERANCE = 1e-3  #: of R Rᵀ against the identity; poses written with four decimals pass
 MAX_LISTED = 1000  #: names in one list of a request
 LARGEST_SHIFT = 10_000.0  #: metres; further out the workers take no point of a scan either
 
@@ -82,17 +81,7 @@ def names_from_text(value: Any) -> Any:
 
 def rigid(matrix: Matrix) -> Matrix:
     """Check that a matrix is a rotation and a shift. Raises ValueError with the number that is off."""
-    if any(abs(a - b) > 1e-6 for a, b in zip(matrix[3], (0, 0, 0, 1), strict=True)):
-        raise ValueError("the last row of a pose is 0, 0, 0, 1; the matrix is row-major")
-    rows = [row[:3] for row in matrix[:3]]
-    for i, a in enumerate(rows):
-        for j, b in enumerate(rows):
-            dot = sum(x * y for x, y in zip(a, b, strict=True))
-            if abs(dot - (i == j)) > RIGID_TOLERANCE:
-                raise ValueError(f"the pose is not rigid: rows {i} and {j} have the dot product {dot:.4f}")
-    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = rows
-    if xx * (yy * zz - yz * zy) - xy * (yx * zz - yz * zx) + xz * (yx * zy - yy * zx) < 0:
-        raise ValueError("the pose mirrors: its determinant is negative")
+    require_rigid(matrix)
     shift = math.hypot(*(row[3] for row in matrix[:3]))
     if shift > LARGEST_SHIFT:
         raise ValueError(
