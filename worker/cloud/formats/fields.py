@@ -110,8 +110,8 @@ def rows_size(fields: Sequence[Field], *, n: int, held: int) -> int:
     needed = n * stride(fields)
     if held < needed:
         raise ScanError(
-            f"truncated: header declares {n} points ({needed} bytes), "
-            f"file holds {held // stride(fields)} ({held} bytes); upload it again"
+            f"the file is cut off (truncated): header declares {n} points ({needed} bytes), "
+            f"file holds {held // stride(fields)} ({held} bytes); copy or record it again"
         )
     return needed
 
@@ -196,7 +196,9 @@ def from_text(fields: Sequence[Field], lines: Iterator[bytes], *, n: int, size: 
     while start < n:
         chunk = _chunk(lines, rows=min(n - start, max(1, _NUMBERS_AT_ONCE // width)))
         if not chunk:
-            raise ScanError(f"truncated: header declares {n} points, file holds {start}; upload it again")
+            raise ScanError(
+                f"the file is cut off (truncated): header declares {n} points, file holds {start}; copy or record it again"
+            )
         numbers = _decode(chunk, width, start=start, n=n)
         for name, i in chosen.items():
             columns[name][start : start + len(chunk)] = _cast(numbers[:, firsts[i]], fields[i])

@@ -212,7 +212,7 @@ def _compressed(header: PcdHeader, buffer: mmap.mmap, *, most: int) -> Columns:
     if len(buffer) - start < packed:
         raise ScanError(
             f"truncated: {packed} bytes of compressed data for {header.n} points are declared, "
-            f"file holds {len(buffer) - start}; upload it again"
+            f"file holds {len(buffer) - start}; copy or record it again"
         )
     if unpacked != needed or unpacked > packed * _LZF_GAIN:
         raise ScanError(
@@ -234,7 +234,7 @@ def _decompress(packed: memoryview, size: int) -> NDArray[np.uint8]:
     try:
         filled = len(imagecodecs.lzf_decode(packed, out=unpacked.data))  # type: ignore[arg-type]  # any buffer
     except imagecodecs.LzfError as error:
-        raise ScanError(f"compressed data is damaged ({error}); upload it again") from None
+        raise ScanError(f"compressed data is damaged ({error}); copy or record it again") from None
     if filled != size:  # the decoder stops early without complaint
         raise ScanError(f"compressed data is damaged: it gives {filled} bytes instead of {size}")
     return unpacked

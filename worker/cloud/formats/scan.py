@@ -57,7 +57,7 @@ def _decode(path: Path, max_points: int) -> RawCloud:
     """Tell the format by the first bytes and decode the whole file."""
     with path.open("rb") as file:
         if path.stat().st_size == 0:
-            raise ScanError("the file is empty (0 bytes); upload it again")
+            raise ScanError("the file is empty (0 bytes); copy or record it again")
         buffer = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
     head = buffer[:256]
     if looks_like_ply(head):

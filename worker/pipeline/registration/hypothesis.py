@@ -30,15 +30,22 @@ class Hypothesis:
 
     def is_accepted(self, settings: RegistrationSettings) -> bool:
         """Ask for Table 1's RMSE, enough of the scan in the map, and inliers both ways; never against a prior."""
-        overlap = settings.min_overlap
-        if self.consistent_with_prior:
-            overlap = min(overlap, settings.min_overlap_near_prior)
         return (
             not self.contradicts_prior
-            and (self.fitness > settings.min_fitness or self.overlap >= overlap)
+            and self.overlaps(settings)
             and self.inlier_rmse < settings.max_inlier_rmse
             and self.two_way_inlier_ratio >= self.required_inlier_ratio(settings)
         )
+
+    def overlaps(self, settings: RegistrationSettings) -> bool:
+        """Tell whether enough of the scan is in the map: by the overlap, or by Table 1's fitness."""
+        return self.fitness > settings.min_fitness or self.overlap >= self.required_overlap(settings)
+
+    def required_overlap(self, settings: RegistrationSettings) -> float:
+        """Ask for less of the scan near a prior."""
+        if self.consistent_with_prior:
+            return min(settings.min_overlap, settings.min_overlap_near_prior)
+        return settings.min_overlap
 
     def required_inlier_ratio(self, settings: RegistrationSettings) -> float:
         """Ask for more where the sides are known, which raises the ratio, and no prior speaks for the pose."""

@@ -121,11 +121,30 @@ def require_accepted(name: str, hypothesis: Hypothesis, settings: RegistrationSe
         name,
         hypothesis,
         reason,
-        f"fitness {hypothesis.fitness:.2f} (over {settings.min_fitness:g} is accepted), "
-        f"inlier RMSE {hypothesis.inlier_rmse * 100:.1f} cm, inlier ratio {hypothesis.two_way_inlier_ratio:.2f} "
-        f"(at least {hypothesis.required_inlier_ratio(settings):g}) over {hypothesis.overlap:.0%} of the scan; "
-        + advice,
+        f"{' and '.join(_shortcomings(hypothesis, settings)) or 'it fits elsewhere'}; {advice}",
     )
+
+
+def _shortcomings(hypothesis: Hypothesis, settings: RegistrationSettings) -> list[str]:
+    """Return which of the conditions of `Hypothesis.is_accepted` do not hold, each with its number and its limit."""
+    short = []
+    if not hypothesis.overlaps(settings):
+        short.append(
+            f"the map covers {hypothesis.overlap:.1%} of it, at least {hypothesis.required_overlap(settings):.0%} is "
+            f"needed (or a fitness over {settings.min_fitness:g}, it has {hypothesis.fitness:.2f})"
+        )
+    required = hypothesis.required_inlier_ratio(settings)
+    if hypothesis.two_way_inlier_ratio < required:
+        short.append(
+            f"of the surfaces that it shares with the map {hypothesis.two_way_inlier_ratio:.1%} lie on each other "
+            f"(inlier ratio), at least {required:.0%} is needed"
+        )
+    if not hypothesis.inlier_rmse < settings.max_inlier_rmse:
+        short.append(
+            f"its inlier RMSE is {hypothesis.inlier_rmse * 100:.1f} cm, less than "
+            f"{settings.max_inlier_rmse * 100:g} cm is needed"
+        )
+    return short
 
 
 def require_constrained(

@@ -11,13 +11,16 @@ from tests.support.graphs import shifted
 from tests.support.rooms import Room, as_scan, wall
 from worker.cloud.poses import exponential, inverse
 from worker.cloud.visibility import RangeImage
+from worker.pipeline.registration.hypothesis import Hypothesis
 from worker.pipeline.registration.preprocessing import PreparedScan, prepare
+from worker.pipeline.registration.results import ScanRejected
 from worker.pipeline.registration.settings import RegistrationSettings
 from worker.pipeline.registration.surface import Surface
 from worker.pipeline.registration.verification import (
     ROBOT,
     TwoWayInliers,
     free_space_violation,
+    require_accepted,
     two_way_inliers,
 )
 
@@ -138,3 +141,35 @@ def test_a_scan_of_the_same_room_a_metre_and_a_half_off_is_contradicted(room: Ro
     a, b = (prepare(as_scan(scan.points), SETTINGS) for scan in room.before[:2])
     wrong = inverse(room.before[1].world_from_sensor) @ shifted(1.5) @ room.before[0].world_from_sensor
     assert free_space_violation(a, b, wrong) > 5 * SETTINGS.max_free_space_violation
+
+
+POOR = Hypothesis(
+    target_from_source=np.eye(4),
+    fitness=0.29,
+    inlier_rmse=0.033,
+    num_inliers=900,
+    overlap=0.8,
+    two_way_inlier_ratio=0.57,
+    from_global_search=True,
+    consistent_with_prior=False,
+    contradicts_prior=False,
+    oriented=True,
+)
+
+
+@pytest.mark.parametrize(
+    ("values", "said", "unsaid"),
+    [
+        ({}, ["57.0% lie on each other", "at least 85% is needed"], ["fitness", "RMSE"]),
+        ({"overlap": 0.1}, ["57.0%", "the map covers 10.0% of it", "over 0.55, it has 0.29"], ["RMSE"]),
+        ({"two_way_inlier_ratio": 0.9, "inlier_rmse": 0.2}, ["RMSE is 20.0 cm"], ["fitness", "ratio"]),
+        ({"two_way_inlier_ratio": 0.9, "contradicts_prior": True}, ["far from the pose prior"], ["ratio"]),
+    ],
+)
+def test_a_refusal_names_the_conditions_that_do_not_hold_and_no_other(
+    values: dict[str, object], said: list[str], unsaid: list[str]
+) -> None:
+    with pytest.raises(ScanRejected) as refused:
+        require_accepted("b.ply", replace(POOR, **values), SETTINGS)  # type: ignore[arg-type]
+    assert all(part in str(refused.value) for part in said)
+    assert not any(part in str(refused.value) for part in unsaid)
