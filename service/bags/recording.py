@@ -265,6 +265,11 @@ def _instant(stamp: int) -> datetime:
     return datetime.fromtimestamp(stamp / _SECOND, UTC)
 
 
+def _reason(error: Exception) -> str:
+    """Return what a library says, without the address of its line."""
+    return str(error).strip().rstrip(".") or type(error).__name__
+
+
 def _open(path: Path) -> Any:
     try:
         from rosbags.highlevel import AnyReader  # noqa: PLC0415  # an extra
@@ -273,11 +278,17 @@ def _open(path: Path) -> Any:
         raise BagError(
             "reading recordings of ROS needs the package rosbags: pip install 'spicd[ros]'"
         ) from error
+    if path.is_dir() and not (path / "metadata.yaml").is_file():
+        raise BagError(
+            f"no metadata.yaml in {path}; name the folder that `ros2 bag record` made, or an .mcap or .db3"
+        )
+    if path.is_file() and path.stat().st_size == 0:
+        raise BagError(f"{path} is empty (0 bytes); copy or record it again")
     try:
         reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
         reader.open()
     except Exception as error:  # the library raises what its parts do
         raise BagError(
-            f"{path} is no recording that can be read (a folder of rosbag2, .mcap, .db3): {type(error).__name__}: {error}"
+            f"{path} is no recording that can be read (a folder of rosbag2, .mcap, .db3): {_reason(error)}"
         ) from error
     return reader

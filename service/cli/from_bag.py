@@ -52,7 +52,9 @@ def from_bag(
 
     A stop is where the sensor moves by less than 2 cm and turns by less than 1 degree; what it saw there, 20 clouds at
     most, is one scan. The pose of a scan takes points from the sensor's frame to --frame, by the transforms of the
-    recording, interpolated at the time of the cloud.
+    recording, interpolated at the time of the cloud. A pose in `odom` is taken as if it were one in the map: where the
+    two differ by more than a metre or so, leave poses out or localize first (--frame map). Give --device-id: scans of
+    two robots with the same bytes are told apart by it.
 
     \b
       spicd scans from-bag patrol.mcap --to /data/visits/monday       files for `spicd scans watch`

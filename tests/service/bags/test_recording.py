@@ -210,6 +210,18 @@ def test_what_is_no_recording_is_told(tmp_path: Path) -> None:
         Recording(tmp_path / "patrol.mcap")
 
 
+def test_an_empty_folder_or_file_is_told_in_plain_words(tmp_path: Path) -> None:
+    with pytest.raises(BagError, match=f"^no metadata.yaml in {tmp_path}"):
+        Recording(tmp_path)
+    (tmp_path / "x.mcap").touch()
+    with pytest.raises(BagError, match=r"x\.mcap is empty \(0 bytes\)"):
+        Recording(tmp_path / "x.mcap")
+    (tmp_path / "y.mcap").write_bytes(b"no recording at all")
+    with pytest.raises(BagError, match=r"y\.mcap is no recording") as error:
+        Recording(tmp_path / "y.mcap")
+    assert "Error:" not in str(error.value)
+
+
 def test_without_the_library_the_extra_is_named(bag: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "rosbags.highlevel", None)
     with pytest.raises(BagError, match=r"pip install 'spicd\[ros\]'"):
