@@ -22,6 +22,7 @@ router = APIRouter(tags=["health"])
 Check = Literal["ok", "failed"]
 
 _ELSEWHERE_S = 10.0  #: between two looks at a store that takes money for each
+_WORKERS_START_S = 30.0  #: they are started beside the API, and load their libraries first
 
 
 class Live(Document):
@@ -44,7 +45,7 @@ def parts(services: Services) -> dict[str, Part]:
     """Return what the service needs, and how each part is asked."""
     blobs = services.catalog.blobs
     return {
-        "workers": Part(ping=functools.partial(_ask_workers, services.queue)),
+        "workers": Part(ping=functools.partial(_ask_workers, services.queue), starts_s=_WORKERS_START_S),
         "database": Part(ping=services.catalog.database.ping),
         "queue": Part(ping=services.queue.ping),
         "blobs": Part(ping=blobs.ping, every_s=2.0 if blobs.is_local else _ELSEWHERE_S),

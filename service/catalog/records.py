@@ -408,6 +408,9 @@ class SurveySummary(Record):
     captured_at: Utc  #: given, else the latest of its scans, else the time of the request
     warnings: Warnings = Field((), description="what is odd about the survey itself: its clock")
     scan_count: int = Field(description="scans that it is made of, accepted or not", examples=[4])
+    accepted_count: int = Field(
+        0, description="of these, that were placed; 0 until its scans are registered", examples=[3]
+    )
     placement: Placement | None = Field(
         description="null until its scans are registered, and in surveys of releases that did not judge it"
     )

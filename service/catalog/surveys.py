@@ -126,7 +126,9 @@ class Surveys:
     def page(self, map_id: str, *, after: Position | None = None, limit: int = 100) -> Page[SurveySummary]:
         """Return surveys of a map, newest first."""
         query = select(Survey).where(Survey.map_id == map_id)
-        query = query.options(undefer(Survey.scan_count), selectinload(Survey.job))
+        query = query.options(
+            undefer(Survey.scan_count), undefer(Survey.accepted_count), selectinload(Survey.job)
+        )
         created, key = Survey.created, Survey.survey_id
         return self._database.page(query, created, key, SurveySummary.of_row, after=after, limit=limit)
 

@@ -233,6 +233,13 @@ class Survey(Base):
         .scalar_subquery(),
         deferred=True,
     )
+    accepted_count: Mapped[int] = column_property(
+        select(func.count())
+        .where(SurveyScan.survey_id == survey_id, SurveyScan.accepted.is_(True))
+        .correlate_except(SurveyScan)
+        .scalar_subquery(),
+        deferred=True,
+    )
     job: Mapped[Job | None] = relationship(primaryjoin="foreign(Survey.job_id) == Job.job_id", viewonly=True)
     problem: AssociationProxy[dict[str, Any] | None] = association_proxy("job", "problem")
 

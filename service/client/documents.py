@@ -464,6 +464,7 @@ class SurveyRequest(TypedDict):
 class SurveySummaryDocument(TypedDict):
     """A survey in short; the survey itself tells what became of each scan."""
 
+    accepted_count: int
     asked_threshold: float | None
     captured_at: str
     counts: dict[str, int]
@@ -993,6 +994,7 @@ class SightingFeature(TypedDict):
 class SurveyDocument(TypedDict):
     """A survey and what became of its scans."""
 
+    accepted_count: int
     asked_threshold: float | None
     captured_at: str
     counts: dict[str, int]

@@ -20,6 +20,7 @@ class Part:
     ping: Callable[[], None]  #: returns, or raises whatever is wrong
     every_s: float = 2.0  #: between two questions
     limit_s: float = 3.0  #: after which a part that has not answered has failed
+    starts_s: float = 0.0  #: that it may take until it answers first; no failure is logged before
 
 
 @dataclass(slots=True)
@@ -28,6 +29,7 @@ class _Seen:
 
     asked: float | None = None  #: monotonic seconds of the question that waits for its answer
     reason: str | None = "it was not asked yet"  #: why the last answer was none; None: it was one
+    logged: str | None = None  #: the failure that the log has
     answered: threading.Event = field(default_factory=threading.Event)
 
 
@@ -61,13 +63,18 @@ class HealthMonitor:
 
     def _watch(self, name: str) -> None:
         part, seen = self._parts[name], self._seen[name]
+        begun, has_answered = time.monotonic(), False
         while not self._stopped.is_set():
             seen.asked = time.monotonic()
             reason = _asked(part.ping)
-            if reason is not None and seen.reason != reason:
+            has_answered = has_answered or reason is None
+            starts = not has_answered and time.monotonic() - begun < part.starts_s
+            if reason is not None and seen.logged != reason and not starts:
                 log.warning("the part %s does not answer: %s", name, reason)
-            elif reason is None and seen.answered.is_set() and seen.reason is not None:
+                seen.logged = reason
+            elif reason is None and seen.logged is not None:
                 log.info("the part %s answers again", name)
+                seen.logged = None
             seen.reason, seen.asked = reason, None
             seen.answered.set()
             self._stopped.wait(part.every_s)

@@ -13,6 +13,7 @@ from sqlalchemy import text
 from service.api.http.monitor import HealthMonitor, Part
 from service.api.http.problems import MEDIA_TYPE
 from service.catalog.catalog import Catalog
+from service.errors import QueueUnavailable
 from service.queue import QueueState
 from service.settings import Settings
 from tests.support.processes import until
@@ -115,6 +116,20 @@ def test_a_part_that_hangs_is_told_of_and_nobody_waits_for_it() -> None:
     gate.set()
     until(lambda: monitor.failures()["hangs"] is None)
     monitor.stop()
+
+
+@pytest.mark.parametrize(("starts_s", "logged"), [(60.0, 0), (0.0, 1)])
+def test_a_part_that_still_starts_is_no_warning(
+    starts_s: float, logged: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    def absent() -> None:
+        raise QueueUnavailable("no geometry worker answers")
+
+    monitor = HealthMonitor({"workers": Part(ping=absent, starts_s=starts_s)})
+    monitor.start()
+    monitor.stop()
+    assert monitor.failures() == {"workers": "no geometry worker answers"}
+    assert [record.levelname for record in caplog.records].count("WARNING") == logged
 
 
 def assert_true(value: bool) -> None:

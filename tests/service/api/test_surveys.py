@@ -51,7 +51,11 @@ def test_a_pose_of_a_survey_counts_there_alone(client: TestClient, catalog: Cata
     assert catalog.scans.get(turned).pose == IDENTITY
     outcome = ScanOutcome(scan_id=turned, accepted=True)
     catalog.surveys.save_outcomes(survey_id, [outcome])
-    assert client.get(f"/surveys/{survey_id}").json()["scans"][1]["pose"] == moved
+    shown = client.get(f"/surveys/{survey_id}").json()
+    assert shown["scans"][1]["pose"] == moved
+    (listed,) = client.get("/maps/lobby/surveys").json()["surveys"]
+    for document in (shown, listed):
+        assert (document["accepted_count"], document["scan_count"]) == (1, 3)
 
 
 def test_a_scan_is_named_once_with_a_pose_or_without(client: TestClient, catalog: Catalog) -> None:
