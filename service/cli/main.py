@@ -26,7 +26,7 @@ from service.cli import (
     watch,
     webhooks,
 )
-from service.cli.terminal import Terminal
+from service.cli.terminal import Terminal, in_commands
 from service.client import DEFAULT_URL, ClientError
 from service.up.embedded_redis import LaunchFailed
 
@@ -110,6 +110,8 @@ GROUPS: dict[str, tuple[str, dict[Callable[..., None], str]]] = {
         {models.train: "train lobby --minutes 10 --wait"},
     ),
 }
+#: Options that stand before the command or behind it, and are not in its list. `\n\n` begins a paragraph.
+_EVERYWHERE = "\n\nWith every command: --url ADDRESS (or SPICD_URL; the key in SPICD_KEY), --json."
 _GLOBAL_FLAGS = ("--json",)
 _GLOBAL_OPTIONS = ("--url",)
 
@@ -120,7 +122,7 @@ def main(arguments: list[str] | None = None) -> None:
     try:
         _commands()(args=words, prog_name="spicd")
     except (ClientError, LaunchFailed) as error:
-        Terminal(url="", as_json=False).fail(str(error))
+        Terminal(url="", as_json=False).fail(in_commands(str(error)))
         raise SystemExit(1) from None
 
 
@@ -147,9 +149,9 @@ def _commands() -> typer.Typer:
 
 def _add(group: typer.Typer, function: Callable[..., None], example: str) -> None:
     """Add a command under the name of its function, with an example below its help."""
-    group.command(function.__name__.rstrip("_").replace("_", "-"), epilog=f"Example: spicd {example}")(
-        function
-    )
+    group.command(
+        function.__name__.rstrip("_").replace("_", "-"), epilog=f"Example: spicd {example}{_EVERYWHERE}"
+    )(function)
 
 
 def _version(wanted: bool) -> None:

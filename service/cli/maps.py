@@ -29,7 +29,12 @@ def create(
     captured_at: Captured = None,
     wait: Wait = False,
 ) -> None:
-    """Build a map of scans."""
+    """Build a map of scans.
+
+    Of each file the sidecar counts, hall.pose.json or hall.pose.txt of hall.ply, and is where its registration starts:
+    `spicd scans watch --help` says what is in one. The frame of the map is the one that the poses lead to, or that of one
+    of the scans where there are none; metres, z up.
+    """
     terminal: Terminal = ctx.obj
     with terminal.client() as client:
         ids = terminal.scan_ids(client, scans, device_id=device_id, captured_at=captured_at)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import json
 from collections.abc import Callable, Iterator, Sequence
@@ -13,11 +14,12 @@ from rich.console import Group
 from rich.table import Table
 
 from service.cli.completion import MapId, SurveyId
-from service.cli.tables import columns, counts, facts, number, placement, point, scan_table, warnings
+from service.cli.tables import columns, counts, facts, failure, number, placement, point, scan_table, warnings
 from service.cli.terminal import Captured, Device, Model, Scans, Terminal, Wait
-from service.client import Client, ClientError, Document
+from service.client import Client, ClientError, Document, RequestRefused
 from service.client.documents import SurveyDocument
 
+NAMED_SCANS = 200  #: of a survey, whose files are asked for one by one
 CSV_PAGE = OBJECTS_PAGE = 1000  #: in one answer
 
 
@@ -43,7 +45,7 @@ def submit(
             f"survey {survey_id}",
             accepted,
             wait,
-            lambda: client.survey(survey_id),
+            lambda: _asked(client, survey_id, as_json=terminal.as_json),
             _whole(terminal.url),
         )
 
@@ -55,9 +57,24 @@ def list_(ctx: typer.Context, map_id: MapId) -> None:
 
 
 def show(ctx: typer.Context, survey_id: SurveyId) -> None:
-    """One survey with its placement, its scans and counts."""
+    """One survey with its placement, its scans and their files, and counts."""
     terminal: Terminal = ctx.obj
-    terminal.ask(lambda client: client.survey(survey_id), _whole(terminal.url))
+    terminal.ask(lambda client: _asked(client, survey_id, as_json=terminal.as_json), _whole(terminal.url))
+
+
+def _asked(client: Client, survey_id: str, *, as_json: bool) -> Document:
+    """Return a survey, for people with the name of each scan's file; --json shows the document as it is."""
+    survey = client.survey(survey_id)
+    if as_json or len(survey["scans"]) > NAMED_SCANS:
+        return survey
+    return {**survey, "scans": [{**scan, "file": _file(client, scan["scan_id"])} for scan in survey["scans"]]}
+
+
+def _file(client: Client, scan_id: str) -> str | None:
+    """Return the name of a scan's file; None where the service does not tell it."""
+    with contextlib.suppress(RequestRefused):
+        return client.scan(scan_id)["filename"]
+    return None
 
 
 def delete(ctx: typer.Context, survey_id: SurveyId) -> None:
@@ -91,6 +108,8 @@ def download(
                 files += _features(client, survey, folder)
         except OSError as error:
             raise ClientError(f"{folder}: cannot be written ({error.strerror})") from error
+    if survey["status"] == "failed":
+        terminal.note(f"survey {survey_id} failed: {failure(survey)}")
     document: dict[str, Any] = {"survey_id": survey_id, "files": {path.name: str(path) for path in files}}
     terminal.show(document, lambda told: "\n".join(told["files"].values()))
 
@@ -156,13 +175,18 @@ def changes(
 
 
 def _table(surveys: Sequence[Document]) -> Table:
-    table = columns("survey", "status", "captured", "scans", "placement", "counts")
+    table = columns("survey", "status", "captured", "scans", "placement", "found, or why it failed")
     for one in surveys:
-        scans = str(one.get("scan_count", len(one.get("scans", []))))
-        table.add_row(
-            one["survey_id"], one["status"], one.get("captured_at"), scans, placement(one), counts(one)
-        )
+        found = failure(one) if one["status"] == "failed" else counts(one)
+        row = (one["survey_id"], one["status"], one.get("captured_at"), _scans(one), placement(one), found)
+        table.add_row(*row)
     return table
+
+
+def _scans(survey: Document) -> str:
+    """Write how many scans a survey has, and how many of them were placed once it has ended."""
+    scans, placed = survey.get("scan_count", len(survey.get("scans", []))), survey.get("accepted_count")
+    return str(scans) if survey["status"] == "running" or placed is None else f"{placed} of {scans} placed"
 
 
 def _whole(url: str) -> Callable[[Document], Group]:
@@ -181,6 +205,7 @@ def _whole(url: str) -> Callable[[Document], Group]:
             "objects": counts(survey, "objects"),
             "moving": survey.get("moving"),
             "warnings": warnings(survey),
+            "failed": failure(survey),
         }
         if survey["status"] == "ready":
             rows |= {

@@ -40,12 +40,23 @@ def counts(document: Document, member: str = "counts") -> str:
 
 def scan_table(document: Document) -> Table:
     """Return how each scan of a map, version or survey was registered, why it was left out, and what is odd about it."""
+    scans = document.get("scans", [])
+    file = ["file"] if any(scan.get("file") for scan in scans) else []
     table = columns(
-        "scan", "accepted", "fitness", "rmse (m)", "sigma (m)", "confidence", "reason", "detail, warnings"
+        "scan",
+        *file,
+        "accepted",
+        "fitness",
+        "rmse (m)",
+        "sigma (m)",
+        "confidence",
+        "reason",
+        "detail, warnings",
     )
-    for scan in document.get("scans", []):
+    for scan in scans:
         table.add_row(
             scan["scan_id"],
+            *(scan.get(name) for name in file),
             _ACCEPTED.get(scan.get("accepted"), Text()),
             number(scan.get("fitness"), 2),
             number(scan.get("rmse"), 3),
@@ -66,6 +77,12 @@ def with_all_scans(document: Document, every: Callable[[], Sequence[Document]]) 
 def warnings(document: Document) -> str:
     """Write what is odd about a scan or a survey, each on a line of its own."""
     return "\n".join(f"{words(one['reason'])}: {one['detail']}" for one in document.get("warnings") or ())
+
+
+def failure(document: Document) -> str:
+    """Write why a map or a survey failed; nothing where it did not."""
+    problem = document.get("problem") or {}
+    return str(problem.get("detail") or problem.get("title") or "")
 
 
 def placement(survey: Document) -> str:

@@ -212,6 +212,26 @@ def _advance(bar: Progress) -> OnProgress:
     return advance
 
 
+#: What the API tells its own clients to ask, and which command asks that.
+_COMMANDS = (
+    (r"GET /maps/<id>/surveys", r"`spicd surveys list MAP`"),
+    (r"GET /maps/([\w-]+)/versions", r"`spicd versions list \1`"),
+    (r"GET /maps/([\w-]+)/objects", r"`spicd objects \1`"),
+    (r"GET /surveys/([\w-]+)/tiles", r"`spicd surveys download \1`"),
+    (r"GET /maps\b(?!/)", r"`spicd maps list`"),
+    (r"GET /jobs\b(?!/)", r"`spicd jobs`"),
+    (r"GET /models\b(?!/)", r"`spicd models`"),
+    (r"GET /webhooks\b(?!/)", r"`spicd webhooks list`"),
+)
+
+
+def in_commands(sentence: str) -> str:
+    """Return a sentence of the API with the commands of this command line in place of its calls."""
+    for call, command in _COMMANDS:
+        sentence = re.sub(call, command, sentence)
+    return sentence
+
+
 def read_pose(given: str) -> Pose:
     """Read a pose: a file, or the numbers themselves. Raises `ClientError`.
 

@@ -316,12 +316,18 @@ def test_a_ready_file_that_cannot_be_written_ends_up_with_one_sentence(
     assert said.strip().endswith("cannot be written (No such file or directory)")
 
 
+def files_of(service: Service) -> None:
+    for scan_id in ("scan-1", "scan-2", "scan-3"):
+        service.on(f"GET /scans/{scan_id}", {**SCAN, "scan_id": scan_id})
+
+
 def test_surveys_submit_waits_and_shows_what_was_left_out(
     service: Service, capsys: pytest.CaptureFixture[str]
 ) -> None:
     service.on("POST /maps/lobby/surveys", {"survey_id": "survey-1", "job_id": "job-1"}, status=202)
     service.on("GET /jobs/job-1", job("successful", 100))
     service.on("GET /surveys/survey-1", SURVEY)
+    files_of(service)
     assert spicd("surveys", "submit", "lobby", "scan-2", "--wait") == 0
     shown = capsys.readouterr().out
     assert "changed 9, unchanged 150" in shown
@@ -333,6 +339,7 @@ def test_a_survey_is_shown_with_its_placement_and_why_scans_were_left_out(
     service: Service, capsys: pytest.CaptureFixture[str]
 ) -> None:
     service.on("GET /surveys/survey-1", SURVEY)
+    files_of(service)
     assert spicd("surveys", "show", "survey-1") == 0
     shown = capsys.readouterr().out
     assert "in doubt (confidence 0.71)" in shown
@@ -345,6 +352,7 @@ def test_a_refused_survey_is_shown_with_its_picture(
 ) -> None:
     refused = {**SURVEY, "status": "failed", "placement": {"state": "refused", "confidence": None}}
     service.on("GET /surveys/survey-1", refused)
+    files_of(service)
     assert spicd("surveys", "show", "survey-1") == 0
     shown = capsys.readouterr().out
     assert "refused" in shown
@@ -359,6 +367,57 @@ def test_surveys_are_listed_with_their_placement(
     service.on("GET /maps/lobby/surveys", {"surveys": [SURVEY, {**earlier, "placement": None}], "links": []})
     assert spicd("surveys", "list", "lobby") == 0
     assert capsys.readouterr().out.count("in doubt") == 1
+
+
+def test_surveys_list_tells_what_was_placed_and_why_one_failed(
+    service: Service, capsys: pytest.CaptureFixture[str]
+) -> None:
+    placed = {**SURVEY, "scan_count": 2, "accepted_count": 1}
+    problem = {"title": "No scan accepted", "detail": "none of 2 scans fits the map"}
+    failed = {**placed, "survey_id": "survey-2", "status": "failed", "accepted_count": 0, "problem": problem}
+    service.on("GET /maps/lobby/surveys", {"surveys": [placed, failed], "links": []})
+    assert spicd("surveys", "list", "lobby") == 0
+    shown = capsys.readouterr().out
+    for said in ("1 of 2 placed", "0 of 2 placed", "none of 2 scans fits the map"):
+        assert said in shown
+
+
+def test_a_survey_names_the_file_of_each_scan(service: Service, capsys: pytest.CaptureFixture[str]) -> None:
+    service.on("GET /surveys/survey-1", SURVEY)
+    service.on("GET /scans/scan-2", {**SCAN, "filename": "monday/b.ply"})
+    service.on("GET /scans/scan-3", {"title": "no"}, status=404)
+    assert spicd("surveys", "show", "survey-1") == 0
+    assert "monday/b.ply" in capsys.readouterr().out
+    assert spicd("surveys", "show", "survey-1", "--json") == 0
+    assert json.loads(capsys.readouterr().out) == SURVEY
+
+
+@pytest.mark.parametrize(
+    ("said", "shown"),
+    [
+        ("no map 'x'; GET /maps lists those there are", "`spicd maps list` lists"),
+        ("no survey 'x'; GET /maps/<id>/surveys lists those there are", "`spicd surveys list MAP` lists"),
+        (
+            "no version 3 of map 'a'; GET /maps/a/versions lists those there are",
+            "`spicd versions list a` lists",
+        ),
+        ("no job 'x'; GET /jobs lists those there are", "`spicd jobs` lists"),
+    ],
+)
+def test_what_the_api_says_to_ask_is_told_as_a_command(
+    service: Service, capsys: pytest.CaptureFixture[str], said: str, shown: str
+) -> None:
+    service.on("GET /surveys/x", {"title": "Not found", "detail": said}, status=404)
+    assert spicd("surveys", "show", "x") == 1
+    assert shown in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", [("scans", "watch"), ("maps", "list"), ("jobs",)])
+def test_the_help_of_each_command_names_the_options_of_all(
+    command: tuple[str, ...], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert spicd(*command, "--help") == 0
+    assert "--url" in capsys.readouterr().out
 
 
 def test_changes_passes_its_filters_on_and_lists_the_tiles(
@@ -496,6 +555,7 @@ def test_maps_create_passes_the_alarms_on(service: Service) -> None:
 def test_map_and_survey_show_their_objects(service: Service, capsys: pytest.CaptureFixture[str]) -> None:
     service.on("GET /maps/lobby", {**MAP, "objects": {"new": 2, "still_there": 5}})
     service.on("GET /surveys/survey-1", {**SURVEY, "objects": {"appeared": 3}, "moving": 4})
+    files_of(service)
     assert spicd("maps", "show", "lobby") == 0
     assert "new 2, still there 5" in capsys.readouterr().out
     assert spicd("surveys", "show", "survey-1") == 0

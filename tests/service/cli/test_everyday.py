@@ -146,10 +146,13 @@ def test_of_a_survey_without_objects_the_rest_is_downloaded_and_of_a_refused_one
     service.answers = results(None)
     assert spicd("surveys", "download", "survey-1") == 0
     assert len(list((tmp_path / "survey-1").iterdir())) == 3
-    refused = {**SURVEY, "status": "failed", "placement": {"state": "refused", "confidence": None}}
+    problem = {"title": "No scan accepted", "detail": "none fits"}
+    placement = {"state": "refused", "confidence": None}
+    refused = {**SURVEY, "status": "failed", "placement": placement, "problem": problem}
     service.answers["GET /surveys/survey-1"] = refused
     assert spicd("surveys", "download", "survey-1", "--to", "refused") == 0
     assert [path.name for path in (tmp_path / "refused").iterdir()] == ["picture.png"]
+    assert "survey survey-1 failed: none fits" in capsys.readouterr().err
 
 
 def test_a_folder_that_cannot_be_made_is_one_sentence(
