@@ -73,8 +73,9 @@ def watch(
 
     \b
     What becomes of a scan:
-      FOLDER/done/hall.ply               the service has it (done/hall.2.ply where that name is taken)
-      FOLDER/refused/hall.ply            the service does not take it, or it is cut off or empty, and
+      FOLDER/done/hall.ply               the service has it
+      FOLDER/done/hall.2.ply             likewise, where that name is taken
+      FOLDER/refused/hall.ply            it is cut off, empty or no scan, and
       FOLDER/refused/hall.ply.why.json   says why
 
     Of a refused scan: mend it and move it with its sidecar back into its folder; a visit that is over becomes a
@@ -85,7 +86,9 @@ def watch(
     ended a line says what it found; more of it:
 
     \b
-      spicd surveys list MAP       spicd surveys show ID       spicd objects MAP --survey ID
+      spicd surveys list MAP
+      spicd surveys show ID
+      spicd objects MAP --survey ID
 
     Where the scan was taken may lie beside it, and is written before it: hall.pose.txt with "x y z qx qy qz qw"
     (metres, unit quaternion) or 16 numbers of a 4x4 row by row, or hall.pose.json:
@@ -103,10 +106,11 @@ def watch(
     the service refuses to be asked, say for an unknown key or map, or --once finds nobody at the address.
 
     \b
-      spicd scans watch /data/scans --url https://spicd.example.org --device-id robot-7
+      spicd scans watch /data/scans --device-id robot-7
       spicd scans watch /data/visits --map lobby --visit-ends 120
-      spicd --json scans watch /data/scans --once      one JSON object a line: events scan, refused,
-                                                       stray, survey, survey_ended
+      spicd scans watch /data/scans --once --json
+
+    With --json each event is a JSON object on a line of its own: scan, refused, stray, survey, survey_ended.
 
     SPICD_URL and SPICD_KEY name the service and the API key (scopes scans:write and, with --map, surveys:write).
     """
