@@ -58,7 +58,25 @@ def test_without_one_nothing_is_said(scan: Path) -> None:
         ("hall.pose.json", "[1]", "no JSON object"),
         ("hall.pose.json", '{"poses": []}', "'poses' is none of pose"),
         ("hall.pose.json", '{"pose": [[1, 2], [3, 4]]}', "four rows"),
-        ("hall.pose.json", '{"pose":', "hall.pose.json cannot be used"),
+        ("hall.pose.json", '{"pose":', "no valid JSON at line 1, column 9"),
+        ("hall.pose.txt", "2.O 0 0 0 0 0 1", "'2.O' is no number"),
+        (
+            "hall.pose.txt",
+            "2 0 0 1 0 2 0 2 0 0 2 3 0 0 0 1",
+            "scales by 2; its rotation part must be orthonormal",
+        ),
+        ("hall.pose.txt", "1 0 0 1 0 1 0 2 0 0 2 3 0 0 0 1", "rows have the lengths 1, 1, 2; its"),
+        ("hall.pose.txt", "1 .1 0 1 0 1 0 2 0 0 1 3 0 0 0 1", "not at right angles"),
+        ("hall.pose.txt", "1 0 0 1 0 1 0 2 0 0 -1 3 0 0 0 1", "mirrors"),
+        ("hall.pose.txt", "1 0 0 0 0 1 0 0 0 0 1 0 1 2 3 1", "last row of a pose"),
+        (
+            "hall.pose.json",
+            '{"pose": [["1", 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}',
+            "numbers alone",
+        ),
+        ("hall.pose.json", '{"captured_at": "yesterday"}', "captured_at 'yesterday' is no date"),
+        ("hall.pose.json", '{"captured_at": "2026-03-01T12:00:00"}', "with its zone"),
+        ("hall.pose.json", '{"captured_at": "2026-13-01T12:00:00Z"}', "is no date and time"),
     ],
 )
 def test_one_that_cannot_be_used_is_named(scan: Path, name: str, text: str, told: str) -> None:
