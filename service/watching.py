@@ -51,6 +51,9 @@ class WatchOptions:
     """How a folder is watched."""
 
     settle_s: float = 3.0  #: so long a file has to stay as it is before it is whole
+    cut_off_s: float = (
+        30.0  #: so long a file that is cut off has to stay as it is before nobody writes to it any more
+    )
     visit_ends_s: float = 300.0  #: so long nothing is added to a sub-folder before its visit is over
     every_s: float = 1.0  #: between two looks
     follow_s: float = 5.0  #: between two questions after surveys that are under way
@@ -140,6 +143,7 @@ class Watcher:
             str, tuple[float, int]
         ] = {}  #: visits to be submitted again: not before, and after how many
         self._seen: dict[Path, tuple[tuple[int, int], float]] = {}  #: size and time of change, and since when
+        self._cut_off: dict[Path, tuple[int, int]] = {}  #: as `_seen`: files that may still be written to
         self._strays: set[Path] = set()  #: sidecars without a scan that were told of
         self.sent = self.refused = self.surveys = 0
 
@@ -205,7 +209,8 @@ class Watcher:
         present = list(self._present())
         whole = [path for path in present if self._is_whole(path)]
         for path in whole:
-            self._take(path)
+            self._take(path, at_once=visits_are_over)
+        self._cut_off = {path: stamp for path, stamp in self._cut_off.items() if path.exists()}
         self._seen = {path: seen for path, seen in self._seen.items() if path.exists()}
         left = len(present) > len(whole)
         if self._options.map_id is not None:
@@ -234,15 +239,20 @@ class Watcher:
         if known != stamp:
             self._seen[path] = (stamp, time.monotonic())
             return self._options.settle_s == 0
-        return time.monotonic() - since >= self._options.settle_s
+        is_cut_off = self._cut_off.get(path) == stamp
+        return time.monotonic() - since >= (self._options.cut_off_s if is_cut_off else self._options.settle_s)
 
-    def _take(self, path: Path) -> None:
-        """Send one scan, and move it to where it belongs."""
+    def _take(self, path: Path, *, at_once: bool) -> None:
+        """Send one scan, and move it to where it belongs; one that is cut off stays a while, unless `at_once`."""
         try:
             require_whole(path)
             said = self._said(path)
             scan = self._send(path, said)
         except FileNotWhole as error:
+            stamp = self._seen[path][0]
+            if not at_once and self._cut_off.get(path) != stamp:
+                self._cut_off[path] = stamp
+                return
             self._refuse(path, {"title": "The file is no whole scan", "detail": str(error)})
         except SidecarError as error:
             self._refuse(path, {"title": "What lies beside the scan cannot be used", "detail": str(error)})

@@ -289,6 +289,24 @@ def test_a_file_that_is_cut_off_is_refused_before_it_is_sent(
     assert "cut off" in json.loads((folder / "refused/cut.ply.why.json").read_text())["detail"]
 
 
+def test_a_file_that_is_cut_off_may_still_be_written_for_a_while(service: Client, folder: Path) -> None:
+    scan = put(folder / "hall.ply", ply(points=5)[:-9])
+    slow = WatchOptions(settle_s=0, every_s=0, cut_off_s=1e6)
+    with Watcher(service, folder, slow) as watcher:
+        for _ in range(3):
+            watcher.look()
+        assert names(folder) == ["hall.ply"]
+        scan.write_bytes(ply(points=5))
+        watcher.look()
+        watcher.look()
+        assert names(folder) == ["done/hall.ply"]
+    put(folder / "cut.ply", ply(points=5)[:-9])
+    with Watcher(service, folder, WatchOptions(settle_s=0, every_s=0, cut_off_s=0)) as watcher:
+        watcher.look()
+        watcher.look()
+        assert watcher.refused == 1
+
+
 def test_a_survey_that_has_ended_is_told_with_its_files(
     service: Client, client: TestClient, folder: Path
 ) -> None:
