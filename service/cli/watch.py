@@ -196,10 +196,10 @@ def _begin(terminal: Terminal, watcher: Watcher, folder: Path, map_id: str | Non
             raise
         terminal.note(f"{what}, which is not ready: {refused}")
         return
-    except Unreachable as error:
+    except Unreachable:
         if once and not watcher.left:
             raise
-        terminal.note(f"{what}, where nobody answers yet: {error}")
+        terminal.note(f"{what}, where nobody answers yet; scans wait until somebody does")
         return
     of_map = "" if map_id is None else f", map {map_id}"
     if found is not None:
