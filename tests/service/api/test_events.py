@@ -194,6 +194,7 @@ def test_a_stream_outlasts_the_database_for_a_while(service: Live, monkeypatch: 
     with service.http.stream("GET", "/events", headers=SSE) as answer:
         entries = stream(answer.iter_lines())
         next(entries)
+        until(lambda: service.services.listeners._head is not None)  # till then the stream reads by itself
         with monkeypatch.context() as patch:
             looks: list[int] = []
 
