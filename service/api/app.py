@@ -17,6 +17,7 @@ from starlette.types import ASGIApp
 
 from service.api import (
     changes,
+    event_documents,
     events,
     health,
     jobs,
@@ -25,6 +26,7 @@ from service.api import (
     models,
     objects,
     processes,
+    receivers,
     scans,
     surveys,
     tiles,
@@ -92,6 +94,7 @@ UNSEEN: dict[JsonSchemaMode, tuple[type[BaseModel], ...]] = {
         tiles.FgTileCollection,
         *objects.DOCUMENTS,
         events.EventList,
+        event_documents.WebhookEvent,
     ),
 }
 
@@ -124,6 +127,7 @@ class Api(FastAPI):
                 schemas.update(derived["$defs"])
             for replaced in ("HTTPValidationError", "ValidationError"):  # by problems
                 schemas.pop(replaced, None)
+            document["webhooks"] = receivers.described()
             add_conditions(document)
             secured(document, problems.documented("unauthorized", "forbidden"))
             _leaving_out(schemas)
@@ -133,10 +137,10 @@ class Api(FastAPI):
 
 
 def _leaving_out(schemas: dict[str, Any]) -> None:
-    """Require of collections, which are written by hand, no member that comes with one parameter alone."""
+    """Require of features and collections, which are written by hand, no member that comes with one parameter alone."""
     for schema in schemas.values():
         members = schema.get("properties", {})
-        if "features" in members:
+        if "features" in members or "geometry" in members:
             alone = {name for name, member in members.items() if member.get("default", "") is None}
             schema["required"] = [name for name in schema["required"] if name not in alone]
 

@@ -30,6 +30,7 @@ from service.api.http.paging import (
 )
 from service.api.http.problems import BODY, LISTED, MADE, NAMED, JobProblem, documented
 from service.api.http.submission import (
+    SUBMITTED,
     ScansRequest,
     accepted,
     admit,
@@ -209,7 +210,8 @@ class MapList(Document):
     "/maps",
     status_code=202,
     summary="Build a map",
-    responses=documented(
+    responses=SUBMITTED
+    | documented(
         *BODY, "not_found", "conflict", "scan_unreadable", "queue_unavailable", "queue_full", *KEYED
     ),
     openapi_extra=bodies.documented(json=MapRequest, form=MapRequest, file="scans"),

@@ -18,6 +18,7 @@ from service.api.http.idempotency import KEYED, Keyed
 from service.api.http.paging import PageRequest, list_links
 from service.api.http.problems import BODY, MADE, NAMED, JobProblem, documented
 from service.api.http.submission import (
+    SUBMITTED,
     ScansRequest,
     accepted,
     admit,
@@ -89,7 +90,8 @@ class VersionList(Document):
     "/maps/{map_id}/versions",
     status_code=202,
     summary="Build a new version of a map",
-    responses=documented(
+    responses=SUBMITTED
+    | documented(
         *BODY,
         "not_found",
         "not_ready",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from typing import Any
 
@@ -22,10 +23,15 @@ def mended(document: dict[str, Any]) -> dict[str, Any]:
     for operation in operations(document):
         for parameter in operation.get("parameters", ()):
             parameter["schema"] = not_null(parameter["schema"])
+            _say_bounds(parameter)
         for answer in operation["responses"].values():
             _mend_answer(answer)
-    for schema in _only_sent(document):
+    sent = _only_sent(document)
+    for schema in sent:
         _leave_out_defaults(schema)
+    for schema in document["components"]["schemas"].values():
+        if schema not in sent:
+            _leave_out_nulls(schema)
     _name_forms(document)
     _join_equal_items(document)
     return document
@@ -68,6 +74,33 @@ def _mend_answer(answer: dict[str, Any]) -> None:
     for content in answer.get("content", {}).values():
         if "$ref" in content.get("schema", {}):
             content["schema"].pop("type", None)
+
+
+def _say_bounds(parameter: dict[str, Any]) -> None:
+    """Say in words between which numbers a parameter lies and what it is where it is left out.
+
+    Generators of TypeScript show the description of a parameter, and nothing of the numbers in its schema.
+    """
+    schema = parameter["schema"]
+    least, most, default = (schema.get(name) for name in ("minimum", "maximum", "default"))
+    said = [parameter["description"]] if "description" in parameter else []
+    if least is not None and most is not None:
+        said.append(f"{least:g} to {most:g}")
+    elif least is not None:
+        said.append(f"at least {least:g}")
+    if isinstance(default, bool | int | float | str) and "left out" not in " ".join(said):
+        said.append(f"left out: {json.dumps(default) if isinstance(default, bool) else default}")
+    if said:
+        parameter["description"] = "; ".join(said)
+
+
+def _leave_out_nulls(schema: Schema) -> None:
+    """Describe what an answer leaves out where it has none as that, and not as null; no null is a default."""
+    for name, field in schema.get("properties", {}).items():
+        if "default" in field and field["default"] is None:
+            del field["default"]
+            if name not in schema.get("required", ()):
+                schema["properties"][name] = not_null(field)
 
 
 def _only_sent(document: dict[str, Any]) -> list[Schema]:
