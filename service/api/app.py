@@ -71,6 +71,29 @@ object by object, what later visits found changed.
 Maps, their versions and surveys are built by jobs: the answer to the POST names the job, \
 and `GET /jobs/{id}` says how far it is.
 Every error is a problem document (RFC 9457) with a stable `type`.
+
+To wait for a job ask `GET /jobs/{id}?wait=20` until it has ended; `GET /events` and webhooks tell of all.
+
+### In TypeScript
+
+With types of openapi-typescript and openapi-fetch. Some answers come in more than one media type: a client for JSON, \
+and one for features, have one type for each answer.
+
+```ts
+const api = createClient<paths, "application/json" | "application/problem+json">({ baseUrl });
+const features = createClient<paths, "application/geo+json" | "application/problem+json">({ baseUrl });
+```
+
+Bytes are typed `string` there. A file is sent as it is by:
+
+```ts
+const { data: scan } = await api.POST("/scans", {
+  params: { query: { filename: "hall.pcd" } },
+  headers: { "Content-Type": "application/octet-stream" },
+  body: file as unknown as string,
+  bodySerializer: (body) => body,
+});
+```
 """
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from functools import partial
 from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Path, Query, Request, Response
@@ -15,7 +14,7 @@ from service.api.http.access import maps_of_key
 from service.api.http.dependencies import Provided, Services
 from service.api.http.documents import Document, Link, link
 from service.api.http.documents import Request as Asked
-from service.api.http.fields import ID, Id
+from service.api.http.fields import Id
 from service.api.http.idempotency import KEYED, Keyed
 from service.api.http.paging import PageRequest, list_links
 from service.api.http.problems import LISTED, NAMED, JobProblem, documented
@@ -31,7 +30,7 @@ from service.dispatch import queue_positions
 RESULTS = "http://www.opengis.net/def/rel/ogc/1.0/results"  #: OGC 18-062r2, Section 7.11
 
 router = APIRouter(tags=["jobs"])
-JobId = Annotated[Annotated[str, Field(pattern=ID, examples=["job-5f0c"])], Path()]
+JobId = Annotated[Id, Path()]
 OPEN = ("accepted", "running")  #: states of a job that has not ended
 _EVENTS = 100  #: of jobs that ended, read at a time
 _LOOKED_AT: dict[int | str, dict[str, Any]] = {
@@ -128,7 +127,11 @@ async def get_job(
 async def _awaited(services: Services, job_id: str, wait_s: float) -> JobRecord:
     """Return a job; one that has not ended once it has, or after so long. Raises NotFound and Unavailable."""
     until = time.monotonic() + wait_s
-    listeners, look = services.listeners, partial(run_in_threadpool, services.catalog.jobs.get, job_id)
+    listeners = services.listeners
+
+    async def look() -> JobRecord:
+        return await run_in_threadpool(services.catalog.jobs.get, job_id)
+
     job = await look()
     if wait_s == 0 or job.status not in OPEN:
         return job

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from fastapi import APIRouter, Path, Query, Response
 from fastapi import Request as HttpRequest
@@ -42,6 +42,7 @@ from service.api.http.submission import (
     stop_if_open,
     submit,
 )
+from service.api.manifests import Manifest
 from service.catalog import blob_keys
 from service.catalog.idempotency import Answer, Once
 from service.catalog.records import Anchor, Built, JobRecord, MapRecord, MapStatus, MapSummary, ScanOutcome
@@ -276,7 +277,7 @@ async def delete_map(services: Provided, map_id: MapId) -> None:
 @router.get(
     "/maps/{map_id}/manifest",
     summary="The tiles of a map",
-    response_model=dict[str, Any],
+    response_model=Manifest,
     responses={200: {"description": "The tile manifest, fields as in Table A1 of the paper"}, **MADE},
 )
 async def get_manifest(services: Provided, map_id: MapId) -> Response:

@@ -104,6 +104,8 @@ async def upload_scan(
     are one scan: sent again with another `pose` or `captured_at`, these are kept from then on, as the answer shows.
     Maps and surveys that were asked for before stay with what they were asked for with, and a request for one may name
     a pose of its own (`scans`).
+
+    `openapi-typescript` types bytes as `string`: the head of this document has the line that sends a file.
     """
 
     def accept(record: ScanRecord, is_new: bool) -> Answer:

@@ -149,6 +149,8 @@ def get_survey(request: HttpRequest, services: Provided, survey_id: SurveyId) ->
 async def delete_survey(services: Provided, survey_id: SurveyId) -> None:
     """With its job and files; a job that still runs is stopped first. Its scans stay.
 
+    Its job is a 404 from then on; of one that was stopped `job.ended` is told nevertheless, with the status `dismissed`.
+
     Versions of the map that took the survey over stay as well; while one is being built of it, this is a conflict.
     """
     await delete(services, _delete, services, survey_id)

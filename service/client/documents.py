@@ -104,6 +104,18 @@ class Live(TypedDict):
     status: Literal["ok"]
 
 
+class ManifestTile(TypedDict):
+    """One tile that is kept."""
+
+    dense_file: None
+    file: None
+    n_original_points: int
+    n_sampled_points: int | None
+    patch_id: str
+    tile_center: list[float]
+    tile_idx: list[int]
+
+
 class MapDeletedData(TypedDict):
     """A map that was deleted, and all that was of it."""
 
@@ -1100,6 +1112,23 @@ class LandingPage(TypedDict):
     description: str
     links: list[Link]
     title: str
+
+
+class Manifest(TypedDict):
+    """Tile size, bounds and the tiles of a map (paper, Table A1); metres, map frame."""
+
+    dense_voxel: float
+    map_bounds: Bounds
+    min_points: int
+    n_skipped_tiles: int
+    n_tiles_grid: list[int]
+    n_valid_patches: int
+    patch_size: int | None
+    patches: list[ManifestTile]
+    save_dense_tiles: bool
+    tile_lowest_idx: list[int]
+    tile_origin: list[float]
+    tile_size: list[float]
 
 
 class MapSettings(TypedDict):

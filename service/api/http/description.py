@@ -12,6 +12,17 @@ Schema = dict[str, Any]  #: JSON Schema (draft 2020-12), as OpenAPI 3.1 has it
 
 _SCHEMAS = "#/components/schemas/"
 
+#: Of ids, by the names that parameters and fields have.
+_EXAMPLES = {
+    "scan_id": "scan-2b1f",
+    "survey_id": "survey-91c4",
+    "survey": "survey-91c4",
+    "object_id": "object-77aa",
+    "job_id": "job-5f0c",
+    "webhook_id": "webhook-2d7e",
+    "delivery_id": "delivery-88a0",
+}
+
 
 def operation_id(route: APIRoute) -> str:
     """Return the id of an operation, which names a function of each generated client: that of ours."""
@@ -24,15 +35,19 @@ def mended(document: dict[str, Any]) -> dict[str, Any]:
         for parameter in operation.get("parameters", ()):
             parameter["schema"] = not_null(parameter["schema"])
             _say_bounds(parameter)
+            _give_example(parameter["name"], parameter["schema"])
         for answer in operation["responses"].values():
             _mend_answer(answer)
     sent = _only_sent(document)
     for schema in sent:
         _leave_out_defaults(schema)
-    for schema in document["components"]["schemas"].values():
-        if schema not in sent:
-            _leave_out_nulls(schema)
     _name_forms(document)
+    for schema in document["components"]["schemas"].values():
+        if not any(schema is one for one in sent):
+            _leave_out_nulls(schema)
+        for name, field in schema.get("properties", {}).items():
+            for option in (field, *field.get("anyOf", ())):
+                _give_example(name, option)
     _join_equal_items(document)
     return document
 
@@ -74,6 +89,13 @@ def _mend_answer(answer: dict[str, Any]) -> None:
     for content in answer.get("content", {}).values():
         if "$ref" in content.get("schema", {}):
             content["schema"].pop("type", None)
+
+
+def _give_example(name: str, schema: Schema) -> None:
+    """Give an id that is none of a map an example of its own sort."""
+    example = _EXAMPLES.get(name)
+    if example is not None and "examples" in schema:
+        schema["examples"] = [example]
 
 
 def _say_bounds(parameter: dict[str, Any]) -> None:

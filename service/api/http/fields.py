@@ -125,7 +125,6 @@ _POSE_SCHEMA = {
 ID = r"^[A-Za-z0-9_-]{1,64}$"
 Id = Annotated[str, Field(pattern=ID, examples=["lobby"])]
 ScanId = Annotated[str, Field(pattern=ID, examples=["scan-2b1f"])]
-SurveyId = Annotated[str, Field(pattern=ID, examples=["survey-91c4"])]
 Instant = Annotated[
     datetime,
     BeforeValidator(instant),
