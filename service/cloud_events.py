@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping
 from datetime import datetime
 from typing import Any
 
-from service.catalog.records import EventRecord, rfc3339
+from service.catalog.records import EventRecord, problem_urn, rfc3339
 
 MEDIA_TYPE = "application/cloudevents+json"
 
@@ -27,8 +27,14 @@ def cloud_event(event: EventRecord, *, root: str = "") -> dict[str, Any]:
         subject=event.subject,
         time=event.created,
         sequence=event.sequence,
-        data={**event.data, "links": links},
+        data={**event.data, **_problem(event.data), "links": links},
     )
+
+
+def _problem(data: Mapping[str, Any]) -> dict[str, str]:
+    """Return the problem of a job as its document names it; the log has its code."""
+    code = data.get("problem")
+    return {} if code is None else {"problem": problem_urn(code)}
 
 
 def document(

@@ -17,6 +17,7 @@ from starlette.types import ASGIApp
 
 from service.api import (
     changes,
+    event_documents,
     events,
     health,
     jobs,
@@ -25,6 +26,7 @@ from service.api import (
     models,
     objects,
     processes,
+    receivers,
     scans,
     surveys,
     tiles,
@@ -69,6 +71,29 @@ object by object, what later visits found changed.
 Maps, their versions and surveys are built by jobs: the answer to the POST names the job, \
 and `GET /jobs/{id}` says how far it is.
 Every error is a problem document (RFC 9457) with a stable `type`.
+
+To wait for a job ask `GET /jobs/{id}?wait=20` until it has ended; `GET /events` and webhooks tell of all.
+
+### In TypeScript
+
+With types of openapi-typescript and openapi-fetch. Some answers come in more than one media type: a client for JSON, \
+and one for features, have one type for each answer.
+
+```ts
+const api = createClient<paths, "application/json" | "application/problem+json">({ baseUrl });
+const features = createClient<paths, "application/geo+json" | "application/problem+json">({ baseUrl });
+```
+
+Bytes are typed `string` there. A file is sent as it is by:
+
+```ts
+const { data: scan } = await api.POST("/scans", {
+  params: { query: { filename: "hall.pcd" } },
+  headers: { "Content-Type": "application/octet-stream" },
+  body: file as unknown as string,
+  bodySerializer: (body) => body,
+});
+```
 """
 
 
@@ -92,6 +117,7 @@ UNSEEN: dict[JsonSchemaMode, tuple[type[BaseModel], ...]] = {
         tiles.FgTileCollection,
         *objects.DOCUMENTS,
         events.EventList,
+        event_documents.WebhookEvent,
     ),
 }
 
@@ -124,6 +150,7 @@ class Api(FastAPI):
                 schemas.update(derived["$defs"])
             for replaced in ("HTTPValidationError", "ValidationError"):  # by problems
                 schemas.pop(replaced, None)
+            document["webhooks"] = receivers.described()
             add_conditions(document)
             secured(document, problems.documented("unauthorized", "forbidden"))
             _leaving_out(schemas)
@@ -133,10 +160,10 @@ class Api(FastAPI):
 
 
 def _leaving_out(schemas: dict[str, Any]) -> None:
-    """Require of collections, which are written by hand, no member that comes with one parameter alone."""
+    """Require of features and collections, which are written by hand, no member that comes with one parameter alone."""
     for schema in schemas.values():
         members = schema.get("properties", {})
-        if "features" in members:
+        if "features" in members or "geometry" in members:
             alone = {name for name, member in members.items() if member.get("default", "") is None}
             schema["required"] = [name for name in schema["required"] if name not in alone]
 

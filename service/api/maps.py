@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from fastapi import APIRouter, Path, Query, Response
 from fastapi import Request as HttpRequest
@@ -30,6 +30,7 @@ from service.api.http.paging import (
 )
 from service.api.http.problems import BODY, LISTED, MADE, NAMED, JobProblem, documented
 from service.api.http.submission import (
+    SUBMITTED,
     ScansRequest,
     accepted,
     admit,
@@ -41,6 +42,7 @@ from service.api.http.submission import (
     stop_if_open,
     submit,
 )
+from service.api.manifests import Manifest
 from service.catalog import blob_keys
 from service.catalog.idempotency import Answer, Once
 from service.catalog.records import Anchor, Built, JobRecord, MapRecord, MapStatus, MapSummary, ScanOutcome
@@ -209,7 +211,8 @@ class MapList(Document):
     "/maps",
     status_code=202,
     summary="Build a map",
-    responses=documented(
+    responses=SUBMITTED
+    | documented(
         *BODY, "not_found", "conflict", "scan_unreadable", "queue_unavailable", "queue_full", *KEYED
     ),
     openapi_extra=bodies.documented(json=MapRequest, form=MapRequest, file="scans"),
@@ -274,7 +277,7 @@ async def delete_map(services: Provided, map_id: MapId) -> None:
 @router.get(
     "/maps/{map_id}/manifest",
     summary="The tiles of a map",
-    response_model=dict[str, Any],
+    response_model=Manifest,
     responses={200: {"description": "The tile manifest, fields as in Table A1 of the paper"}, **MADE},
 )
 async def get_manifest(services: Provided, map_id: MapId) -> Response:

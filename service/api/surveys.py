@@ -22,6 +22,7 @@ from service.api.http.idempotency import KEYED, Keyed
 from service.api.http.paging import PageRequest, list_links
 from service.api.http.problems import BODY, MADE, NAMED, JobProblem, documented
 from service.api.http.submission import (
+    SUBMITTED,
     ScansRequest,
     accepted,
     admit,
@@ -88,7 +89,8 @@ class SurveyList(Document):
     "/maps/{map_id}/surveys",
     status_code=202,
     summary="Compare a visit with a map",
-    responses=documented(
+    responses=SUBMITTED
+    | documented(
         *BODY, "not_found", "not_ready", "scan_unreadable", "queue_unavailable", "queue_full", *KEYED
     ),
     openapi_extra=bodies.documented(json=SurveyRequest, form=SurveyRequest, file="scans"),
@@ -146,6 +148,8 @@ def get_survey(request: HttpRequest, services: Provided, survey_id: SurveyId) ->
 )
 async def delete_survey(services: Provided, survey_id: SurveyId) -> None:
     """With its job and files; a job that still runs is stopped first. Its scans stay.
+
+    Its job is a 404 from then on; of one that was stopped `job.ended` is told nevertheless, with the status `dismissed`.
 
     Versions of the map that took the survey over stay as well; while one is being built of it, this is a conflict.
     """

@@ -40,7 +40,11 @@ router = APIRouter(tags=["surveys"])
 MinScore = Annotated[float | None, Field(ge=0, le=1, description="probability of change")]
 Bbox = Annotated[
     Annotated[str, readable(numbers_of)] | None,
-    Field(description="what meets this box, in the frame that `bbox-crs` names", examples=["0,0,7.5,4.5"]),
+    Field(
+        description="what meets this box: four numbers with commas between, min x, min y, max x, max y, or six, min x, min "
+        "y, min z, max x, max y, max z, in the frame that `bbox-crs` names (on the Earth x is the longitude, y the latitude)",
+        examples=["0,0,7.5,4.5"],
+    ),
 ]
 BboxCrs = Annotated[
     Crs | None,
@@ -54,7 +58,10 @@ BboxCrs = Annotated[
 ]
 VoxelKinds = Annotated[
     VoxelKind | None,
-    Field(description="tiles with voxels that did so; none of models that tell tiles alone"),
+    Field(
+        description="tiles with voxels that did so; none of models that tell tiles alone. What `moved` is told of objects, "
+        "not of tiles"
+    ),
 ]
 
 

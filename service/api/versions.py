@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import APIRouter, Path, Query, Response
 from fastapi import Request as HttpRequest
@@ -18,6 +18,7 @@ from service.api.http.idempotency import KEYED, Keyed
 from service.api.http.paging import PageRequest, list_links
 from service.api.http.problems import BODY, MADE, NAMED, JobProblem, documented
 from service.api.http.submission import (
+    SUBMITTED,
     ScansRequest,
     accepted,
     admit,
@@ -28,6 +29,7 @@ from service.api.http.submission import (
     monitor,
     submit,
 )
+from service.api.manifests import Manifest
 from service.api.maps import (
     SCANS_LISTED,
     SCANS_SHOWN,
@@ -89,7 +91,8 @@ class VersionList(Document):
     "/maps/{map_id}/versions",
     status_code=202,
     summary="Build a new version of a map",
-    responses=documented(
+    responses=SUBMITTED
+    | documented(
         *BODY,
         "not_found",
         "not_ready",
@@ -177,7 +180,7 @@ async def delete_version(services: Provided, map_id: MapId, number: Number) -> N
 @router.get(
     "/maps/{map_id}/versions/{number}/manifest",
     summary="The tiles of a version of a map",
-    response_model=dict[str, Any],
+    response_model=Manifest,
     responses={200: {"description": "The tile manifest, fields as in Table A1 of the paper"}, **MADE},
 )
 async def get_version_manifest(services: Provided, map_id: MapId, number: Number) -> Response:

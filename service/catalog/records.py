@@ -119,6 +119,11 @@ class Record(BaseModel):
         return cls.model_validate(row, from_attributes=True)
 
 
+def problem_urn(code: str) -> str:
+    """Return the type of a problem with this code, as problem documents and events have it (RFC 9457)."""
+    return f"urn:spicd:problem:{code}"
+
+
 class Problem(Record):
     """Why a job failed, as data; api/http/problems.py turns it into RFC 9457."""
 
@@ -463,7 +468,11 @@ class JobRecord(Record):
     job_id: str
     kind: JobKind
     status: JobStatus
-    message: str = Field(description="the stage", examples=["registering"])
+    message: str = Field(
+        description="for people: the stage while it waits or runs, and what became of it once it has ended; of one that "
+        "failed the same sentence as `problem.detail`",
+        examples=["registering"],
+    )
     progress: int = Field(ge=0, le=100, examples=[40])
     created: Utc
     started: Utc | None
