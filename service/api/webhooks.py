@@ -100,7 +100,7 @@ class DeliveryList(Document):
     "/webhooks",
     status_code=201,
     summary="Have events sent to an address",
-    responses=documented(*BODY, "conflict", *KEYED),
+    responses=documented(*BODY, "not_found", "conflict", *KEYED),
     openapi_extra=bodies.documented(json=WebhookRequest),
 )
 async def create_webhook(
@@ -134,7 +134,7 @@ def list_webhooks(
     page = services.catalog.webhooks.page(maps=maps_of_key(request), after=asked.after(), limit=asked.limit)
     return WebhookList(
         webhooks=[_document(request, record) for record in page.items],
-        links=list_links(request, page, lambda record: (record.created, record.webhook_id)),
+        links=list_links(request, asked, page, lambda record: (record.created, record.webhook_id)),
     )
 
 
@@ -229,7 +229,7 @@ def list_deliveries(
     page = services.catalog.webhooks.deliveries(webhook_id, after=asked.after(), limit=asked.limit)
     return DeliveryList(
         deliveries=[_delivery(request, record) for record in page.items],
-        links=list_links(request, page, lambda record: (record.created, record.delivery_id)),
+        links=list_links(request, asked, page, lambda record: (record.created, record.delivery_id)),
     )
 
 

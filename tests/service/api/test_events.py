@@ -164,6 +164,7 @@ def test_the_service_ends_within_its_grace_while_others_listen(settings: Setting
         ended.append("whole")  # an answer that is cut raises
 
     with live(settings.model_copy(update={"shutdown_grace_s": 20})) as served:
+        add_map(served.services.catalog)
         ways = [(SSE, {}), (SSE, {"map": "lobby"}), ({}, {"wait": "60"})]
         threads = [threading.Thread(target=listen, args=(served.url, *way)) for way in ways]
         for thread in threads:
