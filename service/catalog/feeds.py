@@ -23,7 +23,7 @@ T = TypeVar("T")
 
 def read_feed(
     session: Session,
-    matching: Select[Any],
+    matching: Select[Any, Any, Any],
     table: type[TileChange] | type[MapObject],
     record: Callable[..., T],
     *,
@@ -81,5 +81,5 @@ def _id(row: TileChange | MapObject) -> str:
     return row.change_id if isinstance(row, TileChange) else row.object_id
 
 
-def _count(session: Session, query: Select[Any]) -> int:
+def _count(session: Session, query: Select[Any, Any, Any]) -> int:
     return session.scalar(select(func.count()).select_from(query.subquery())) or 0
