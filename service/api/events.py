@@ -88,7 +88,7 @@ class EventList(Document):
                 "text/event-stream": {"schema": {"type": "string", "description": STREAM}},
             },
         },
-        **documented("gone", "invalid_request", "bad_request", "unavailable"),
+        **documented("not_found", "gone", "invalid_request", "bad_request", "unavailable"),
     },
 )
 async def get_events(
@@ -116,6 +116,8 @@ async def get_events(
     listeners = services.listeners
     listeners.require_room()
     wanted = _filter(request, asked)
+    if asked.map is not None:
+        await listeners.check_map(asked.map)
     given = last_event_id or asked.after
     cursor = await listeners.last() if given is None else _read(given)
     root = request.scope.get("root_path", "")

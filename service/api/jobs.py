@@ -94,7 +94,7 @@ def list_jobs(request: Request, services: Provided, asked: Annotated[JobsRequest
         after=asked.after(),
         limit=asked.limit,
     )
-    links = list_links(request, page, lambda job: (job.created, job.job_id))
+    links = list_links(request, asked, page, lambda job: (job.created, job.job_id))
     waits = _waits(services, page.items)
     return JobList(
         jobs=[job_document(job, request, waits.get(job.job_id)) for job in page.items], links=links

@@ -243,7 +243,7 @@ async def create_map(
 def list_maps(request: HttpRequest, services: Provided, asked: Annotated[PageRequest, Query()]) -> MapList:
     """In short, newest first; a key that is bound to maps sees those."""
     page = services.catalog.maps.page(only=maps_of_key(request), after=asked.after(), limit=asked.limit)
-    links = list_links(request, page, lambda record: (record.created, record.map_id))
+    links = list_links(request, asked, page, lambda record: (record.created, record.map_id))
     maps = [MapSummaryDocument(**dict(record), links=_links(record, request)) for record in page.items]
     return MapList(maps=maps, links=links)
 

@@ -78,7 +78,9 @@ class AcceptedModel(Document):
     status_code=202,
     summary="Train a model on a map",
     responses=SUBMITTED
-    | documented(*BODY, "not_found", "not_ready", "conflict", "queue_unavailable", "queue_full", *KEYED),
+    | documented(
+        *BODY, "not_found", "not_ready", "failed", "conflict", "queue_unavailable", "queue_full", *KEYED
+    ),
     openapi_extra=bodies.documented(json=TrainingRequest),
 )
 async def train_model(
@@ -115,7 +117,7 @@ def list_models(request: HttpRequest, services: Provided) -> ModelList:
 @router.get(
     "/models/{name}",
     summary="Look at a model",
-    responses=documented("not_found", "not_ready", "invalid_request"),
+    responses=documented("not_found", "not_ready", "failed", "invalid_request"),
 )
 def get_model(
     request: HttpRequest,

@@ -135,7 +135,7 @@ async def upload_scan(
 def list_scans(request: HttpRequest, services: Provided, asked: Annotated[PageRequest, Query()]) -> ScanList:
     """Newest first."""
     page = services.catalog.scans.page(after=asked.after(), limit=asked.limit)
-    links = list_links(request, page, lambda scan: (scan.created, scan.scan_id))
+    links = list_links(request, asked, page, lambda scan: (scan.created, scan.scan_id))
     return ScanList(scans=[ScanDocument.of_row(scan) for scan in page.items], links=links)
 
 

@@ -91,7 +91,14 @@ class SurveyList(Document):
     summary="Compare a visit with a map",
     responses=SUBMITTED
     | documented(
-        *BODY, "not_found", "not_ready", "scan_unreadable", "queue_unavailable", "queue_full", *KEYED
+        *BODY,
+        "not_found",
+        "not_ready",
+        "failed",
+        "scan_unreadable",
+        "queue_unavailable",
+        "queue_full",
+        *KEYED,
     ),
     openapi_extra=bodies.documented(json=SurveyRequest, form=SurveyRequest, file="scans"),
 )
@@ -129,7 +136,7 @@ def list_surveys(
     """Of one map in short, newest first."""
     services.catalog.maps.summary(map_id)
     page = services.catalog.surveys.page(map_id, after=asked.after(), limit=asked.limit)
-    links = list_links(request, page, lambda record: (record.created, record.survey_id))
+    links = list_links(request, asked, page, lambda record: (record.created, record.survey_id))
     surveys = [SurveySummaryDocument(**dict(one), links=_links(one, request)) for one in page.items]
     return SurveyList(surveys=surveys, links=links)
 

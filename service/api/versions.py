@@ -96,6 +96,7 @@ class VersionList(Document):
         *BODY,
         "not_found",
         "not_ready",
+        "failed",
         "conflict",
         "scan_unreadable",
         "queue_unavailable",
@@ -136,7 +137,7 @@ def list_versions(
 ) -> VersionList:
     """In short, newest first; the first in the list that is `ready` is the one in use."""
     page = services.catalog.versions.page(map_id, after=asked.after(), limit=asked.limit)
-    links = list_links(request, page, lambda record: (record.created, record.job_id))
+    links = list_links(request, asked, page, lambda record: (record.created, record.job_id))
     versions = [VersionSummaryDocument(**dict(one), links=_links(one, request)) for one in page.items]
     return VersionList(versions=versions, links=links)
 

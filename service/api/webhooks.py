@@ -106,7 +106,7 @@ class DeliveryList(Document):
             "description": "The webhook, with its secret",
             "headers": located("/webhooks/webhook-2d7e", "webhook"),
         },
-        **documented(*BODY, "conflict", *KEYED),
+        **documented(*BODY, "not_found", "conflict", *KEYED),
     },
     openapi_extra=bodies.documented(json=WebhookRequest),
 )
@@ -141,7 +141,7 @@ def list_webhooks(
     page = services.catalog.webhooks.page(maps=maps_of_key(request), after=asked.after(), limit=asked.limit)
     return WebhookList(
         webhooks=[_document(request, record) for record in page.items],
-        links=list_links(request, page, lambda record: (record.created, record.webhook_id)),
+        links=list_links(request, asked, page, lambda record: (record.created, record.webhook_id)),
     )
 
 
@@ -236,7 +236,7 @@ def list_deliveries(
     page = services.catalog.webhooks.deliveries(webhook_id, after=asked.after(), limit=asked.limit)
     return DeliveryList(
         deliveries=[_delivery(request, record) for record in page.items],
-        links=list_links(request, page, lambda record: (record.created, record.delivery_id)),
+        links=list_links(request, asked, page, lambda record: (record.created, record.delivery_id)),
     )
 
 

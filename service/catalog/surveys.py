@@ -43,7 +43,7 @@ from service.catalog.scans import (
 )
 from service.catalog.tables import Survey, SurveyObject, SurveyTile, new_id, now
 from service.catalog.versions import map_row, version_in_use
-from service.errors import Conflict, NotFound, NotReady
+from service.errors import Conflict, Failed, NotFound, NotReady
 
 
 class Surveys:
@@ -115,12 +115,12 @@ class Surveys:
             return SurveyRecord.of_row(_row(session, survey_id))
 
     def ready(self, survey_id: str) -> SurveyRecord:
-        """Return one survey that is done. Raises NotFound and NotReady."""
+        """Return one survey that is done. Raises NotFound, and NotReady or Failed."""
         survey = self.get(survey_id)
         if survey.status == "running":
             raise NotReady(f"survey {survey_id!r} is still running; follow job {survey.job_id}")
         if survey.status == "failed":
-            raise NotReady(f"survey {survey_id!r} has no result; job {survey.job_id} says why")
+            raise Failed(f"survey {survey_id!r} has no result; job {survey.job_id} says why")
         return survey
 
     def page(self, map_id: str, *, after: Position | None = None, limit: int = 100) -> Page[SurveySummary]:
@@ -241,8 +241,17 @@ def _check_doubt(row: Survey, by_state: Mapping[TileState, int], *, told: bool) 
 
 
 def _replace_tiles(session: Session, survey_id: str, tiles: Iterable[TileRecord]) -> None:
+    """Write the tiles of a survey; one of which an earlier run said the same goes on to belong to its change."""
+    told = select(SurveyTile.__table__).where(
+        SurveyTile.survey_id == survey_id, SurveyTile.told_by.is_not(None)
+    )
+    before = {row["tile_id"]: dict(row) for row in session.execute(told).mappings()}
     session.execute(delete(SurveyTile).where(SurveyTile.survey_id == survey_id))
-    session.add_all(_tile_row(survey_id, tile) for tile in tiles)
+    for row in (_tile_row(survey_id, tile) for tile in tiles):
+        earlier = before.get(row.tile_id, {})
+        if earlier and all(getattr(row, name) == earlier[name] for name in earlier if name != "told_by"):
+            row.told_by = earlier["told_by"]
+        session.add(row)
 
 
 def _replace_objects(session: Session, survey_id: str, objects: Iterable[ObjectRecord]) -> None:

@@ -302,8 +302,15 @@ class TileChange(Base):
     published: Mapped[int] = mapped_column(
         BigInteger, server_default="0"
     )  #: number of the event that told it
+    updated: Mapped[int] = mapped_column(
+        BigInteger, server_default="0"
+    )  #: number of the event that told it last, where what is known of it changed since
 
-    __table_args__ = (Index(None, "survey_id", "tile_id"), Index(None, "map_id", "published"))
+    __table_args__ = (
+        Index(None, "survey_id", "tile_id"),
+        Index(None, "map_id", "published"),
+        Index(None, "map_id", "updated"),
+    )
 
 
 class SurveyObject(Base):
@@ -352,8 +359,15 @@ class MapObject(Base):
     published: Mapped[int] = mapped_column(
         BigInteger, server_default="0"
     )  #: number of the event that told it
+    updated: Mapped[int] = mapped_column(
+        BigInteger, server_default="0"
+    )  #: number of the event that told it last, where what became of it changed since
 
-    __table_args__ = (Index(None, "map_id", "first_seen", "id"), Index(None, "map_id", "published"))
+    __table_args__ = (
+        Index(None, "map_id", "first_seen", "id"),
+        Index(None, "map_id", "published"),
+        Index(None, "map_id", "updated"),
+    )
 
 
 class Acceptance(Base):

@@ -34,7 +34,7 @@ from service.catalog.scans import (
     write_outcomes,
 )
 from service.catalog.tables import MapVersion, now
-from service.errors import BadRequest, Conflict, Gone, NotFound, NotReady
+from service.errors import BadRequest, Conflict, Failed, Gone, NotFound, NotReady
 
 ScanPosition = tuple[str, int]  #: in a list of scans: the job of their version, and how many came before
 
@@ -290,11 +290,11 @@ def _listed(
 
 
 def check_ready(status: str, what: str, job_id: str) -> None:
-    """Raise NotReady with the job to look at, unless it is ready."""
+    """Raise NotReady, or Failed, with the job to look at, unless it is ready."""
     if status == "building":
         raise NotReady(f"{what} is still building; follow job {job_id}")
     if status == "failed":
-        raise NotReady(f"{what} could not be built; job {job_id} says why")
+        raise Failed(f"{what} could not be built; job {job_id} says why")
 
 
 def _row(session: Session, map_id: str, number: int) -> MapVersion:
@@ -349,7 +349,8 @@ def _survey_scans(session: Session, survey_id: str, base: MapVersion) -> list[Sc
     if survey is None or survey.map_id != base.map_id:
         raise NotFound(f"no survey {survey_id!r} of map {base.map_id!r}")
     if survey.status != "ready":
-        raise NotReady(f"survey {survey_id!r} is {survey.status}; look at job {survey.job_id}")
+        error = Failed if survey.status == "failed" else NotReady
+        raise error(f"survey {survey_id!r} is {survey.status}; look at job {survey.job_id}")
     _check_placed(survey)
     scans = _accepted(survey.scans)
     known = _shared(base, [scan.scan_id for scan in scans])

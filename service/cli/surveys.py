@@ -114,6 +114,7 @@ def _features(client: Client, survey: SurveyDocument, folder: Path) -> Iterator[
 def changes(
     ctx: typer.Context,
     map_id: MapId,
+    change: Annotated[str | None, typer.Option(help="This one alone.")] = None,
     survey: Annotated[str | None, typer.Option(help="Of this survey only.")] = None,
     state: Annotated[
         str | None, typer.Option(help="changed, unchanged, inconsistent or unobserved; left out: changed.")
@@ -134,6 +135,7 @@ def changes(
     most = CSV_PAGE if csv else 100
     frame = None if bbox is None else "map"  # else the Earth's, of a map that has an anchor
     filters = {
+        "change": change,
         "survey": survey,
         "state": state,
         "kind": kind,

@@ -212,8 +212,10 @@ class NewWebhook(TypedDict):
                 "model.ready",
                 "model.failed",
                 "change.told",
+                "change.updated",
                 "change.withdrawn",
                 "object.told",
+                "object.updated",
                 "object.gone_again",
                 "object.seen_again",
                 "object.accepted",
@@ -289,6 +291,7 @@ class ObjectProperties(TypedDict):
     status: Literal["new", "still_there", "gone_again", "unknown", "accepted"]
     survey_id: str
     transient: bool
+    updated: bool | None
     volume: float
     yaw_degrees: float
     z_max: float
@@ -682,6 +685,7 @@ class TileProperties(TypedDict):
     threshold: float | None
     tile_id: str
     tile_index: list[int]
+    updated: bool | None
     z_max: float
     z_min: float
 
@@ -797,8 +801,10 @@ class WebhookChange(TypedDict):
                 "model.ready",
                 "model.failed",
                 "change.told",
+                "change.updated",
                 "change.withdrawn",
                 "object.told",
+                "object.updated",
                 "object.gone_again",
                 "object.seen_again",
                 "object.accepted",
@@ -837,8 +843,10 @@ class WebhookDocument(TypedDict):
                 "model.ready",
                 "model.failed",
                 "change.told",
+                "change.updated",
                 "change.withdrawn",
                 "object.told",
+                "object.updated",
                 "object.gone_again",
                 "object.seen_again",
                 "object.accepted",
@@ -878,8 +886,10 @@ class WebhookRequest(TypedDict):
                 "model.ready",
                 "model.failed",
                 "change.told",
+                "change.updated",
                 "change.withdrawn",
                 "object.told",
+                "object.updated",
                 "object.gone_again",
                 "object.seen_again",
                 "object.accepted",
@@ -894,6 +904,7 @@ class WebhookRequest(TypedDict):
 class WithdrawnDocument(TypedDict):
     """Something that is told no more: a survey was deleted, or a late visit joined two into one."""
 
+    filtered: bool
     id: str
     merged_into: str | None
 

@@ -91,8 +91,7 @@ class Flaky:
             case ["maps", _, "changes"]:
                 start = int(query.get("after", ["0"])[0])
                 page = FEATURES[start : start + 4]
-                following = f"/maps/lobby/changes?after={start + len(page)}"
-                return document(200, {"features": page, "links": [{"rel": "next", "href": following}]})
+                return document(200, {"features": page, "links": [], "cursor": str(start + len(page))})
             case ["maps"]:
                 return document(200, {"maps": [{"map_id": "lobby", "name": None}], "links": []})
             case ["jobs", job_id]:

@@ -31,6 +31,7 @@ PROBLEMS: dict[str, tuple[int | None, str]] = {
     "no_such_job": (404, "There is no such job"),
     "result_not_ready": (404, "The job has not ended"),
     "not_ready": (409, "It is not ready yet"),
+    "failed": (409, "It failed, and does not become ready by waiting"),
     "conflict": (409, "It is in the way of something else"),
     "bad_request": (422, "A value cannot be used"),
     "invalid_request": (422, "The request does not match the API"),
@@ -214,7 +215,7 @@ OUTAGES = documented("database_unavailable", "blobs_unavailable", "unavailable")
 #: The answers of a route that names one thing, of one that lists, and of one that gives what a job makes.
 NAMED = documented("not_found", "invalid_request")
 LISTED = documented("invalid_request", "bad_request")
-MADE = documented("not_found", "not_ready", "invalid_request")
+MADE = documented("not_found", "not_ready", "failed", "invalid_request")
 
 
 def add_handlers(app: FastAPI) -> None:

@@ -160,7 +160,7 @@ def test_a_map_that_has_no_version_to_go_on_from_is_not_ready(
         catalog.jobs.fail(job_id, PROBLEM)
     answer = client.post("/maps/lobby/versions", files={"scans": ("a.ply", ply())})
     assert answer.status_code == 409
-    assert answer.json()["type"] == "urn:spicd:problem:not_ready"
+    assert answer.json()["type"] == f"urn:spicd:problem:{'failed' if ended else 'not_ready'}"
     assert job_id in answer.json()["detail"]
 
 
@@ -183,7 +183,7 @@ def test_a_survey_without_a_result_cannot_be_taken_over(
         catalog.jobs.fail(job_id, PROBLEM)
     answer = post(client, survey_id=survey_id)
     assert answer.status_code == 409
-    assert answer.json()["type"] == "urn:spicd:problem:not_ready"
+    assert answer.json()["type"] == f"urn:spicd:problem:{'failed' if ended else 'not_ready'}"
     assert job_id in answer.json()["detail"]
 
 
