@@ -60,7 +60,9 @@ def span_of(interval: str) -> Span:
 class ChangesRequest(FeaturesRequest):
     """Which changed tiles."""
 
-    change: Annotated[Id | None, Field(description="this change alone, by its `change_id`")] = None
+    change: Annotated[
+        Id | None, Field(description="this change alone, by its `change_id`", examples=["change-5c1d"])
+    ] = None
     survey: Annotated[
         Id | None, Field(description="of this survey only, also what an earlier visit found before")
     ] = None
