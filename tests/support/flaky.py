@@ -20,7 +20,7 @@ CLOUD = bytes(range(256)) * 4096  #: 1 MiB, a result to be downloaded
 FEATURES = [
     {
         "id": f"change-{number}",
-        "properties": {"tile_id": "tile_007_003_002", "center": [0, 0, 1], "score": 0.9},
+        "properties": {"tile_id": "tile_007_003_002", "center": [0, 0, 1], "score": 0.9, "updated": False},
     }
     for number in range(25)
 ]
