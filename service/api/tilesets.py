@@ -41,7 +41,6 @@ Content = Annotated[
 ]
 
 GLB = "model/gltf-binary"
-ECEF = "http://www.opengis.net/def/crs/EPSG/0/4978"  #: x, y, z from the Earth's centre, metres
 _PAD = 1e-4  #: of the box of a cloud: contents are quantised, and their boxes are wider by that
 
 
@@ -51,7 +50,12 @@ class PlacedRequest(BaseModel):
     model_config = ConfigDict(extra="ignore", frozen=True)
 
     crs: Annotated[
-        Literal["map", "EPSG:4978", "http://www.opengis.net/def/crs/OGC/0/Engineering3D", ECEF],
+        Literal[
+            "map",
+            "EPSG:4978",
+            "http://www.opengis.net/def/crs/OGC/0/Engineering3D",
+            "http://www.opengis.net/def/crs/EPSG/0/4978",
+        ],
         Field(
             description="`map`: metres in the map's own frame; `EPSG:4978`: Earth-centred, by the map's anchor, as globes "
             "want it; also by their URIs"

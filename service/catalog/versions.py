@@ -170,8 +170,8 @@ class Versions:
             _delete(session, _row_of_job(session, job_id))
 
 
-def tileset_of(told: dict[str, Any] | None, what: str) -> Tileset:
-    """Return the tileset that a row tells of. Raises NotFound where there is none."""
+def tileset_of(told: Tileset | dict[str, Any] | None, what: str) -> Tileset:
+    """Return the tileset that a row or a record tells of. Raises NotFound where there is none."""
     if told is None:
         raise NotFound(
             f"{what} has no tileset: an earlier release built it, or its cloud is small; read cloud.ply"

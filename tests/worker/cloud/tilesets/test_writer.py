@@ -120,7 +120,7 @@ def test_geometric_errors_fall_from_the_root_to_zero_at_the_leaves(tmp_path: Pat
     tileset = written(tmp_path, floors())
     assert max(tile.depth for tile in tileset.tiles) >= 2
     assert all(tile.error < tile.parent_error for tile in tileset.tiles)
-    depths = {}
+    depths: dict[int, set[float]] = {}
     for tile in tileset.tiles:
         if tile.error:
             depths.setdefault(tile.depth, set()).add(tile.error)
@@ -236,7 +236,8 @@ def test_what_an_earlier_run_left_in_the_folder_does_not_matter(tmp_path: Path) 
 
 
 def test_progress_never_falls_and_ends_at_one(tmp_path: Path) -> None:
-    points, told = floors(5000), []
+    points = floors(5000)
+    told: list[float] = []
     files = tmp_path / "tileset.json", tmp_path / "tileset.bin"
     write_tileset(*files, lambda: pieces_of(points), scratch=tmp_path, settings=SMALL, progress=told.append)
     assert told == sorted(told)
