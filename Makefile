@@ -6,7 +6,7 @@ INSTALLED := $(VENV)/.installed
 SERVERS := build/servers
 TOOLS := build/tools
 
-.PHONY: help servers tools demo up test test-fast acceptance-shared check format bench chaos fuzz schemathesis load soak openapi client clean
+.PHONY: help servers tools demo up test test-fast acceptance-shared check format bench chaos fuzz schemathesis load soak big-maps openapi client clean
 help: ## this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
 
@@ -24,7 +24,7 @@ test-fast: $(INSTALLED) ## the tests that take no longer than a second or so: un
 
 servers: $(SERVERS)/bin/moto_server ## an S3 server for tests, in an environment of its own; PostgreSQL has to be there
 
-tools: $(TOOLS)/.installed ## what tests drive the service with: GeoPandas, schemathesis, tus clients, Node and its compilers
+tools: $(TOOLS)/.installed ## what tests drive the service with: GeoPandas, schemathesis, tus clients, Node, its compilers and a viewer
 
 acceptance-shared: $(INSTALLED) $(SERVERS)/bin/moto_server ## tests of the catalog on PostgreSQL; acceptance with S3 too, one host and two
 	SPICD_TEST_DATABASE_URL=postgresql $(BIN)/pytest tests/service/catalog tests/service/api -m fast -n auto --dist loadscope
@@ -59,6 +59,9 @@ load: $(INSTALLED) ## 20 robots at 200 kB/s, 50 surveys, 5 dashboards against a 
 
 soak: $(INSTALLED) ## two hours of light work; fails where a process grows
 	$(BIN)/python -m tests.breaking.soak
+
+big-maps: $(INSTALLED) ## memory and time of made maps of 1, 5 and 20 million points, from fusing to the tileset: half an hour
+	$(BIN)/python -m tests.breaking.big_maps
 
 openapi: $(INSTALLED) ## write openapi/openapi.json anew
 	$(BIN)/python -m service.api.openapi

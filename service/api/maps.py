@@ -45,7 +45,16 @@ from service.api.http.submission import (
 from service.api.manifests import Manifest
 from service.catalog import blob_keys
 from service.catalog.idempotency import Answer, Once
-from service.catalog.records import Anchor, Built, JobRecord, MapRecord, MapStatus, MapSummary, ScanOutcome
+from service.catalog.records import (
+    Anchor,
+    Built,
+    JobRecord,
+    MapRecord,
+    MapStatus,
+    MapSummary,
+    ScanOutcome,
+    Tileset,
+)
 from service.catalog.versions import ScanPosition
 
 router = APIRouter(tags=["maps"])
@@ -376,18 +385,19 @@ def _links(record: MapSummary, request: HttpRequest) -> list[Link]:
     ]
     if record.status == "ready":
         links += [
-            *file_links(request, path),
+            *file_links(request, path, record.tileset),
             link(request, f"{path}/changes", "changes", "application/geo+json"),
             link(request, f"{path}/objects", "objects", "application/geo+json"),
         ]
     return links
 
 
-def file_links(request: HttpRequest, path: str) -> list[Link]:
+def file_links(request: HttpRequest, path: str, tileset: Tileset | None) -> list[Link]:
     """Return the links to the files of a map, or of a version of one, that lies at `path`."""
     return [
         link(request, f"{path}/manifest", "manifest"),
         link(request, f"{path}/cloud.ply", "cloud", bodies.RAW),
+        *([link(request, f"{path}/tileset.json", "tileset")] if tileset is not None else []),
     ]
 
 

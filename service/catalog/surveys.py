@@ -29,6 +29,7 @@ from service.catalog.records import (
     SurveyRecord,
     SurveySummary,
     TileRecord,
+    Tileset,
     TileState,
 )
 from service.catalog.scans import (
@@ -42,7 +43,7 @@ from service.catalog.scans import (
     write_outcomes,
 )
 from service.catalog.tables import Survey, SurveyObject, SurveyTile, new_id, now
-from service.catalog.versions import map_row, version_in_use
+from service.catalog.versions import map_row, tileset_of, version_in_use
 from service.errors import Conflict, Failed, NotFound, NotReady
 
 
@@ -117,11 +118,18 @@ class Surveys:
     def ready(self, survey_id: str) -> SurveyRecord:
         """Return one survey that is done. Raises NotFound, and NotReady or Failed."""
         survey = self.get(survey_id)
-        if survey.status == "running":
-            raise NotReady(f"survey {survey_id!r} is still running; follow job {survey.job_id}")
-        if survey.status == "failed":
-            raise Failed(f"survey {survey_id!r} has no result; job {survey.job_id} says why")
+        _check_ready(survey.status, survey_id, survey.job_id)
         return survey
+
+    def tileset(self, survey_id: str) -> Tileset:
+        """Return the tileset of a survey that is done; of the scans nothing is read.
+
+        Raises NotFound, also for a survey without a tileset, and NotReady.
+        """
+        with self._database.read() as session:
+            row = _row(session, survey_id)
+            _check_ready(row.status, survey_id, row.job_id)
+            return tileset_of(row.tileset, f"survey {survey_id!r}")
 
     def page(self, map_id: str, *, after: Position | None = None, limit: int = 100) -> Page[SurveySummary]:
         """Return surveys of a map, newest first."""
@@ -153,6 +161,7 @@ class Surveys:
         threshold: float,
         objects: Iterable[ObjectRecord] | None = None,
         moving: int | None = None,
+        tileset: Tileset | None = None,
     ) -> None:
         """Record tiles and objects, replacing those of an earlier run; `jobs.succeed` makes the survey ready.
 
@@ -179,6 +188,7 @@ class Surveys:
             row.counts = {"tiles": len(tiles), **{state: by_state[state] for state in get_args(TileState)}}
             row.objects = {kind: by_kind[kind] for kind in get_args(ObjectKind)} if told else None
             row.moving = moving
+            row.tileset = None if tileset is None else tileset.model_dump()
             row.updated = now()
             if row.status == "ready":  # a step that was thought lost runs beside its second run, and is late
                 history.rewrite(session, row.map_id)
@@ -208,6 +218,14 @@ def _check_unused(session: Session, row: Survey) -> None:
             f"version {built.version} of map {row.map_id!r} is being built of survey {row.survey_id!r}; wait for job "
             f"{built.job_id}, or dismiss it"
         )
+
+
+def _check_ready(status: str, survey_id: str, job_id: str) -> None:
+    """Raise NotReady or Failed, with the job to look at, for a survey that is not done."""
+    if status == "running":
+        raise NotReady(f"survey {survey_id!r} is still running; follow job {job_id}")
+    if status == "failed":
+        raise Failed(f"survey {survey_id!r} has no result; job {job_id} says why")
 
 
 def _locked(session: Session, survey_id: str) -> Survey:
