@@ -39,6 +39,8 @@ OF_THE_FILE: frozenset[ScanReason] = frozenset(
     (
         "far_from_origin",
         "far_points",
+        "offset_taken_off",
+        "no_sensor_place",
         "missing_returns",
         "odd_density",
         "odd_size",

@@ -14,6 +14,7 @@ from typing import Self
 import numpy as np
 
 from worker.cloud.carrier import Carrier, CarrierSettings
+from worker.cloud.formats.fields import FARTHEST
 from worker.cloud.formats.scan import Scan, read_scan
 from worker.cloud.poses import inverse, transformed
 from worker.cloud.types import Colors, Floats, Matrix4, Points
@@ -47,11 +48,22 @@ class ScanFile:
             colors=None if scan.colors is None else scan.colors[~cut],
         )
 
-    def prior(self, sensor_pose: Matrix4) -> Matrix4 | None:
-        """Return map_from_scan by the client's pose, which is the sensor's; the file may know where that stood."""
-        if self.pose is None:
+    def prior(self, scan: Scan) -> Matrix4 | None:
+        """Return map_from_scan by the client's pose of the sensor, or else by that of the file, as an E57 has one.
+
+        The file may know where in its frame the sensor stood. An offset that was taken off its points is put back. The
+        file's own pose says nothing where it is the identity, as of a station that nobody registered, or where it puts
+        the points kilometres away, as in a country's grid.
+        """
+        map_from_sensor = self.pose if self.pose is not None else scan.prior
+        if map_from_sensor is None:
             return None
-        map_from_scan: Matrix4 = self.pose @ inverse(sensor_pose)
+        shift = np.eye(4)
+        shift[:3, 3] = scan.offset
+        map_from_scan: Matrix4 = map_from_sensor @ inverse(scan.sensor_pose) @ shift
+        far = float(np.linalg.norm(map_from_scan[:3, 3])) > FARTHEST
+        if self.pose is None and (far or np.allclose(map_from_sensor, np.eye(4))):
+            return None
         return map_from_scan
 
 

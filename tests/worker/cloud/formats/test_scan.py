@@ -135,8 +135,8 @@ def test_the_format_is_told_by_content_not_by_the_ending(tmp_path):
 
 def test_a_file_of_another_kind_is_refused(tmp_path):
     path = tmp_path / "scan.ply"
-    path.write_bytes(b"LASF\x00\x00\x00\x00 and more")
-    with pytest.raises(ScanError, match=r"^scan.ply: neither PLY nor PCD, it starts with b'LASF"):
+    path.write_bytes(b"glTF\x02\x00\x00\x00 and more")
+    with pytest.raises(ScanError, match=r"^scan.ply: neither PLY, PCD, E57 nor LAS, it starts with b'glTF"):
         read_scan(path)
 
 
