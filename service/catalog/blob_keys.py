@@ -62,6 +62,7 @@ def map_folder(job_id: str) -> str:
 
 
 map_cloud = _within(map_folder, "cloud.ply")  #: the fused reference map
+map_laz = _within(map_folder, "cloud.laz")  #: the same, packed; an earlier release kept no such file
 map_reference = _within(
     map_folder, "reference.npz"
 )  #: points, normals and grid, which surveys are compared with
@@ -124,6 +125,7 @@ survey_scores = _within(
     survey_folder, "scores.npz"
 )  #: probabilities of tiles, and of voxels where there are such
 survey_cloud = _within(survey_folder, "cloud.ply")  #: the current map coloured by result
+survey_laz = _within(survey_folder, "cloud.laz")  #: the same, packed; an earlier release kept no such file
 survey_picture = _within(survey_folder, "picture.png")  #: the top view with tiles by state
 
 

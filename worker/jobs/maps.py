@@ -7,6 +7,7 @@ import json
 from service.catalog import blob_keys
 from service.catalog.records import Bounds, VersionRecord
 from worker.cloud import npz
+from worker.cloud.formats.laz import write_laz
 from worker.cloud.formats.ply import write_ply
 from worker.cloud.types import Points
 from worker.detectors.card import Card
@@ -74,6 +75,11 @@ def _put_map(context: Context, built: BuiltMap, card: Card) -> None:
         context,
         blob_keys.map_cloud(job_id),
         lambda path: write_ply(path, reference.points, colors=reference.colors),
+    )
+    put(
+        context,
+        blob_keys.map_laz(job_id),
+        lambda path: write_laz(path, reference.points, colors=reference.colors),
     )
     listing = manifest(
         reference.points,

@@ -41,7 +41,7 @@ from worker.pipeline.flow import NoScanAccepted, compare, concluded, locate_surv
 from worker.pipeline.mapping.fusion import CurrentMap, ReferenceMap
 from worker.pipeline.registration.results import ScanResult
 from worker.pipeline.results.changes import ChangeSet
-from worker.pipeline.results.export import TileResult, tile_results, write_coloured_cloud
+from worker.pipeline.results.export import ColouredCloud, TileResult, tile_results
 from worker.pipeline.results.objects import ChangeObject
 from worker.pipeline.results.picture import draw_picture
 from worker.pipeline.results.refusal import draw_refusal
@@ -182,11 +182,9 @@ def _put_cloud_and_picture(
 ) -> None:
     reference, current = comparison.reference.points, comparison.current.points
     left_out = _left_out(context, survey)
-    put(
-        context,
-        blob_keys.survey_cloud(survey.survey_id),
-        lambda path: write_coloured_cloud(path, reference, current, changes),
-    )
+    cloud = ColouredCloud.of(reference, current, changes)
+    put(context, blob_keys.survey_cloud(survey.survey_id), cloud.write_ply)
+    put(context, blob_keys.survey_laz(survey.survey_id), cloud.write_laz)
     context.report("exporting", 0.6)
     put(
         context,
