@@ -14,6 +14,7 @@ from worker.detectors.card import Card
 from worker.detectors.comparison import Side
 from worker.detectors.detector import Detector
 from worker.jobs.models import card_of, kept_detector, pipeline_settings
+from worker.jobs.stations import take_stations_apart
 from worker.jobs.step import Context, put, step
 from worker.jobs.versions import kept_alarms, kept_reference, make_version
 from worker.pipeline.flow import BuiltMap
@@ -23,7 +24,10 @@ from worker.pipeline.results.manifest import manifest
 @step
 def register_map(context: Context) -> None:
     """Build a fused, tiled map of scans: the first version of it, or a later one."""
-    version = context.catalog.versions.of_job(context.job.job_id)
+    versions, job_id = context.catalog.versions, context.job.job_id
+    given = versions.of_job(job_id).scans
+    take_stations_apart(context, job_id, given, versions.take_apart, stage="reading")
+    version = versions.of_job(job_id)
     card = card_of(context, version.model)
     made = make_version(context, version, pipeline_settings(context, version, card))
     _put_map(context, made.built, card)

@@ -34,6 +34,7 @@ from worker.jobs.scans import (
     seen_by,
     unread,
 )
+from worker.jobs.stations import take_stations_apart
 from worker.jobs.step import Context, load, put, step
 from worker.jobs.versions import kept_alarms, kept_reference, kept_seen
 from worker.pipeline.alarms import AlarmCalibration
@@ -53,6 +54,8 @@ from worker.progress import Progress
 @step
 def register_survey(context: Context) -> None:
     """Fuse the scans to one cloud in the map's frame; a survey with no accepted scan fails here."""
+    given, surveys = _asked(context)[0], context.catalog.surveys
+    take_stations_apart(context, given.survey_id, given.scans, surveys.take_apart, stage="registering")
     survey, version, settings = _asked(context)
     reference = kept_reference(context, version)
     seen = None

@@ -139,7 +139,7 @@ def _samples_of(task: _Task) -> list[Sample]:
             tried = poses_tried(
                 scan,
                 place,
-                prior=file.prior(scan),
+                prior=file.prior(scan.sensor_pose),
                 registration=pipeline.registration,
                 placement=pipeline.placement,
             )

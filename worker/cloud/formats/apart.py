@@ -191,20 +191,28 @@ def _decoded(asked: dict[str, Any], file: int, columns: int | None) -> dict[str,
         raise ValueError("no file for the columns")
     store, pose = ColumnStore(columns), None
     if asked["format"] == "e57":
-        station = _chosen(read_stations(buffer), asked["station"])
+        station = _chosen(read_stations(buffer), asked["station"], asked["max_points"])
         read_e57(f"/proc/self/fd/{file}", station, store, max_points=asked["max_points"])
         pose = station.pose
     else:
-        read_las(buffer, store, max_points=asked["max_points"])
+        with os.fdopen(os.dup(file), "rb") as opened:
+            read_las(opened, store, max_points=asked["max_points"])
     return {"format": asked["format"], "n": store.n, "colors": store.has_colors, "pose": _rows(pose)}
 
 
-def _chosen(stations: tuple[Station, ...], number: int | None) -> Station:
+def _chosen(stations: tuple[Station, ...], number: int | None, max_points: int) -> Station:
     if number is not None:
         return stations[number]
     if len(stations) > 1:
+        together = sum(station.n for station in stations)
+        if together > max_points:
+            raise ScanTooLarge(
+                f"its {len(stations)} scans declare {together} points together, the limit is {max_points}; split or thin "
+                "the file"
+            )
         raise ScanError(
-            f"it holds {len(stations)} scans, each from its own place of the sensor; read one of them by its number"
+            f"it holds {len(stations)} scans, each from its own place of the sensor, and they could not all be read; "
+            "write each into a file of its own"
         )
     return stations[0]
 

@@ -11,7 +11,7 @@ import mmap
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +31,7 @@ _LEAST_SCALE, _MOST_SCALE = 1e-9, 1.0  #: metres; a step wider than a metre is n
 _MOST_RECORDS = 10_000  #: of variable length
 _RECORD_HEADER = struct.Struct("<2x16sHH32x")  #: user id, record id, length
 _LASZIP = (b"laszip encoded", 22204)
+_ANY_SIZE = 2**32 - 1  #: points of a chunk where chunks differ, as in COPC
 _AT_ONCE = 64 * 1024**2  #: bytes of points that are held together
 _POINTS_AT_ONCE = 1_000_000
 _PLAIN_PER_POINT = 100  #: bytes a point of the limit that a LAZ may unpack to; format 10 takes 67
@@ -56,18 +57,21 @@ def looks_like_las(head: bytes) -> bool:
     return head.startswith(b"LASF")
 
 
-def read_las(buffer: mmap.mmap, store: ColumnStore, *, max_points: int) -> None:
-    """Decode all points into `store`: x, y, z in the coordinates of the file; withheld ones are NaN.
+def read_las(file: BinaryIO, store: ColumnStore, *, max_points: int) -> None:
+    """Decode all points of an open file into `store`: x, y, z in the coordinates of the file; withheld ones are NaN.
 
     Raises ScanError, ScanTooLarge; whatever lazrs does to a damaged LAZ ends the process.
     """
+    buffer = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
     header = parse_las_header(buffer)
     check_point_count(header.n, max_points=max_points)
     if header.laszip is None:
         pieces = _plain(header, buffer)
     else:
         _check_gain(header, len(buffer), max_points=max_points)
-        pieces = _unpacked(header, header.laszip, buffer)
+        if header.n:
+            _check_chunk_table(header, header.laszip, buffer, file)
+        pieces = _unpacked(header, header.laszip, file)
     store.allocate(header.n, colors=header.point_format in _COLORS_AT)
     brightest = done = 0
     for rows in pieces:
@@ -104,7 +108,7 @@ def parse_las_header(buffer: mmap.mmap) -> LasHeader:
     laszip = _laszip_record(buffer, size, start, n_records)
     if packed != (laszip is not None):
         raise ScanError("the header and its records disagree on whether the points are packed (LAZ)")
-    n = _n_points(buffer, minor, point_format)
+    n = _n_points(buffer, minor)
     header = LasHeader(
         point_format=point_format,
         record_size=record_size,
@@ -117,17 +121,17 @@ def parse_las_header(buffer: mmap.mmap) -> LasHeader:
     if laszip is None:
         _check_size(header, buffer, minor)
     else:
-        _check_laszip(header, laszip, buffer)
+        _check_laszip(header, laszip)
     return header
 
 
-def _n_points(buffer: mmap.mmap, minor: int, point_format: int) -> int:
+def _n_points(buffer: mmap.mmap, minor: int) -> int:
     """Return how many points the header declares; version 1.4 has a second, wider count."""
     legacy = int(struct.unpack_from("<I", buffer, 107)[0])
     if minor < 4:
         return legacy
     n = int(struct.unpack_from("<Q", buffer, 247)[0])
-    if legacy not in (0, n) or (point_format < 6 and n < 2**32 and legacy != n):
+    if legacy not in (0, n):
         raise ScanError(f"the header declares {n} points, and in its older field {legacy}")
     return n
 
@@ -184,7 +188,7 @@ def _check_size(header: LasHeader, buffer: mmap.mmap, minor: int) -> None:
         raise ScanError(f"{left} bytes follow after the declared points; correct the count of points")
 
 
-def _check_laszip(header: LasHeader, laszip: bytes, buffer: mmap.mmap) -> None:
+def _check_laszip(header: LasHeader, laszip: bytes) -> None:
     """Hold the record of LASzip against the header: what it unpacks to has to be a point."""
     if len(laszip) < 34:
         raise ScanError(f"the record of LASzip has {len(laszip)} bytes, it takes 34 at least")
@@ -197,9 +201,38 @@ def _check_laszip(header: LasHeader, laszip: bytes, buffer: mmap.mmap) -> None:
         raise ScanError(
             f"LASzip unpacks {sum(sizes)} bytes a point, the header declares {header.record_size}"
         )
-    if header.start + 8 > len(buffer) and header.n:
+
+
+def _check_chunk_table(header: LasHeader, laszip: bytes, buffer: mmap.mmap, file: BinaryIO) -> None:
+    """Hold the table of the chunks that points are packed in against their number, and against the file's size."""
+    import lazrs  # noqa: PLC0415 - most scans are not compressed
+
+    cut = f"truncated: header declares {header.n} points, the file ends before them or their table; upload it again"
+    if header.start + 16 > len(buffer):
+        raise ScanError(cut)
+    at = int(struct.unpack_from("<q", buffer, header.start)[0])
+    if at == -1:  # written by who could not go back
+        at = int(struct.unpack_from("<q", buffer, len(buffer) - 8)[0])
+    if not header.start + 8 <= at <= len(buffer) - 8:
+        raise ScanError(cut)
+    chunk_size = int(struct.unpack_from("<I", laszip, 12)[0])
+    version, n_chunks = struct.unpack_from("<II", buffer, at)
+    most = header.n if chunk_size in (0, _ANY_SIZE) else -(-header.n // chunk_size)
+    if version != 0 or n_chunks > most:
         raise ScanError(
-            f"truncated: header declares {header.n} points, the file ends before them; upload it again"
+            f"a table (version {version}) of {n_chunks} chunks of {chunk_size} points is declared for {header.n} points"
+        )
+    try:
+        file.seek(header.start)
+        chunks = lazrs.read_chunk_table(file, lazrs.LazVlr(laszip))
+    except (lazrs.LazrsError, OSError) as error:
+        raise ScanError(
+            f"the table of its packed points is damaged ({str(error)[:200]}); upload it again"
+        ) from None
+    packed = sum(size for _, size in chunks)
+    if packed != at - header.start - 8:
+        raise ScanError(
+            f"its chunks take {packed} bytes, but {at - header.start - 8} lie before their table; upload it again"
         )
 
 
@@ -226,14 +259,14 @@ def _split(rows: NDArray[np.uint8]) -> Iterator[NDArray[np.uint8]]:
     return (rows[at : at + _POINTS_AT_ONCE] for at in range(0, len(rows), _POINTS_AT_ONCE))
 
 
-def _unpacked(header: LasHeader, laszip: bytes, buffer: mmap.mmap) -> Iterator[NDArray[np.uint8]]:
+def _unpacked(header: LasHeader, laszip: bytes, file: BinaryIO) -> Iterator[NDArray[np.uint8]]:
     """Yield the points (K, record_size) of a LAZ. Raises ScanError for what lazrs says is damaged."""
     import lazrs  # noqa: PLC0415 - most scans are not compressed
 
     at_once = max(1, min(_POINTS_AT_ONCE, _AT_ONCE // header.record_size))
     try:
-        buffer.seek(header.start)
-        unpacker = lazrs.LasZipDecompressor(buffer, laszip)
+        file.seek(header.start)
+        unpacker = lazrs.LasZipDecompressor(file, laszip)
         for start in range(0, header.n, at_once):
             rows = np.empty((min(at_once, header.n - start), header.record_size), np.uint8)
             unpacker.decompress_many(rows.reshape(-1))

@@ -69,7 +69,7 @@ def _write(
                 rows["X"], rows["Y"], rows["Z"] = (
                     np.rint(points[piece].astype(np.float64) / _STEP).astype(np.int32).T
                 )
-                rows["return_number"], rows["number_of_returns"] = 1, 1
+                rows["return_number"] = rows["number_of_returns"] = np.ones(len(points[piece]), np.uint8)
                 if colors is not None:
                     rows["red"], rows["green"], rows["blue"] = (colors[piece].astype(np.uint16) * _FULL).T
                 for name, column in columns.items():

@@ -42,7 +42,7 @@ def test_a_scan_that_surfaces_lay_half_a_metre_off_is_told_by_what_rays_went_thr
     (alone, *_) = scan_files(after)
     scan = prepare(alone.read(max_points=MANY), settings.registration)
     by_surfaces = register(
-        scan, target, prior=alone.prior(scan), settings=settings.registration
+        scan, target, prior=alone.prior(scan.sensor_pose), settings=settings.registration
     ).target_from_source
     assert off(by_surfaces, true[0]) > 0.2
     found = register_survey_scans(
