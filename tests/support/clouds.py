@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -91,3 +92,46 @@ def write_las(
         las.withheld = withheld
     las.write(str(path))
     return path
+
+
+_CRC = [0] * 256
+for _byte in range(256):
+    _value = _byte
+    for _ in range(8):
+        _value = _value >> 1 ^ (0x82F63B78 if _value & 1 else 0)
+    _CRC[_byte] = _value
+
+
+def crc32c(data: bytes) -> int:
+    """Return the CRC-32C (Castagnoli) that each page of an E57 has at its end."""
+    value = 0xFFFFFFFF
+    for byte in data:
+        value = _CRC[(value ^ byte) & 0xFF] ^ value >> 8
+    return value ^ 0xFFFFFFFF
+
+
+def without_checksums(content: bytes) -> bytes:
+    """Return what the pages of an E57 hold."""
+    return b"".join(content[start : start + 1020] for start in range(0, len(content), 1024))
+
+
+def with_checksums(plain: bytes) -> bytes:
+    """Return the pages that hold these bytes."""
+    pages = (plain[start : start + 1020].ljust(1020, b"\0") for start in range(0, len(plain), 1020))
+    return b"".join(page + struct.pack(">I", crc32c(page)) for page in pages)
+
+
+def split_xml(content: bytes) -> tuple[bytes, bytes]:
+    """Return what the pages of an E57 hold before its XML, and the XML."""
+    at, length = struct.unpack_from("<QQ", content, 24)
+    plain, begin = without_checksums(content), at // 1024 * 1020 + at % 1024
+    return plain[:begin], plain[begin : begin + length]
+
+
+def with_xml(before: bytes, xml: bytes) -> bytes:
+    """Return an E57 of what stands before its XML, and the XML on pages of its own; every checksum holds."""
+    plain = before.ljust(-(-len(before) // 1020) * 1020, b"\0")
+    place = len(plain) // 1020 * 1024
+    whole = plain + xml.ljust(-(-max(len(xml), 1) // 1020) * 1020)
+    header = struct.pack("<QQQ", len(whole) // 1020 * 1024, place, len(xml))
+    return with_checksums(whole[:16] + header + whole[40:])

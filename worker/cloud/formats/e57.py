@@ -107,7 +107,7 @@ def read_e57(path: str, station: Station, store: ColumnStore, *, max_points: int
             done = _decode(libe57, file, station, store)
         finally:
             file.close()
-    except libe57.E57Exception as error:
+    except (libe57.E57Exception, RuntimeError, UnicodeError) as error:  # its words may be those of the file
         raise ScanError(f"its points are damaged ({_first_line(error)}); upload it again") from None
     if done != station.n:
         raise ScanError(f"truncated: {station.n} points are declared, file holds {done}; upload it again")
@@ -148,8 +148,9 @@ def _put(station: Station, held: dict[str, NDArray[Any]], store: ColumnStore, pi
     positions = (first, second, third)
     state = held.get(station.invalid_state)
     if station.position is _SPHERICAL:
-        flat = first * np.cos(third)
-        positions = (flat * np.cos(second), flat * np.sin(second), first * np.sin(third))
+        with np.errstate(invalid="ignore"):  # of an angle that is infinite
+            flat = first * np.cos(third)
+            positions = (flat * np.cos(second), flat * np.sin(second), first * np.sin(third))
     for name, values in zip("xyz", positions, strict=True):
         store.positions[name][piece] = values if state is None else np.where(state == 0, values, np.nan)
     unknown = held.get("isColorInvalid")

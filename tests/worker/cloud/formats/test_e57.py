@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from pye57 import libe57
 from scipy.spatial.transform import Rotation
 
-from tests.support.clouds import write_e57, write_e57_nodes
+from tests.support.clouds import split_xml, with_xml, write_e57, write_e57_nodes
 from worker.cloud.formats.apart import stations_of
 from worker.cloud.formats.scan import Scan, read_scan
 from worker.cloud.poses import translation
@@ -40,31 +40,11 @@ def read(path: Path, **known: int) -> Scan:
     return read_scan(path, apart=False, **known)
 
 
-def crc32c(data: bytes) -> int:
-    """CRC-32C (Castagnoli), as the pages of an E57 have it."""
-    value = 0xFFFFFFFF
-    for byte in data:
-        value ^= byte
-        for _ in range(8):
-            value = value >> 1 ^ (0x82F63B78 if value & 1 else 0)
-    return value ^ 0xFFFFFFFF
-
-
-def with_xml(path: Path, old: bytes, new: bytes) -> Path:
-    """The file with other words in its XML, which is written anew behind all else; every checksum holds."""
-    content = path.read_bytes()
-    at, length = struct.unpack_from("<QQ", content, 24)
-    plain = b"".join(content[start : start + 1020] for start in range(0, len(content), 1024))
-    begin = at // 1024 * 1020 + at % 1024
-    xml = plain[begin : begin + length]
+def with_words(path: Path, old: bytes, new: bytes) -> Path:
+    """The file with other words in its XML; every checksum holds."""
+    before, xml = split_xml(path.read_bytes())
     assert old in xml
-    plain = plain[: -(-begin // 1020) * 1020].ljust(-(-begin // 1020) * 1020, b"\0")
-    xml, place = xml.replace(old, new), len(plain)
-    plain += xml.ljust(-(-len(xml) // 1020) * 1020)
-    header = struct.pack("<QQQ", len(plain) // 1020 * 1024, place // 1020 * 1024, len(xml))
-    plain = plain[:16] + header + plain[40:]
-    pages = (plain[start : start + 1020] for start in range(0, len(plain), 1020))
-    path.write_bytes(b"".join(page + struct.pack(">I", crc32c(page)) for page in pages))
+    path.write_bytes(with_xml(before, xml.replace(old, new)))
     return path
 
 
@@ -234,10 +214,12 @@ XML = [
 @pytest.mark.parametrize(("old", "new", "said"), XML)
 def test_an_xml_that_is_not_of_these_points_is_an_error(tmp_path, old, new, said):
     pose = pose_of(4, 30)
-    path = with_xml(write_e57(tmp_path / "hall.e57", [room()], poses=[pose]), b"<formatName", b"<formatName")
+    path = with_words(
+        write_e57(tmp_path / "hall.e57", [room()], poses=[pose]), b"<formatName", b"<formatName"
+    )
     assert len(read(path).points) == N  # written anew it is as sound as before
     try:
-        scan = read_scan(with_xml(path, old, new))
+        scan = read_scan(with_words(path, old, new))
     except ScanError as error:
         assert said is None or re.search(said, str(error)), str(error)
     else:
@@ -249,7 +231,7 @@ def test_an_xml_that_is_nested_or_long_beyond_reason_is_refused(tmp_path):
     for words in (b"<a>" * 60 + b"</a>" * 60, b"<a/>" * 500_001):
         path = write_e57(tmp_path / "hall.e57", [room()])
         with pytest.raises(ScanError, match="elements, or is nested deeper"):
-            read(with_xml(path, b"</e57Root>", words + b"</e57Root>"))
+            read(with_words(path, b"</e57Root>", words + b"</e57Root>"))
     path = write_e57(tmp_path / "hall.e57", [room()])
     content = bytearray(path.read_bytes())
     struct.pack_into("<Q", content, 32, 1 << 40)

@@ -135,3 +135,21 @@ def test_few_directions_rings_and_surfaces_are_told(hall: Scan) -> None:
     azimuth = np.degrees(np.arctan2(hall.points[:, 1], hall.points[:, 0]))
     narrow = replace(hall, points=hall.points[np.abs(azimuth - 42) < 15])
     assert "degrees about the vertical" in told(narrow)["little_coverage"]
+
+
+def test_a_scan_that_an_offset_was_taken_off_has_no_place_of_its_sensor_and_both_are_told(hall: Scan) -> None:
+    moved = replace(hall, offset=np.array([412_300.0, 5_654_300.0, 100.0]), tells_sensor=False)
+    assert prepare(moved, SETTINGS).origin is None  # though all points can be seen from the new origin
+    found = {one.reason: one for one in oddities(moved, prepare(moved, SETTINGS))}
+    assert set(found) == {"offset_taken_off", "no_sensor_place"}
+    assert found["offset_taken_off"].numbers == {"x": 412_300, "y": 5_654_300, "z": 100}
+    assert "(412300, 5654300, 100) m was taken off" in found["offset_taken_off"].detail
+
+
+def test_of_a_format_that_tells_no_sensor_it_is_told_where_the_points_contradict_the_origin(
+    hall: Scan,
+) -> None:
+    assert told(replace(hall, tells_sensor=False)) == {}
+    outside = replace(hall, points=hall.points + np.float32([20, 0, 0]))
+    assert "no_sensor_place" not in told(outside)
+    assert set(told(replace(outside, tells_sensor=False))) == {"no_sensor_place"}
