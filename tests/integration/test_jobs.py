@@ -116,9 +116,9 @@ def test_a_survey_leaves_a_cloud_a_picture_and_its_scan(house: House) -> None:
         packed = read_scan(path)
     assert np.abs(packed.points - cloud.points).max() < 6e-4
     assert packed.colors is not None
+    assert cloud.colors is not None
     assert np.array_equal(packed.colors, cloud.colors)
     assert cloud.points[:, 0].max() < SEEN_TO + 0.1
-    assert cloud.colors is not None
     assert blobs.exists(blob_keys.survey_scan(survey.survey_id, survey.scans[0].scan_id))
 
 

@@ -194,7 +194,7 @@ def _check_laszip(header: LasHeader, laszip: bytes) -> None:
         raise ScanError(f"the record of LASzip has {len(laszip)} bytes, it takes 34 at least")
     compressor, coder = struct.unpack_from("<HH", laszip)
     n_items = struct.unpack_from("<H", laszip, 32)[0]
-    if compressor not in (1, 2, 3) or coder != 0 or len(laszip) < 34 + 6 * n_items:
+    if compressor not in (2, 3) or coder != 0 or len(laszip) < 34 + 6 * n_items:
         raise ScanError(f"LASzip compressor {compressor}, coder {coder}, {n_items} items are not known")
     sizes = [struct.unpack_from("<HHH", laszip, 34 + 6 * item)[1] for item in range(n_items)]
     if sum(sizes) != header.record_size:
@@ -217,8 +217,8 @@ def _check_chunk_table(header: LasHeader, laszip: bytes, buffer: mmap.mmap, file
         raise ScanError(cut)
     chunk_size = int(struct.unpack_from("<I", laszip, 12)[0])
     version, n_chunks = struct.unpack_from("<II", buffer, at)
-    most = header.n if chunk_size in (0, _ANY_SIZE) else -(-header.n // chunk_size)
-    if version != 0 or n_chunks > most:
+    varies = chunk_size in (0, _ANY_SIZE)
+    if version != 0 or not (n_chunks <= header.n if varies else n_chunks == -(-header.n // chunk_size)):
         raise ScanError(
             f"a table (version {version}) of {n_chunks} chunks of {chunk_size} points is declared for {header.n} points"
         )
@@ -229,6 +229,10 @@ def _check_chunk_table(header: LasHeader, laszip: bytes, buffer: mmap.mmap, file
         raise ScanError(
             f"the table of its packed points is damaged ({str(error)[:200]}); upload it again"
         ) from None
+    if varies and sum(points for points, _ in chunks) != header.n:
+        raise ScanError(
+            f"its chunks hold {sum(points for points, _ in chunks)} points, the header declares {header.n}"
+        )
     packed = sum(size for _, size in chunks)
     if packed != at - header.start - 8:
         raise ScanError(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import struct
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -35,7 +36,7 @@ def pose_of(x: float, degrees: float) -> np.ndarray:
     return pose
 
 
-def read(path: Path, **known: int) -> Scan:
+def read(path: Path, **known: Any) -> Scan:
     """Read a file in this process."""
     return read_scan(path, apart=False, **known)
 
@@ -54,6 +55,7 @@ def test_points_colours_and_the_pose_of_one_station_are_read(tmp_path):
     scan = read(path)
     assert_array_equal(scan.points, room().astype("f"))
     assert_array_equal(scan.colors, colors)
+    assert scan.prior is not None
     assert_allclose(scan.prior, pose_of(4, 30), atol=1e-12)
     assert_array_equal(scan.sensor_pose, np.eye(4))  # points are in the station's own frame
     assert scan.tells_sensor

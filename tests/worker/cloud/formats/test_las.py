@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,7 +24,7 @@ def room(seed: int = 0) -> np.ndarray:
     return np.round(rng.uniform((-3, -2, 0), (3, 2, 3), (N, 3)), 3)
 
 
-def read(path: Path, **known: int) -> Scan:
+def read(path: Path, **known: Any) -> Scan:
     """Read a file in this process."""
     return read_scan(path, apart=False, **known)
 

@@ -16,7 +16,7 @@ COLORS = np.array([[255, 0, 128], [1, 2, 3], [213, 94, 0]], np.uint8)
 
 def test_points_colours_and_scalars_are_read_back(tmp_path):
     path = tmp_path / "cloud.laz"
-    scalars = {
+    scalars: dict[str, np.ndarray] = {
         "change_score": np.array([0.25, np.nan, 1], np.float32),
         "tile_state": np.array([0, 3, 255], np.uint8),
         "kind": np.array([0, 1, 4], np.uint8),

@@ -150,6 +150,6 @@ def test_of_a_format_that_tells_no_sensor_it_is_told_where_the_points_contradict
     hall: Scan,
 ) -> None:
     assert told(replace(hall, tells_sensor=False)) == {}
-    outside = replace(hall, points=hall.points + np.float32([20, 0, 0]))
+    outside = replace(hall, points=hall.points + np.array([20, 0, 0], np.float32))
     assert "no_sensor_place" not in told(outside)
     assert set(told(replace(outside, tells_sensor=False))) == {"no_sensor_place"}
