@@ -47,8 +47,9 @@ bench: $(INSTALLED) ## seconds in each stage on a simulated corridor, saved unde
 chaos: $(INSTALLED) ## 1,000 kills and 100 freezes while surveys run: an hour, 90 minutes at most
 	$(BIN)/python -m tests.breaking.chaos
 
-fuzz: $(INSTALLED) ## a million mutated scans to the readers, 100,000 requests to the API: about 20 minutes, 40 at most
+fuzz: $(INSTALLED) ## 1.2 million mutated scans to the readers, 100,000 requests to the API: about 35 minutes, 55 at most
 	$(BIN)/python -m tests.breaking.fuzz_readers --files 1000000 --minutes 25
+	$(BIN)/python -m tests.breaking.fuzz_readers --packed --files 200000 --minutes 15
 	$(BIN)/python -m tests.breaking.fuzz_api --cases 100000 --minutes 15
 
 schemathesis: $(INSTALLED) $(TOOLS)/.installed ## hold a running API against its OpenAPI document: about 15 minutes

@@ -307,6 +307,18 @@ async def get_map_cloud(services: Provided, map_id: MapId) -> Response:
     return await cloud_response(services, ready.job_id, f"{map_id}.ply")
 
 
+@router.get(
+    "/maps/{map_id}/cloud.laz",
+    summary="The cloud of a map, packed",
+    response_class=Response,
+    responses=files.documented(bodies.LAZ, "The fused reference map, LAZ 1.4") | MADE,
+)
+async def get_map_laz(services: Provided, map_id: MapId) -> Response:
+    """The points of `cloud.ply` to the millimetre, for desktops. A map of release 0.1 has none."""
+    ready = await run_in_threadpool(services.catalog.maps.ready, map_id)
+    return await laz_response(services, ready.job_id, f"{map_id}.laz")
+
+
 @router.put(
     "/maps/{map_id}/anchor",
     summary="Say where a map lies on the Earth",
@@ -397,6 +409,7 @@ def file_links(request: HttpRequest, path: str, tileset: Tileset | None) -> list
     return [
         link(request, f"{path}/manifest", "manifest"),
         link(request, f"{path}/cloud.ply", "cloud", bodies.RAW),
+        link(request, f"{path}/cloud.laz", "cloud-laz", bodies.LAZ),
         *([link(request, f"{path}/tileset.json", "tileset")] if tileset is not None else []),
     ]
 
@@ -410,3 +423,9 @@ async def cloud_response(services: Services, job_id: str, filename: str) -> Resp
     """Answer with the cloud of the version that a job built."""
     key = blob_keys.map_cloud(job_id)
     return await blob_response(services.catalog.blobs, key, media_type=bodies.RAW, filename=filename)
+
+
+async def laz_response(services: Services, job_id: str, filename: str) -> Response:
+    """Answer with the packed cloud of the version that a job built."""
+    key = blob_keys.map_laz(job_id)
+    return await blob_response(services.catalog.blobs, key, media_type=bodies.LAZ, filename=filename)

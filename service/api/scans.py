@@ -98,7 +98,7 @@ async def upload_scan(
     asked: Annotated[ScanQuery, Query()],
     keyed: Keyed,
 ) -> ScanDocument:
-    """One PLY or PCD, as the raw body or as the field `file` of a form; it is read later, by the job that uses it.
+    """One PLY, PCD, E57, LAS or LAZ, as the raw body or as the field `file` of a form; a job that uses it reads it later.
 
     What is said of the scan stands in the query, or in the form, which wins. The same bytes from the same device
     are one scan: sent again with another `pose` or `captured_at`, these are kept from then on, as the answer shows.

@@ -182,6 +182,27 @@ async def get_survey_cloud(services: Provided, survey_id: SurveyId) -> Response:
 
 
 @router.get(
+    "/surveys/{survey_id}/cloud.laz",
+    summary="The coloured cloud of a survey, packed",
+    response_class=Response,
+    responses=files.documented(bodies.LAZ, "The current map coloured by result, LAZ 1.4") | MADE,
+)
+async def get_survey_laz(services: Provided, survey_id: SurveyId) -> Response:
+    """The points of `cloud.ply` to the millimetre, for desktops: `change_score`, `tile_state`, `kind` and `object_id` as extra bytes.
+
+    A survey of release 0.1 has none.
+    """
+    await run_in_threadpool(services.catalog.surveys.ready, survey_id)
+    return await blob_response(
+        services.catalog.blobs,
+        blob_keys.survey_laz(survey_id),
+        media_type=bodies.LAZ,
+        filename=f"{survey_id}.laz",
+        immutable=True,
+    )
+
+
+@router.get(
     "/surveys/{survey_id}/picture.png",
     summary="The picture of a survey",
     response_class=Response,
@@ -265,6 +286,7 @@ def _links(record: SurveySummary, request: HttpRequest) -> list[Link]:
         links += [
             link(request, f"{here}/tiles", "tiles", features.MEDIA_TYPE),
             link(request, f"{here}/cloud.ply", "cloud", bodies.RAW),
+            link(request, f"{here}/cloud.laz", "cloud-laz", bodies.LAZ),
             link(request, f"{here}/picture.png", "preview", "image/png"),
         ]
     if record.tileset is not None:

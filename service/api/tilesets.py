@@ -21,7 +21,7 @@ from service.api.http.fields import Id
 from service.api.http.files import blob_response, content_response
 from service.api.http.problems import MADE
 from service.catalog import blob_keys
-from service.catalog.records import Anchor, Bounds, MapRecord, Tileset
+from service.catalog.records import Anchor, Bounds, MapSummary, Tileset
 from service.catalog.tilesets import ContentName
 from service.catalog.versions import tileset_of
 from service.errors import NotFound
@@ -149,7 +149,7 @@ def _named(content: str, tileset: Tileset) -> ContentName:
     return name
 
 
-def _of_version_in_use(ready: MapRecord, *, on_earth: bool) -> dict[str, Any]:
+def _of_version_in_use(ready: MapSummary, *, on_earth: bool) -> dict[str, Any]:
     """Return the tileset of one tile that names the version's. Raises RequestValidationError without an anchor."""
     if ready.bounds is None:
         raise NotFound(f"map {ready.map_id!r} has no extent")
@@ -169,7 +169,7 @@ def _of_version_in_use(ready: MapRecord, *, on_earth: bool) -> dict[str, Any]:
     }
 
 
-def _anchored(ready: MapRecord) -> Anchor:
+def _anchored(ready: MapSummary) -> Anchor:
     if ready.anchor is None:
         raise RequestValidationError(
             [

@@ -141,7 +141,7 @@ def get_upload_options(services: Provided) -> Response:
     openapi_extra=_takes(_LENGTH, _METADATA, _CHECKSUM),
 )
 async def create_upload(request: HttpRequest, services: Provided, receiver: Received) -> Response:
-    """Tell the size of a PLY or PCD in `Upload-Length`; its pieces go to the `Location` of the answer by PATCH.
+    """Tell the size of a PLY, PCD, E57, LAS or LAZ in `Upload-Length`; its pieces go to the `Location` of the answer by PATCH.
 
     `Upload-Metadata` carries what the query of POST /scans does: `filename captured_at device_id pose frame`, each
     value in base64. A body, of the type application/offset+octet-stream, is the first piece.

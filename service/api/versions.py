@@ -39,6 +39,7 @@ from service.api.maps import (
     ScansPageRequest,
     cloud_response,
     file_links,
+    laz_response,
     manifest_response,
     scan_list,
 )
@@ -200,6 +201,18 @@ async def get_version_cloud(services: Provided, map_id: MapId, number: Number) -
     """The fused reference map, in metres."""
     version = await run_in_threadpool(services.catalog.versions.ready, map_id, number)
     return await cloud_response(services, version.job_id, f"{map_id}-{number}.ply")
+
+
+@router.get(
+    "/maps/{map_id}/versions/{number}/cloud.laz",
+    summary="The cloud of a version of a map, packed",
+    response_class=Response,
+    responses=files.documented(bodies.LAZ, "The fused reference map, LAZ 1.4") | MADE,
+)
+async def get_version_laz(services: Provided, map_id: MapId, number: Number) -> Response:
+    """The points of `cloud.ply` to the millimetre, for desktops. A map of release 0.1 has none."""
+    version = await run_in_threadpool(services.catalog.versions.ready, map_id, number)
+    return await laz_response(services, version.job_id, f"{map_id}-{number}.laz")
 
 
 def _accepted(request: HttpRequest, record: VersionRecord, job: JobRecord) -> AcceptedVersion:

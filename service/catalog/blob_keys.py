@@ -62,6 +62,7 @@ def map_folder(job_id: str) -> str:
 
 
 map_cloud = _within(map_folder, "cloud.ply")  #: the fused reference map
+map_laz = _within(map_folder, "cloud.laz")  #: the same, packed; an earlier release kept no such file
 map_reference = _within(
     map_folder, "reference.npz"
 )  #: points, normals and grid, which surveys are compared with
@@ -130,6 +131,7 @@ survey_tileset = _within(
     survey_folder, "tileset.json"
 )  #: the document of the cloud's tileset, where it is large
 survey_tileset_contents = _within(survey_folder, "tileset.bin")  #: all of its contents
+survey_laz = _within(survey_folder, "cloud.laz")  #: the same, packed; an earlier release kept no such file
 survey_picture = _within(survey_folder, "picture.png")  #: the top view with tiles by state
 
 

@@ -46,13 +46,15 @@ ScanReason = Literal[
     "wrong_units",
     "far_from_origin",
     "far_points",
+    "offset_taken_off",
+    "no_sensor_place",
     "missing_returns",
     "odd_density",
     "odd_size",
     "little_coverage",
     "clock",
 ]
-ScanFormat = Literal["ply", "pcd"]
+ScanFormat = Literal["ply", "pcd", "e57", "las", "laz"]
 #: What an API key may do; `admin` is everything.
 Scope = Literal["scans:write", "surveys:write", "maps:write", "changes:read", "admin"]
 WebhookStatus = Literal["active", "disabled"]

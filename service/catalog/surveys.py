@@ -39,6 +39,7 @@ from service.catalog.scans import (
     known_outcomes,
     new_uses,
     outcome_columns,
+    put_in_place,
     scans_in_order,
     write_outcomes,
 )
@@ -137,6 +138,16 @@ class Surveys:
         query = query.options(undefer(Survey.scan_count), selectinload(Survey.job))
         created, key = Survey.created, Survey.survey_id
         return self._database.page(query, created, key, SurveySummary.of_row, after=after, limit=limit)
+
+    def take_apart(self, key: str, scan_id: str, parts: Mapping[str, Matrix | None]) -> None:
+        """Put the scans that one of the survey's was taken apart into in its place, with their poses.
+
+        `key` is the id of the survey. Raises NotFound.
+        """
+        with self._database.write() as session:
+            row = _row(session, key)
+            put_in_place(tables.SurveyScan, row.scans, scan_id, parts)
+            row.updated = now()
 
     def save_outcomes(
         self, survey_id: str, outcomes: Iterable[ScanOutcome], *, placement: Placement | None = None

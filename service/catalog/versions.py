@@ -31,6 +31,7 @@ from service.catalog.scans import (
     known_outcomes,
     new_uses,
     outcome_columns,
+    put_in_place,
     scans_in_order,
     write_outcomes,
 )
@@ -143,6 +144,16 @@ class Versions:
         query = versions_in_short().where(MapVersion.map_id == map_id)
         created, key = MapVersion.created, MapVersion.job_id
         return self._database.page(query, created, key, VersionSummary.of_row, after=after, limit=limit)
+
+    def take_apart(self, key: str, scan_id: str, parts: Mapping[str, Matrix | None]) -> None:
+        """Put the scans that one of a version's was taken apart into in its place, with their poses.
+
+        `key` is the id of the job that builds the version. Raises NotFound, also where it was deleted since.
+        """
+        with self._database.write() as session:
+            row = _row_of_job(session, key)
+            put_in_place(tables.VersionScan, row.scans, scan_id, parts)
+            row.updated = now()
 
     def save_outcomes(self, job_id: str, outcomes: Iterable[ScanOutcome]) -> None:
         """Record what became of the scans, also when the version then fails. Raises NotFound."""

@@ -74,6 +74,9 @@ def download(
         Path | None,
         typer.Option(help="Folder; left out: one that is named like the survey.", file_okay=False),
     ] = None,
+    laz: Annotated[
+        bool, typer.Option("--laz", help="The cloud as LAZ, in a ninth to a quarter of the bytes.")
+    ] = False,
 ) -> None:
     """Fetch what a survey found: cloud, picture, tiles and objects. What was broken off is taken up, also by another run."""
     terminal: Terminal = ctx.obj
@@ -83,7 +86,7 @@ def download(
         refused = survey["status"] == "failed" and _placed(survey) == "refused"
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            names = ("picture.png",) if refused else ("cloud.ply", "picture.png")
+            names = ("picture.png",) if refused else ("cloud.laz" if laz else "cloud.ply", "picture.png")
             files = [
                 terminal.download(client, f"/surveys/{survey_id}/{name}", folder / name) for name in names
             ]

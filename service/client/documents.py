@@ -516,6 +516,8 @@ class ScanWarning(TypedDict):
         "wrong_units",
         "far_from_origin",
         "far_points",
+        "offset_taken_off",
+        "no_sensor_place",
         "missing_returns",
         "odd_density",
         "odd_size",
@@ -694,7 +696,7 @@ class UploadDocument(TypedDict):
 
     created: str
     expires: str
-    format: Literal["ply", "pcd"] | None
+    format: Literal["ply", "pcd", "e57", "las", "laz"] | None
     length: int
     links: list[Link]
     metadata: dict[str, str]
@@ -1180,7 +1182,7 @@ class ScanDocument(TypedDict):
     created: str
     device_id: str | None
     filename: str
-    format: Literal["ply", "pcd"]
+    format: Literal["ply", "pcd", "e57", "las", "laz"]
     frame: str | None
     pose: list[PoseItem] | None
     scan_id: str
@@ -1231,6 +1233,8 @@ class ScanOutcome(TypedDict):
             "wrong_units",
             "far_from_origin",
             "far_points",
+            "offset_taken_off",
+            "no_sensor_place",
             "missing_returns",
             "odd_density",
             "odd_size",

@@ -82,6 +82,8 @@ def test_a_map_is_ready_with_its_counts_scans_and_files(house: House) -> None:
         )
     with house.catalog.blobs.local(blob_keys.map_cloud(house.catalog.maps.get(MAP).job_id)) as path:
         assert len(read_scan(path).points) == found.counts["points"]
+    with house.catalog.blobs.local(blob_keys.map_laz(house.catalog.maps.get(MAP).job_id)) as path:
+        assert len(read_scan(path).points) == found.counts["points"]
     listing = json.loads(
         house.catalog.blobs.get_bytes(blob_keys.map_manifest(house.catalog.maps.get(MAP).job_id))
     )
@@ -154,8 +156,13 @@ def test_a_survey_leaves_a_cloud_a_picture_and_its_scan(house: House) -> None:
     assert blobs.get_bytes(blob_keys.survey_picture(survey.survey_id)).startswith(b"\x89PNG")
     with blobs.local(blob_keys.survey_cloud(survey.survey_id)) as path:
         cloud = read_scan(path)
-    assert cloud.points[:, 0].max() < SEEN_TO + 0.1
+    with blobs.local(blob_keys.survey_laz(survey.survey_id)) as path:
+        packed = read_scan(path)
+    assert np.abs(packed.points - cloud.points).max() < 6e-4
+    assert packed.colors is not None
     assert cloud.colors is not None
+    assert np.array_equal(packed.colors, cloud.colors)
+    assert cloud.points[:, 0].max() < SEEN_TO + 0.1
     assert blobs.exists(blob_keys.survey_scan(survey.survey_id, survey.scans[0].scan_id))
 
 

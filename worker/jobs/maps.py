@@ -7,6 +7,7 @@ import json
 from service.catalog import blob_keys
 from service.catalog.records import Bounds, Tileset, VersionRecord
 from worker.cloud import npz
+from worker.cloud.formats.laz import write_laz
 from worker.cloud.formats.ply import write_ply
 from worker.cloud.tilesets.writer import pieces_of
 from worker.cloud.types import Points
@@ -14,6 +15,7 @@ from worker.detectors.card import Card
 from worker.detectors.comparison import Side
 from worker.detectors.detector import Detector
 from worker.jobs.models import card_of, kept_detector, pipeline_settings
+from worker.jobs.stations import take_stations_apart
 from worker.jobs.step import Context, put, step
 from worker.jobs.tilesets import put_tileset
 from worker.jobs.versions import kept_alarms, kept_reference, make_version
@@ -24,7 +26,10 @@ from worker.pipeline.results.manifest import manifest
 @step
 def register_map(context: Context) -> None:
     """Build a fused, tiled map of scans: the first version of it, or a later one."""
-    version = context.catalog.versions.of_job(context.job.job_id)
+    versions, job_id = context.catalog.versions, context.job.job_id
+    given = versions.of_job(job_id).scans
+    take_stations_apart(context, job_id, given, versions.take_apart, stage="reading")
+    version = versions.of_job(job_id)
     card = card_of(context, version.model)
     made = make_version(context, version, pipeline_settings(context, version, card))
     tileset = _put_map(context, made.built, card)
@@ -77,6 +82,11 @@ def _put_map(context: Context, built: BuiltMap, card: Card) -> Tileset:
         context,
         blob_keys.map_cloud(job_id),
         lambda path: write_ply(path, reference.points, colors=reference.colors),
+    )
+    put(
+        context,
+        blob_keys.map_laz(job_id),
+        lambda path: write_laz(path, reference.points, colors=reference.colors),
     )
     listing = manifest(
         reference.points,

@@ -36,6 +36,7 @@ from worker.jobs.scans import (
     seen_by,
     unread,
 )
+from worker.jobs.stations import take_stations_apart
 from worker.jobs.step import Context, load, put, step
 from worker.jobs.tilesets import put_tileset
 from worker.jobs.versions import kept_alarms, kept_reference, kept_seen
@@ -58,6 +59,8 @@ READ_WHOLE = 1_000_000  #: points of a survey's cloud that viewers read as one P
 @step
 def register_survey(context: Context) -> None:
     """Fuse the scans to one cloud in the map's frame; a survey with no accepted scan fails here."""
+    given, surveys = _asked(context)[0], context.catalog.surveys
+    take_stations_apart(context, given.survey_id, given.scans, surveys.take_apart, stage="registering")
     survey, version, settings = _asked(context)
     reference = kept_reference(context, version)
     seen = None
@@ -192,6 +195,7 @@ def _put_cloud_and_picture(
     cloud = ColouredCloud.of(reference, current, changes)
     put(context, blob_keys.survey_cloud(survey.survey_id), cloud.write_ply)
     tileset = _put_tileset(context, survey.survey_id, cloud)
+    put(context, blob_keys.survey_laz(survey.survey_id), cloud.write_laz)
     context.report("exporting", 0.6)
     put(
         context,

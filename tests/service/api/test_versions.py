@@ -108,6 +108,7 @@ def test_a_map_stays_in_use_while_a_version_builds_and_shows_it_when_it_is_ready
     assert shown(client) == (1, "ready", {"tiles": 4})
     for job_id, content in ((first, b"ply one"), (second, b"ply two")):
         catalog.blobs.put_bytes(blob_keys.map_cloud(job_id), content)
+        catalog.blobs.put_bytes(blob_keys.map_laz(job_id), b"laz" + content[3:])
         catalog.blobs.put_bytes(blob_keys.map_manifest(job_id), b'"%s"' % content)
     assert client.get("/maps/lobby/cloud.ply").content == b"ply one"
     assert client.get("/maps/lobby/versions/2/cloud.ply").status_code == 409
@@ -115,6 +116,7 @@ def test_a_map_stays_in_use_while_a_version_builds_and_shows_it_when_it_is_ready
     assert shown(client)[:2] == (2, "ready")
     for path, content in (("", b"two"), ("/versions/1", b"one"), ("/versions/2", b"two")):
         assert client.get(f"/maps/lobby{path}/cloud.ply").content == b"ply " + content
+        assert client.get(f"/maps/lobby{path}/cloud.laz").content == b"laz " + content
         assert client.get(f"/maps/lobby{path}/manifest").json() == f"ply {content.decode()}"
 
 

@@ -11,6 +11,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from worker.cloud.formats.laz import write_laz
 from worker.cloud.formats.ply import SCALAR, write_ply
 from worker.cloud.tiling import tile_id
 from worker.cloud.types import Bools, Colors, Points
@@ -154,10 +155,23 @@ class ColouredCloud:
             comments=_legend(self.scalars),
         )
 
+    def write_laz(self, path: Path) -> None:
+        """Write it as LAZ: each scalar as extra bytes, colours of 16 bits."""
+        write_laz(path, self.points, colors=self.colors, scalars=self.scalars, meanings=_IN_SHORT)
+
 
 def write_coloured_cloud(path: Path, reference: Points, current: Points, changes: ChangeSet) -> None:
     """Write the survey's fused cloud (N, 3), map frame, as coloured PLY; with objects also what the map (M, 3) lost."""
     ColouredCloud.of(reference, current, changes).write_ply(path)
+
+
+#: What a scalar is, in the 31 letters that a LAS has for it; architecture.md has the numbers.
+_IN_SHORT = {
+    "change_score": "probability, NaN: not scored",
+    "tile_state": "0 same 1 changed 2 odd 3 unseen",
+    "kind": "0 same 1 new 2 gone 3 ? 4 moved",
+    "object_id": "number of the object, 0: none",
+}
 
 
 def _legend(names: Collection[str]) -> list[str]:
