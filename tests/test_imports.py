@@ -50,8 +50,10 @@ ROOMS: dict[str, tuple[str, ...]] = {
         "service.tracing",
         "service.settings",
     ),
+    "service.web": ("service.api.http", "service.errors"),
     "service.api": (
         "service.api.http",
+        "service.web",
         "service.catalog",
         "service.cloud_events",
         "service.webhooks",

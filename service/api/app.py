@@ -59,6 +59,7 @@ from service.catalog.patience import REQUESTS
 from service.dispatch import Dispatcher
 from service.queue import JobQueue
 from service.settings import Settings
+from service.web.pages import add_viewer
 from service.webhooks.deliverer import Deliverer
 from service.webhooks.sending import Sender
 
@@ -174,6 +175,7 @@ def create_app(settings: Settings, *, queue: Queue | None = None) -> FastAPI:
     problems.add_handlers(app)
     idempotency.add_handler(app)
     add_pages(app)
+    add_viewer(app)
     for part in (
         landing,
         scans,
