@@ -9,15 +9,15 @@ NODE := build/node
 NODE_VERSION := 24.19.0
 WEB := service/web/source
 
-.PHONY: help web servers tools demo up test test-fast acceptance-shared check format bench chaos fuzz schemathesis load soak openapi client clean
+.PHONY: help web browser servers tools demo up test test-fast acceptance-shared check format bench chaos fuzz schemathesis load soak openapi client clean
 help: ## this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
 
 web: $(NODE)/.node-$(NODE_VERSION) $(WEB)/node_modules/.installed ## build the viewer that the service shows at /
 	@PATH="$(CURDIR)/$(NODE)/bin:$$PATH" npm --prefix $(WEB) run --silent build
 
-demo: $(INSTALLED) ## simulate a building, run the whole service on it, show what changed
-	$(BIN)/spicd-worker demo
+demo: $(INSTALLED) ## simulate a building, run the whole service on it, show what changed; on a terminal the viewer stays
+	$(BIN)/spicd-worker demo --look
 
 up: $(INSTALLED) ## start the service to stay: API, workers, embedded Redis
 	$(BIN)/spicd up
@@ -27,6 +27,9 @@ test: $(INSTALLED) ## every test, on all cores
 
 test-fast: $(INSTALLED) ## the tests that take no longer than a second or so: under a minute on two cores
 	$(BIN)/pytest -m fast -n auto --dist loadscope
+
+browser: ## a headless Chromium for the tests of the viewer, where apt-get may install one
+	@sh docker/browser.sh
 
 servers: $(SERVERS)/bin/moto_server ## an S3 server for tests, in an environment of its own; PostgreSQL has to be there
 
