@@ -122,6 +122,17 @@ class Blobs:
         with _errors():
             return bytes(obstore.get(self._store, key).bytes())
 
+    def get_range(self, key: str, offset: int, length: int) -> bytes:
+        """Return `length` bytes from `offset` on, fewer where the blob ends before. Raises FileNotFoundError."""
+        path = self.path(key)
+        with _errors():
+            if path is not None:
+                with path.open("rb") as file:
+                    file.seek(offset)
+                    return file.read(length)
+            length = max(min(length, self.size(key) - offset), 0)
+            return bytes(obstore.get_range(self._store, key, start=offset, length=length)) if length else b""
+
     def exists(self, key: str) -> bool:
         """Tell whether something complete lies under `key`."""
         try:

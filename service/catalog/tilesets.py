@@ -1,0 +1,53 @@
+"""Where the contents of a tileset lie: all in one blob, each under an address that says which bytes are its own.
+
+So no index has to be read for a content, and a blob store that takes a while for each request (S3) is asked once. The
+address names what the tileset was made for as well: the id of a job that builds a version, or of a survey. The ids of
+maps and numbers of versions may be given again once a map is deleted; an address of a content is never another's.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import Self
+
+from service.catalog.blobs import Blobs
+
+FOLDER = "tileset"  #: of the contents, beside `tileset.json`
+MOST_BYTES = 1 << 24  #: of a content that is answered; those that are written are a tenth of it
+_NAME = re.compile(r"([A-Za-z0-9._-]+)-([0-9]{1,15})-([0-9]{1,8})\.glb")
+_MAGIC = b"glTF\x02\x00\x00\x00"
+
+
+def addresses(owner: str) -> str:
+    """Return the relative address of every content of a tileset, with `{offset}` and `{length}` to be filled in."""
+    return f"{FOLDER}/{owner}-{{offset}}-{{length}}.glb"
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ContentName:
+    """What the last part of a content's address says."""
+
+    owner: str  #: id of the job, or of the survey, that the tileset was made by
+    offset: int  #: in the blob
+    length: int  #: bytes
+
+    @classmethod
+    def of(cls, name: str) -> Self | None:
+        """Read a name; None where it is none."""
+        match = _NAME.fullmatch(name)
+        if match is None or int(match[3]) > MOST_BYTES:
+            return None
+        return cls(owner=match[1], offset=int(match[2]), length=int(match[3]))
+
+
+def read_content(blobs: Blobs, key: str, name: ContentName) -> bytes:
+    """Return a content out of the blob under `key`.
+
+    Raises FileNotFoundError where there is no such blob, or none of its contents is there: a GLB tells its own length
+    (ISO/IEC 12113, Section 4.4), so that other bytes are noticed.
+    """
+    content = blobs.get_range(key, name.offset, name.length)
+    if content[:12] != _MAGIC + name.length.to_bytes(4, "little") or len(content) != name.length:
+        raise FileNotFoundError(f"{key} has no content of {name.length} bytes at {name.offset}")
+    return content
