@@ -251,7 +251,7 @@ ONLY_IN = {
     "torch": ("worker.detectors", "worker.training", "worker.benchmarks", "worker.cli"),
     "sqlalchemy": ("service.catalog",),
     "obstore": ("service.catalog",),
-    "fastapi": ("service.api", "service.up"),
+    "fastapi": ("service.api", "service.up", "service.web"),
     "opentelemetry": ("service.tracing",),
     "rosbags": ("service.bags",),
     "httpcore": ("service.webhooks",),

@@ -29,3 +29,12 @@ export function colourOfKind(kind: Kind): string {
 export function colourOfState(state: string): string {
   return STATE_COLOURS[state] ?? OTHER_COLOUR;
 }
+
+/** Of points that are of no object: `KIND_COLORS` in `worker/pipeline/results/export.py`. */
+export const POINT_COLOURS = { notJudged: "#d7d7d7", moving: "#f0e442" } as const;
+
+/** Return red, green and blue, 0..255, of a colour `#rrggbb`. */
+export function bytesOf(colour: string): [number, number, number] {
+  const value = Number.parseInt(colour.slice(1), 16);
+  return [value >> 16, (value >> 8) & 255, value & 255];
+}

@@ -1,0 +1,217 @@
+/**
+ * How points become a picture: each in the colour of its height or its own, and then an eye-dome pass over their depths
+ * (Boucheny, "Visualisation scientifique de grands volumes de données", 2009), which shades without any normals.
+ */
+
+import {
+  Color,
+  DepthTexture,
+  FloatType,
+  GLSL3,
+  Mesh,
+  NearestFilter,
+  OrthographicCamera,
+  PlaneGeometry,
+  RawShaderMaterial,
+  Scene as Group,
+  UnsignedByteType,
+  Vector2,
+  Vector3,
+  Vector4,
+  WebGLRenderTarget,
+} from "three";
+import type { PerspectiveCamera, WebGLRenderer } from "three";
+
+import type { Theme } from "./types.ts";
+
+/** What all points of a scene share: the materials of every cloud and tile point to these. */
+export interface PointUniforms {
+  [name: string]: { value: unknown };
+  /** Low and high end of the section, metres. */
+  section: { value: Vector2 };
+  /** Heights that the ramp of colours goes between, metres. */
+  ramp: { value: Vector2 };
+  low: { value: Color };
+  middle: { value: Color };
+  high: { value: Color };
+  back: { value: Color };
+  /** 1: what is outside of the chosen boxes is dim. */
+  dim: { value: number };
+  chosen: { value: [Vector3, Vector3, Vector3, Vector3] };
+  /** Pixels of the picture that a metre takes at a distance of a metre. */
+  scale: { value: number };
+}
+
+const POINT_VERTEX = /* glsl */ `
+precision highp float;
+uniform mat4 modelMatrix, viewMatrix, projectionMatrix;
+uniform vec2 section, ramp;
+uniform vec3 low, middle, high, back;
+uniform vec3 chosen[4];
+uniform float dim, scale, spacing, share;
+in vec3 position;
+#ifdef TINTED
+in vec4 tint;
+#endif
+out vec3 colour;
+
+bool inside(vec3 p, vec3 least, vec3 most) { return all(greaterThan(p, least)) && all(lessThan(p, most)); }
+
+void main() {
+  vec4 world = modelMatrix * vec4(position, 1.0);
+  if (world.z < section.x || world.z > section.y) {
+    gl_Position = vec4(2.0, 2.0, 2.0, 1.0);
+    return;
+  }
+  float height = clamp((world.z - ramp.x) / max(ramp.y - ramp.x, 0.1), 0.0, 1.0);
+  colour = height < 0.5 ? mix(low, middle, 2.0 * height) : mix(middle, high, 2.0 * height - 1.0);
+  float size = 1.35;
+#ifdef TINTED
+  if (tint.a > 0.75) colour = tint.rgb;
+  else if (tint.a > 0.25) { colour = tint.rgb; size = 1.6; }
+#endif
+  if (dim > 0.0 && !inside(world.xyz, chosen[0], chosen[1]) && !inside(world.xyz, chosen[2], chosen[3])) {
+    colour = mix(colour, back, 0.55 * dim);
+  }
+  vec4 eye = viewMatrix * world;
+  gl_Position = projectionMatrix * eye;
+  gl_PointSize = clamp(size * spacing * scale * inversesqrt(share) / -eye.z, 1.5, 40.0);
+}`;
+
+const POINT_FRAGMENT = /* glsl */ `
+precision mediump float;
+in vec3 colour;
+out vec4 painted;
+void main() {
+  vec2 off = gl_PointCoord - 0.5;
+  if (dot(off, off) > 0.27) discard;
+  painted = vec4(colour, 1.0);
+}`;
+
+const PASS_VERTEX = /* glsl */ `
+in vec3 position;
+void main() { gl_Position = vec4(position.xy, 0.0, 1.0); }`;
+
+const PASS_FRAGMENT = /* glsl */ `
+precision highp float;
+uniform sampler2D colours;
+uniform highp sampler2D depths;
+uniform vec2 planes;
+uniform vec4 area;
+uniform vec3 backLow, backHigh;
+uniform float radius, strength;
+out vec4 painted;
+
+float logDistance(ivec2 pixel) {
+  float depth = texelFetch(depths, clamp(pixel, ivec2(area.xy), ivec2(area.zw) - 1), 0).r;
+  return depth == 1.0 ? 100.0 : log2(planes.x * planes.y / (planes.y - depth * (planes.y - planes.x)));
+}
+
+void main() {
+  ivec2 pixel = ivec2(gl_FragCoord.xy);
+  float depth = texelFetch(depths, pixel, 0).r;
+  vec3 back = mix(backLow, backHigh, gl_FragCoord.y / area.w);
+  gl_FragDepth = depth;
+  if (depth == 1.0) { painted = vec4(back, 1.0); return; }
+  float here = logDistance(pixel);
+  float sum = 0.0;
+  for (int i = 0; i < 8; i++) {
+    float angle = 0.785398 * float(i);
+    ivec2 next = pixel + ivec2(round(radius * vec2(cos(angle), sin(angle))));
+    sum += clamp(here - logDistance(next), 0.0, 0.1);
+  }
+  float shade = exp(-strength * sum / 8.0);
+  painted = vec4(texelFetch(colours, pixel, 0).rgb * shade, 1.0);
+}`;
+
+/** Colours of heights and of the ground behind, by theme: quiet ones, so that what changed stands out. */
+const PALETTES: Readonly<Record<Theme, { low: string; middle: string; high: string; backLow: string; backHigh: string }>> = {
+  light: { low: "#6f8295", middle: "#a9b6b5", high: "#dcd6c4", backLow: "#e6eaee", backHigh: "#f8fafb" },
+  dark: { low: "#46586b", middle: "#7d8f95", high: "#bdb9a8", backLow: "#0e1217", backHigh: "#1a2028" },
+};
+
+/** Return the uniforms that all points share. */
+export function pointUniforms(): PointUniforms {
+  return {
+    section: { value: new Vector2(-1e9, 1e9) },
+    ramp: { value: new Vector2(0, 3) },
+    low: { value: new Color() },
+    middle: { value: new Color() },
+    high: { value: new Color() },
+    back: { value: new Color() },
+    dim: { value: 0 },
+    chosen: { value: [new Vector3(), new Vector3(), new Vector3(), new Vector3()] },
+    scale: { value: 1 },
+  };
+}
+
+/** Return a material for points `spacing` metres apart; `tinted`: they have the attribute `tint`. */
+export function pointMaterial(shared: PointUniforms, spacing: number, tinted: boolean): RawShaderMaterial {
+  return new RawShaderMaterial({
+    glslVersion: GLSL3,
+    vertexShader: POINT_VERTEX,
+    fragmentShader: POINT_FRAGMENT,
+    defines: tinted ? { TINTED: 1 } : {},
+    uniforms: { ...shared, spacing: { value: spacing }, share: { value: 1 } },
+  });
+}
+
+/** The eye-dome pass: takes points drawn into `target`, and paints them shaded, with their depth, onto the canvas. */
+export class EyeDome {
+  readonly target = new WebGLRenderTarget(1, 1, {
+    type: UnsignedByteType,
+    minFilter: NearestFilter,
+    magFilter: NearestFilter,
+    depthTexture: new DepthTexture(1, 1, FloatType),
+  });
+  readonly #material = new RawShaderMaterial({
+    glslVersion: GLSL3,
+    vertexShader: PASS_VERTEX,
+    fragmentShader: PASS_FRAGMENT,
+    depthFunc: 7, // AlwaysDepth, for it brings the depth of the points
+    uniforms: {
+      colours: { value: this.target.texture },
+      depths: { value: this.target.depthTexture },
+      planes: { value: new Vector2() },
+      area: { value: new Vector4() },
+      backLow: { value: new Color() },
+      backHigh: { value: new Color() },
+      radius: { value: 1.4 },
+      strength: { value: 22 },
+    },
+  });
+  readonly #pass = new Group();
+  readonly #camera = new OrthographicCamera();
+
+  constructor() {
+    const mesh = new Mesh(new PlaneGeometry(2, 2), this.#material);
+    mesh.frustumCulled = false;
+    this.#pass.add(mesh);
+  }
+
+  /** Paint the rectangle `area` (left, bottom, right, top; pixels) of the target onto the canvas. */
+  paint(renderer: WebGLRenderer, camera: PerspectiveCamera, area: Vector4, pixelRatio: number): void {
+    const { planes, area: shown, radius } = this.#material.uniforms as Record<string, { value: never }>;
+    (planes as { value: Vector2 }).value.set(camera.near, camera.far);
+    (shown as { value: Vector4 }).value.copy(area);
+    (radius as { value: number }).value = 1.4 * pixelRatio;
+    renderer.render(this.#pass, this.#camera);
+  }
+
+  /** Take the colours of a theme, here and for all points. */
+  setTheme(theme: Theme, points: PointUniforms): void {
+    const palette = PALETTES[theme];
+    points.low.value.set(palette.low);
+    points.middle.value.set(palette.middle);
+    points.high.value.set(palette.high);
+    points.back.value.set(palette.backLow);
+    (this.#material.uniforms["backLow"] as { value: Color }).value.set(palette.backLow);
+    (this.#material.uniforms["backHigh"] as { value: Color }).value.set(palette.backHigh);
+  }
+
+  dispose(): void {
+    this.target.depthTexture?.dispose();
+    this.target.dispose();
+    this.#material.dispose();
+  }
+}
