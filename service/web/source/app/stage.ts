@@ -27,13 +27,13 @@ export class Stage {
     return this.#scene;
   }
 
-  /** Make a scene in an element, or end it where there is none any more. */
-  attach(container: HTMLElement | null): void {
+  /** Make a scene in an element, or end it where there is none any more; the same function for every drawing. */
+  readonly attach = (container: HTMLElement | null): void => {
     if (container === this.#container) return;
     this.#end();
     this.#container = container;
     if (container) void this.#begin(container);
-  }
+  };
 
   async #begin(container: HTMLElement): Promise<void> {
     try {

@@ -39,7 +39,7 @@ export function MapPage(props: Props) {
     <main id="main" class={`map panel-${state.panel} ${details ? "with-details" : ""}`} tabIndex={-1}>
       <Panel {...props} />
       <section class="stage" aria-label="3D view of the map">
-        <div class="canvas" ref={(element) => stage.attach(element)} />
+        <div class="canvas" ref={stage.attach} />
         <Over {...props} />
       </section>
       <Timeline {...props} />
