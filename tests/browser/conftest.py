@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,7 +12,8 @@ import pytest
 from playwright.sync_api import Browser
 
 from service.settings import Settings
-from tests.support.browser import started_browser, watched_page
+from service.web.pages import BUILT
+from tests.support.browser import NOT_BUILT, started_browser, watched_page
 from tests.support.live import Live, live
 from tests.support.viewer_data import ViewerData, made
 from tests.support.viewer_page import Opener, ViewerPage
@@ -20,13 +22,20 @@ from worker.detectors.card import MODEL_STORE
 
 @pytest.fixture(scope="session")
 def viewer_data(tmp_path_factory: pytest.TempPathFactory) -> ViewerData:
-    """Made once in a run of the tests, by whichever of their processes comes first; nobody writes into it."""
+    """Made once in a run of the tests, by whichever of their processes comes first; nobody writes into it.
+
+    SPICD_TEST_VIEWER_DATA names a folder in which they stay for the next run.
+    """
+    if kept := os.environ.get("SPICD_TEST_VIEWER_DATA"):
+        return made(Path(kept))
     own = tmp_path_factory.getbasetemp()
     return made((own.parent if own.name.startswith("popen-") else own) / "viewer")
 
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
+    if not (BUILT / "index.html").exists():
+        pytest.skip(NOT_BUILT)
     with started_browser() as browser:
         yield browser
 

@@ -29,6 +29,7 @@ ARGUMENTS = (
     "--disable-sync",
     "--no-first-run",
 )
+NOT_BUILT = "no viewer is built here: `make web` builds it"
 WAITS_S = 30.0  #: for what a page shall come to show, on a busy machine
 
 #: Violations of the Content-Security-Policy as errors of the console, with what was refused.

@@ -13,6 +13,9 @@ from numpy.typing import NDArray
 from playwright.sync_api import Page
 
 from tests.support.browser import WAITS_S, Watch
+from worker.pipeline.results.object_marks import color_of_kind
+
+_GREY = 0.45  #: saturation; that of the heights' colours is below it
 
 Pixels = NDArray[np.uint8]  #: (height, width, 3) red, green, blue
 
@@ -24,8 +27,7 @@ _PIXELS = """() => {
   return { width, height, rgba: btoa(text) };
 }"""
 _SEEN = "(point) => window.spicd.scene.project(point)"
-#: Of each layer whether its cloud has come, as the page says it.
-_DRAWN = "() => window.spicd?.scene.extent !== null && window.spicd?.scene.extent !== undefined"
+_DRAWN = "() => Boolean(window.spicd?.scene.extent) && !document.querySelector('.over-middle')"
 
 
 @dataclass
@@ -47,7 +49,7 @@ class ViewerPage:
         return value
 
     def drawn(self) -> ViewerPage:
-        """Wait for the first cloud."""
+        """Wait until every cloud that is asked for has come, which the page tells by saying no more that it loads."""
         self.until(_DRAWN)
         return self
 
@@ -63,6 +65,45 @@ class ViewerPage:
         place = self.page.evaluate(_SEEN, list(point))
         assert place is not None, f"{point} is out of sight"
         return float(place[0]), float(place[1])
+
+    def area_of(self, box: Sequence[Sequence[float]]) -> tuple[slice, slice]:
+        """Return the rows and columns of the pixels that lie within the outline of a box (2, 3), metres."""
+        ratio = self.page.evaluate("devicePixelRatio")
+        corners = [[box[bits & 1][0], box[bits >> 1 & 1][1], box[bits >> 2][2]] for bits in range(8)]
+        places = np.array([self.seen_at(corner) for corner in corners]) * ratio
+        (left, top), (right, bottom) = np.floor(places.min(axis=0)), np.ceil(places.max(axis=0))
+        return slice(max(int(top), 0), int(bottom) + 1), slice(max(int(left), 0), int(right) + 1)
+
+    def share(self, kind: str, box: Sequence[Sequence[float]], pixels: Pixels | None = None) -> float:
+        """Return which share of the pixels within the outline of a box (2, 3) has the colour of a kind.
+
+        The pixels are those of now, where none are given.
+        """
+        rows, columns = self.area_of(box)
+        shown = self.pixels() if pixels is None else pixels
+        return float(is_of_kind(shown[rows, columns], kind).mean())
+
+
+def is_of_kind(pixels: Pixels, kind: str) -> NDArray[np.bool_]:
+    """Tell of pixels (..., 3) which have the hue of a kind, however light or dark the shading made them."""
+    wanted = _hue(np.array(color_of_kind(kind)) * 255)[0]
+    hue, saturation = _hue(pixels.astype(np.float64))
+    away = np.abs((hue - wanted + 180) % 360 - 180)
+    strong: NDArray[np.bool_] = (away < 12) & (saturation > _GREY)
+    return strong
+
+
+def _hue(colours: NDArray[np.float64]) -> tuple[Any, Any]:
+    """Return hue, degrees, and saturation, 0..1, of (..., 3) red, green, blue."""
+    red, green, blue = np.moveaxis(colours, -1, 0)
+    high, low = colours.max(axis=-1), colours.min(axis=-1)
+    span = np.maximum(high - low, 1e-9)
+    sector = np.where(
+        high == red,
+        (green - blue) / span,
+        np.where(high == green, 2 + (blue - red) / span, 4 + (red - green) / span),
+    )
+    return sector * 60 % 360, (high - low) / np.maximum(high, 1e-9)
 
 
 Opener = Callable[..., ViewerPage]  #: opens a page of the viewer: the fixture `opened`
