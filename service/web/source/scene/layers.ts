@@ -3,6 +3,7 @@
 import { Box3, BufferAttribute, BufferGeometry, Group, Matrix4, Points, Sphere, Vector3 } from "three";
 import type { PerspectiveCamera, RawShaderMaterial, WebGLRenderer } from "three";
 
+import { holds, solidOf } from "./boxes.ts";
 import { KIND_COLOURS, bytesOf } from "./colours.ts";
 import type { Levels } from "./heights.ts";
 import { readPly } from "./ply.ts";
@@ -10,7 +11,9 @@ import { MARKED, cloudOf } from "./points.ts";
 import type { DrawnPoints } from "./points.ts";
 import { pointMaterial } from "./shading.ts";
 import type { PointUniforms } from "./shading.ts";
-import type { Box, CloudSource, Mark } from "./types.ts";
+import type { Box, CloudSource, Mark, Point } from "./types.ts";
+
+const NEARLY = 0.05; // metres that a point of an object may lie outside of its box
 
 /** A layer that is loaded. */
 export interface LoadedLayer {
@@ -134,9 +137,10 @@ class Part {
     if (tints === null || this.#kinds === null || this.#marked.length === 0) return;
     const words = new Uint32Array(tints.buffer);
     const moved = new Uint32Array(new Uint8Array([...bytesOf(KIND_COLOURS["moved"] ?? "#000000"), MARKED]).buffer)[0] as number;
-    const boxes = marks.flatMap(({ box, from }) => (from === undefined ? [box] : [box, from]));
+    const solids = marks.flatMap(({ box, from }) => (from === undefined ? [box] : [box, from])).map((box) => solidOf(box, NEARLY));
     for (const row of this.#marked) {
-      words[row] = boxes.some((box) => holds(box, positions, 3 * row)) ? moved : (this.#kinds[row] as number);
+      const [x, y, z] = positions.subarray(3 * row, 3 * row + 3) as unknown as Point;
+      words[row] = solids.some((solid) => holds(solid, x, y, z)) ? moved : (this.#kinds[row] as number);
     }
     const attribute = this.#geometry.getAttribute("tint");
     attribute.needsUpdate = true;
@@ -146,15 +150,6 @@ class Part {
     this.#geometry.dispose();
     this.#material.dispose();
   }
-}
-
-/** Tell whether a box holds a point, or nearly (5 cm). */
-function holds({ min, max }: Box, positions: Float32Array, at: number): boolean {
-  for (let axis = 0; axis < 3; axis++) {
-    const value = positions[at + axis] as number;
-    if (value < (min[axis] as number) - 0.05 || value > (max[axis] as number) + 0.05) return false;
-  }
-  return true;
 }
 
 /** Return the upright box around a box that was transformed. */

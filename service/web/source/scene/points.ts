@@ -1,13 +1,14 @@
 /** From what a file holds to what is drawn: order, colours by kind, spacing, what was lost. No three.js here. */
 
-import { KIND_COLOURS, POINT_COLOURS, STATE_COLOURS, bytesOf } from "./colours.ts";
+import { KIND_COLOURS, MOVING_COLOUR, STATE_COLOURS, bytesOf } from "./colours.ts";
 import { boundsOf, levelsOf } from "./heights.ts";
 import type { Levels } from "./heights.ts";
 import type { PlyPoints } from "./ply.ts";
 import type { Box } from "./types.ts";
 
-/** Alpha of a tint: the point takes the colour of its height, is of an object, or brings a colour of its own. */
+/** Alpha of a tint: the point takes the colour of its height, a faint one, that of its object, or one that it brings. */
 export const RAMP = 0;
+export const FAINT = 64;
 export const MARKED = 128;
 export const OWN = 255;
 
@@ -16,7 +17,7 @@ export interface DrawnPoints {
   n: number;
   /** x y z each, metres. */
   positions: Float32Array;
-  /** Red, green, blue, and RAMP, MARKED or OWN; null: all by their height. */
+  /** Red, green, blue, and RAMP, FAINT, MARKED or OWN; null: all by their height. */
   tints: Uint8Array | null;
 }
 
@@ -117,8 +118,8 @@ function kindTints(): Uint32Array {
     ["#000000", RAMP],
     [KIND_COLOURS["appeared"], MARKED],
     [KIND_COLOURS["disappeared"], MARKED],
-    [POINT_COLOURS.notJudged, OWN],
-    [POINT_COLOURS.moving, OWN],
+    ["#000000", FAINT],
+    [MOVING_COLOUR, OWN],
   ]);
 }
 

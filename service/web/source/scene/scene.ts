@@ -4,6 +4,7 @@ import "./scene.css";
 
 import { ColorManagement, LinearSRGBColorSpace, MathUtils, Scene as Group, Vector4, WebGLRenderer } from "three";
 
+import { around, grown } from "./boxes.ts";
 import { Rig } from "./camera.ts";
 import { FileLayer, fetchWhole } from "./layers.ts";
 import type { LoadedLayer } from "./layers.ts";
@@ -15,6 +16,7 @@ type Event = "pick" | "view" | "drawn";
 type Listener = (id: string | null) => void;
 
 const CLICK = 5; // CSS pixels that a pointer may go for it to be a click
+const AROUND = 1; // metres around what is flown to
 const REST_MS = 180; // without a change: the camera has come to rest
 const SMOOTH_MS = 40; // of a frame, aimed at while the camera moves
 const MOST_PIXEL_RATIO = 2;
@@ -127,9 +129,8 @@ export class Scene {
   }
 
   flyTo(box: Box): void {
-    const around = grown(box, 1.2);
     this.#viewChosen = true;
-    this.#rig.fly(this.#rig.viewOf(around, "here"), this.#frameMs);
+    this.#rig.fly(this.#rig.viewOf(grown(box, AROUND), "here"), this.#frameMs);
   }
 
   topDown(): void {
@@ -149,7 +150,7 @@ export class Scene {
   /** Bounds of what is loaded. */
   get extent(): Box | null {
     const boxes = [...this.#layers.values()].map(({ bounds }) => bounds);
-    return boxes.length === 0 ? null : boxes.reduce(around);
+    return boxes.length === 0 ? null : around(boxes);
   }
 
   /** Return a height just under the ceiling, by the histogram of heights; null where there is no ceiling. */
@@ -377,14 +378,4 @@ export class Scene {
     const ray = this.#rig.rayThrough(((x - frame.left - left) / width) * 2 - 1, 1 - ((y - frame.top) / frame.height) * 2);
     this.#emit("pick", this.#marks.pick(ray));
   }
-}
-
-function grown({ min, max }: Box, margin: number): Box {
-  return { min: min.map((value) => value - margin) as Point, max: max.map((value) => value + margin) as Point };
-}
-
-/** Return the box around two. */
-function around(a: Box, b: Box): Box {
-  const pairs = (one: Point, other: Point, pick: (x: number, y: number) => number) => one.map((value, axis) => pick(value, other[axis] as number)) as Point;
-  return { min: pairs(a.min, b.min, Math.min), max: pairs(a.max, b.max, Math.max) };
 }

@@ -4,6 +4,7 @@
  */
 
 import {
+  AlwaysDepth,
   Color,
   DepthTexture,
   FloatType,
@@ -65,10 +66,11 @@ void main() {
   }
   float height = clamp((world.z - ramp.x) / max(ramp.y - ramp.x, 0.1), 0.0, 1.0);
   colour = height < 0.5 ? mix(low, middle, 2.0 * height) : mix(middle, high, 2.0 * height - 1.0);
-  float size = 1.35;
+  float size = 1.55;
 #ifdef TINTED
   if (tint.a > 0.75) colour = tint.rgb;
-  else if (tint.a > 0.25) { colour = tint.rgb; size = 1.6; }
+  else if (tint.a > 0.4) { colour = tint.rgb; size = 1.9; }
+  else if (tint.a > 0.1) colour = mix(colour, back, 0.5);
 #endif
   if (dim > 0.0 && !inside(world.xyz, chosen[0], chosen[1]) && !inside(world.xyz, chosen[2], chosen[3])) {
     colour = mix(colour, back, 0.55 * dim);
@@ -168,7 +170,7 @@ export class EyeDome {
     glslVersion: GLSL3,
     vertexShader: PASS_VERTEX,
     fragmentShader: PASS_FRAGMENT,
-    depthFunc: 7, // AlwaysDepth, for it brings the depth of the points
+    depthFunc: AlwaysDepth, // it brings the depth of the points
     uniforms: {
       colours: { value: this.target.texture },
       depths: { value: this.target.depthTexture },
@@ -177,7 +179,7 @@ export class EyeDome {
       backLow: { value: new Color() },
       backHigh: { value: new Color() },
       radius: { value: 1.4 },
-      strength: { value: 22 },
+      strength: { value: 14 },
     },
   });
   readonly #pass = new Group();
