@@ -6,6 +6,8 @@ import { fileURLToPath } from "node:url";
 
 import { build } from "esbuild";
 
+import { unusedShaders } from "./shaders.mjs";
+
 const SOURCE = dirname(fileURLToPath(import.meta.url));
 const BUILT = join(SOURCE, "..", "built");
 const MAKING = `${BUILT}.making`;
@@ -49,6 +51,7 @@ const { metafile } = await build({
   target: "es2022",
   minify: true,
   metafile: true,
+  plugins: [unusedShaders],
   legalComments: "none", // all licences are in licences.txt
   logLevel: "warning",
 });

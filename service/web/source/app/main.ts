@@ -1,8 +1,17 @@
 /** Starts the page. */
 
-import "./main.css";
+import "./styles/main.css";
 
-import { Scene } from "../scene/scene.ts";
+import { h, render } from "preact";
+
+import { Api } from "./api.ts";
+import { Controller } from "./controller.ts";
+import { listen } from "./keys.ts";
+import { listenForDrops } from "./drops.ts";
+import { shownTheme, Stage } from "./stage.ts";
+import { Page } from "./views/page.tsx";
+
+import type { Scene } from "../scene/scene.ts";
 
 declare global {
   interface Window {
@@ -10,6 +19,21 @@ declare global {
   }
 }
 
-const container = document.createElement("main");
-document.body.append(container);
-window.spicd = { scene: new Scene(container, { fetch: (...given) => fetch(...given) }) };
+const root = document.createElement("div");
+root.id = "app";
+document.body.append(root);
+
+const app = new Controller(new Api(document.baseURI), (state) => {
+  document.documentElement.dataset["theme"] = shownTheme(state);
+  const name = state.map.value?.name ?? state.place.map;
+  document.title = name ? `${name} · SPICD` : "SPICD";
+  render(h(Page, { app, stage, state }), root);
+  stage.sync(state);
+});
+const stage = new Stage(app);
+
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => app.update({}));
+listen(app, stage);
+listenForDrops(app);
+app.update({});
+app.start();
