@@ -1,9 +1,10 @@
 /** A layer of 3D Tiles 1.1 (OGC 22-025r4): GLB points, of which as many are fetched as the eye can tell apart. */
 
 import { TilesRenderer } from "3d-tiles-renderer/three";
-import { Box3, BufferAttribute, Group, Matrix4, Points, Vector3 } from "three";
-import type { BufferGeometry, Object3D, PerspectiveCamera, RawShaderMaterial, WebGLRenderer } from "three";
+import { Box3, BufferAttribute, BufferGeometry, Group, Loader, Matrix4, Points, Vector3 } from "three";
+import type { Object3D, PerspectiveCamera, RawShaderMaterial, WebGLRenderer } from "three";
 
+import { readGlb } from "./glb.ts";
 import { boundsOf, levelsOf } from "./heights.ts";
 import type { Levels } from "./heights.ts";
 import { matrixOf, transformed } from "./layers.ts";
@@ -15,6 +16,7 @@ import type { Box, CloudSource, Layer } from "./types.ts";
 
 const NEIGHBOURS = 2.2; // pixels between points where all has come that is wanted
 const COARSE = 12; // pixels of a point while more is on its way
+/** Bytes of a picture of linear ones, which glTF has (Section 3.7.2.1). */
 const SRGB = Uint8Array.from({ length: 256 }, (_, byte) => 255 * encoded(byte / 255) + 0.5);
 
 interface Tile {
@@ -31,6 +33,7 @@ export async function openTileset(
   signal: AbortSignal | undefined,
 ): Promise<TilesetLayer> {
   const tiles = new TilesRenderer(new URL(source.url, document.baseURI).href);
+  tiles.manager.addHandler(/\.glb$/, new PointsLoader(layer, uniforms));
   tiles.registerPlugin({ name: "fetch", fetchData: (url: string, options: RequestInit) => fetched(url, options) });
   signal?.addEventListener("abort", () => tiles.dispose(), { once: true });
   await new Promise<void>((resolve, reject) => {
@@ -39,7 +42,31 @@ export async function openTileset(
     signal?.addEventListener("abort", () => reject(signal.reason), { once: true });
     tiles.update(); // asks for the root
   });
-  return new TilesetLayer(tiles, source, layer, uniforms, changed);
+  return new TilesetLayer(tiles, source, changed);
+}
+
+/** Makes points with our material of the content of a tile; the renderer of tiles asks it in place of three's own loader. */
+class PointsLoader extends Loader<unknown> {
+  readonly #layer: Layer;
+  readonly #uniforms: PointUniforms;
+
+  constructor(layer: Layer, uniforms: PointUniforms) {
+    super();
+    [this.#layer, this.#uniforms] = [layer, uniforms];
+  }
+
+  async parseAsync(file: ArrayBuffer): Promise<{ scene: Object3D }> {
+    const { positions, colours } = readGlb(file);
+    const geometry = new BufferGeometry();
+    geometry.setAttribute("position", new BufferAttribute(positions, 3));
+    if (colours !== null) {
+      const tints = tintsOfBytes(colours.map((byte) => SRGB[byte] as number), this.#layer);
+      geometry.setAttribute("tint", new BufferAttribute(tints, 4, true));
+    }
+    const scene = new Group();
+    scene.add(new Points(geometry, pointMaterial(this.#uniforms, 0.05, colours !== null)));
+    return { scene };
+  }
 }
 
 /** A tileset that is open; its points come and go with `update`. */
@@ -51,15 +78,12 @@ export class TilesetLayer implements LoadedLayer {
   levels: Levels;
   drawable = false;
   readonly #tiles: TilesRenderer;
-  readonly #uniforms: PointUniforms;
-  readonly #layer: Layer;
-  readonly #materials = new Map<Object3D, RawShaderMaterial>();
   readonly #parts = { value: 3 };
   readonly #cap = { value: COARSE };
   #share = 1;
 
-  constructor(tiles: TilesRenderer, source: CloudSource, layer: Layer, uniforms: PointUniforms, changed: () => void) {
-    [this.#tiles, this.#uniforms, this.#layer] = [tiles, uniforms, layer];
+  constructor(tiles: TilesRenderer, source: CloudSource, changed: () => void) {
+    this.#tiles = tiles;
     const matrix = matrixOf(source);
     this.bounds = transformed(rootBox(tiles), matrix);
     this.levels = { floor: this.bounds.min[2], ceiling: null };
@@ -74,7 +98,6 @@ export class TilesetLayer implements LoadedLayer {
       tiles.addEventListener("load-error", ({ error }) => reject(new Error(`the tileset cannot be had: ${error.message}`)));
     });
     this.ready.catch(() => {}); // whoever waits for it is told
-    tiles.addEventListener("dispose-model", ({ scene }) => this.#undress(scene));
     for (const event of ["needs-update", "tile-visibility-change", "tiles-load-end"] as const) tiles.addEventListener(event, changed);
   }
 
@@ -102,36 +125,19 @@ export class TilesetLayer implements LoadedLayer {
     this.#tiles.dispose();
   }
 
-  /** Give the points of a tile that has come our material. */
+  /** Say of the points of a tile that has come how large they are. */
   #dress(scene: Object3D, tile: Tile, matrix: Matrix4): void {
-    scene.updateMatrixWorld(true);
-    const all: Points<BufferGeometry>[] = [];
-    scene.traverse((object) => {
-      if (object instanceof Points) all.push(object);
-    });
-    for (const points of all) {
-      const geometry = points.geometry as BufferGeometry;
-      const tints = tintsOf(geometry, this.#layer);
-      if (tints !== null) geometry.setAttribute("tint", new BufferAttribute(tints, 4, true));
-      const leaf = tile.geometricError === 0;
-      const spacing = leaf || !this.drawable ? this.#measure(points, matrix) : tile.geometricError;
-      const material = pointMaterial(this.#uniforms, spacing, tints !== null);
-      material.uniforms["cap"] = leaf ? { value: LARGEST } : this.#cap;
-      material.uniforms["parts"] = this.#parts;
-      points.material = material;
-      this.#materials.set(points, material);
-    }
-  }
-
-  #undress(scene: Object3D): void {
-    scene.traverse((object) => {
-      this.#materials.get(object)?.dispose();
-      this.#materials.delete(object);
-    });
+    const points = scene.children[0];
+    if (!(points instanceof Points)) return;
+    const leaf = tile.geometricError === 0;
+    const spacing = leaf || !this.drawable ? this.#measure(points, matrix) : tile.geometricError;
+    const { uniforms } = points.material as RawShaderMaterial;
+    Object.assign(uniforms, { spacing: { value: spacing }, cap: leaf ? { value: LARGEST } : this.#cap, parts: this.#parts });
   }
 
   /** Return the spacing of a tile's points, metres; the first tile, a sample of all, tells floor and ceiling as well. */
   #measure(points: Points, matrix: Matrix4): number {
+    points.parent?.updateMatrixWorld(true);
     const place = new Matrix4().multiplyMatrices(matrix, points.matrixWorld);
     const given = points.geometry.getAttribute("position");
     const positions = new Float32Array(3 * given.count);
@@ -149,19 +155,6 @@ function rootBox(tiles: TilesRenderer): Box {
   const box = new Box3();
   if (!tiles.getBoundingBox(box)) throw new Error("the tileset does not tell where it is");
   return { min: box.min.toArray(), max: box.max.toArray() };
-}
-
-/** Return tints of colours, which glTF has linear (Section 3.7.2.1); null where there are none. */
-function tintsOf(geometry: BufferGeometry, layer: Layer): Uint8Array | null {
-  const colours = geometry.getAttribute("color");
-  if (colours === undefined) return null;
-  const bytes = new Uint8Array(3 * colours.count);
-  for (let i = 0; i < colours.count; i++) {
-    bytes[3 * i] = SRGB[Math.round(255 * colours.getX(i))] as number;
-    bytes[3 * i + 1] = SRGB[Math.round(255 * colours.getY(i))] as number;
-    bytes[3 * i + 2] = SRGB[Math.round(255 * colours.getZ(i))] as number;
-  }
-  return tintsOfBytes(bytes, layer);
 }
 
 /** IEC 61966-2-1, 0..1. */
