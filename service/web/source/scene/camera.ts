@@ -3,13 +3,15 @@
 import { MathUtils, PerspectiveCamera, Ray, Vector2, Vector3 } from "three";
 import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
 
+import { across, centreOf, sizeOf } from "./boxes.ts";
 import type { Box, Point, View } from "./types.ts";
 
 const FIELD_OF_VIEW = 45; // degrees, upright
 const FLIGHT_MS = 350;
 const TURN = Math.PI / 24; // a key press
 const AZIMUTH = -Math.PI * 0.36; // where the first view stands, from the middle of the map: south, and a bit east
-const ELEVATION = Math.PI * 0.27;
+const ELEVATION = Math.PI * 0.3;
+const STEEP = Math.PI * 0.31;
 
 /** Moves the camera; calls `changed` on each change, and `rested` when it has come to rest. */
 export class Rig {
@@ -61,11 +63,11 @@ export class Rig {
 
   /** Return the view that shows a box whole, from where the camera looks now, or from the first side. */
   viewOf(box: Box, from: "here" | "first" | "above"): View {
-    const target = new Vector3(...mid(box));
-    const half = new Vector3(...box.max).sub(new Vector3(...box.min)).multiplyScalar(0.5);
+    const target = new Vector3(...centreOf(box));
+    const half = new Vector3(...across(box)).multiplyScalar(0.5);
     const direction = this.#direction(from);
-    const across = Math.tan(MathUtils.degToRad(FIELD_OF_VIEW / 2));
-    const distance = Math.max(fitted(half, direction, across, this.camera.aspect) * 1.08, 2);
+    const slope = Math.tan(MathUtils.degToRad(FIELD_OF_VIEW / 2));
+    const distance = Math.max(fitted(half, direction, slope, this.camera.aspect) * 1.03, 2);
     return { position: target.clone().addScaledVector(direction, distance).toArray(), target: target.toArray() };
   }
 
@@ -121,7 +123,7 @@ export class Rig {
   /** Set the clipping planes around what there is, so that depths keep their precision. */
   clip(): void {
     const size = this.#extent === null ? 100 : sizeOf(this.#extent);
-    const away = this.#extent === null ? 10 : this.camera.position.distanceTo(new Vector3(...mid(this.#extent)));
+    const away = this.#extent === null ? 10 : this.camera.position.distanceTo(new Vector3(...centreOf(this.#extent)));
     this.camera.far = away + size;
     this.camera.near = Math.max(0.05, Math.min(away - size, this.camera.far / 100), this.camera.far / 4000);
     this.camera.updateProjectionMatrix();
@@ -131,7 +133,7 @@ export class Rig {
   #direction(from: "here" | "first" | "above"): Vector3 {
     if (from === "above") return new Vector3(0, -0.0001, 1).normalize();
     const here = this.camera.position.clone().sub(this.#controls.target);
-    if (from === "here" && here.lengthSq() > 0) return here.normalize();
+    if (from === "here" && here.lengthSq() > 0) return steep(here);
     const flat = Math.cos(ELEVATION);
     return new Vector3(flat * Math.cos(AZIMUTH), flat * Math.sin(AZIMUTH), Math.sin(ELEVATION));
   }
@@ -178,26 +180,23 @@ export class Rig {
   }
 }
 
+/** Return a direction, at least steep enough to look into a room over its walls. */
+function steep(direction: Vector3): Vector3 {
+  const flat = Math.hypot(direction.x, direction.y);
+  return direction.setZ(Math.max(direction.z, flat * Math.tan(STEEP))).normalize();
+}
+
 /** Return how far a box of these half sides has to be for all of its corners to be in the picture. */
-function fitted(half: Vector3, direction: Vector3, across: number, aspect: number): number {
+function fitted(half: Vector3, direction: Vector3, slope: number, aspect: number): number {
   const right = new Vector3(-direction.y, direction.x, 0).normalize();
   if (right.lengthSq() === 0) right.set(1, 0, 0);
   const up = direction.clone().cross(right);
   let distance = 0;
   for (let bits = 0; bits < 8; bits++) {
     const corner = new Vector3(bits & 1 ? half.x : -half.x, bits & 2 ? half.y : -half.y, bits & 4 ? half.z : -half.z);
-    const wide = Math.abs(corner.dot(right)) / (across * aspect);
-    const tall = Math.abs(corner.dot(up)) / across;
+    const wide = Math.abs(corner.dot(right)) / (slope * aspect);
+    const tall = Math.abs(corner.dot(up)) / slope;
     distance = Math.max(distance, Math.max(wide, tall) + corner.dot(direction));
   }
   return distance;
-}
-
-function mid({ min, max }: Box): Point {
-  return [(min[0] + max[0]) / 2, (min[1] + max[1]) / 2, (min[2] + max[2]) / 2];
-}
-
-/** Return the diagonal of a box, metres. */
-export function sizeOf({ min, max }: Box): number {
-  return Math.hypot(max[0] - min[0], max[1] - min[1], max[2] - min[2]);
 }

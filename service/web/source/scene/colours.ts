@@ -30,8 +30,8 @@ export function colourOfState(state: string): string {
   return STATE_COLOURS[state] ?? OTHER_COLOUR;
 }
 
-/** Of points that are of no object: `KIND_COLORS` in `worker/pipeline/results/export.py`. */
-export const POINT_COLOURS = { notJudged: "#d7d7d7", moving: "#f0e442" } as const;
+/** Of points that moved while the visit lasted: `PointKind.MOVING` in `worker/pipeline/results/export.py`. */
+export const MOVING_COLOUR = "#f0e442";
 
 /** Return red, green and blue, 0..255, of a colour `#rrggbb`. */
 export function bytesOf(colour: string): [number, number, number] {

@@ -3,6 +3,7 @@
 import { Box3, BufferAttribute, BufferGeometry, Group, Matrix4, Points, Sphere, Vector3 } from "three";
 import type { PerspectiveCamera, RawShaderMaterial, WebGLRenderer } from "three";
 
+import { holds, solidOf } from "./boxes.ts";
 import { KIND_COLOURS, bytesOf } from "./colours.ts";
 import type { Levels } from "./heights.ts";
 import { readPly } from "./ply.ts";
@@ -10,18 +11,24 @@ import { MARKED, cloudOf } from "./points.ts";
 import type { DrawnPoints } from "./points.ts";
 import { pointMaterial } from "./shading.ts";
 import type { PointUniforms } from "./shading.ts";
-import type { Box, CloudSource, Mark } from "./types.ts";
+import type { Box, CloudSource, Mark, Point } from "./types.ts";
+
+const NEARLY = 0.05; // metres that a point of an object may lie outside of its box
 
 /** A layer that is loaded. */
 export interface LoadedLayer {
-  /** What the visit saw. */
-  readonly present: Group;
-  /** Of a survey: what the map has and the survey has not; empty for others. */
-  readonly lost: Group;
+  readonly group: Group;
   readonly bounds: Box;
   readonly levels: Levels;
-  /** Fetch and drop parts for a camera and a picture of so many pixels; returns whether more will come. */
-  update(camera: PerspectiveCamera, renderer: WebGLRenderer): boolean;
+  /** Metres between neighbouring points; 0: they differ. */
+  readonly spacing: number;
+  /** Resolves once there are points to draw. */
+  readonly ready: Promise<void>;
+  readonly drawable: boolean;
+  /** Fetch and drop parts for what a camera sees. */
+  update(camera: PerspectiveCamera, renderer: WebGLRenderer): void;
+  /** Draw what the visit saw; and, of a survey, what the map has and the survey has not. */
+  show(present: boolean, lost: boolean): void;
   /** Draw a part of the points alone, 0..1. */
   thin(share: number): void;
   /** Paint the points of objects that were moved as such. */
@@ -67,10 +74,14 @@ function joined(pieces: Uint8Array[], bytes: number): ArrayBuffer {
 
 /** The cloud of one PLY file. */
 export class FileLayer implements LoadedLayer {
-  readonly present = new Group();
-  readonly lost = new Group();
+  readonly group = new Group();
   readonly bounds: Box;
   readonly levels: Levels;
+  readonly spacing: number;
+  readonly ready = Promise.resolve();
+  readonly drawable = true;
+  readonly #present = new Group();
+  readonly #lost = new Group();
   readonly #parts: Part[];
 
   constructor(file: ArrayBuffer, source: CloudSource, uniforms: PointUniforms) {
@@ -78,16 +89,18 @@ export class FileLayer implements LoadedLayer {
     const matrix = matrixOf(source);
     this.bounds = transformed(cloud.bounds, matrix);
     this.levels = cloud.levels;
-    const parts = [[cloud.present, this.present], [cloud.lost, this.lost]] as const;
+    this.spacing = cloud.spacing;
+    const parts = [[cloud.present, this.#present], [cloud.lost, this.#lost]] as const;
     this.#parts = parts.flatMap(([points, group]) => (points === null ? [] : [new Part(points, cloud.spacing, cloud.bounds, group, uniforms)]));
-    for (const group of [this.present, this.lost]) {
-      group.matrixAutoUpdate = false;
-      group.matrix.copy(matrix);
-    }
+    this.group.add(this.#present, this.#lost);
+    this.group.matrixAutoUpdate = false;
+    this.group.matrix.copy(matrix);
   }
 
-  update(): boolean {
-    return false;
+  update(): void {}
+
+  show(present: boolean, lost: boolean): void {
+    [this.#present.visible, this.#lost.visible] = [present, lost];
   }
 
   thin(share: number): void {
@@ -134,9 +147,10 @@ class Part {
     if (tints === null || this.#kinds === null || this.#marked.length === 0) return;
     const words = new Uint32Array(tints.buffer);
     const moved = new Uint32Array(new Uint8Array([...bytesOf(KIND_COLOURS["moved"] ?? "#000000"), MARKED]).buffer)[0] as number;
-    const boxes = marks.flatMap(({ box, from }) => (from === undefined ? [box] : [box, from]));
+    const solids = marks.flatMap(({ box, from }) => (from === undefined ? [box] : [box, from])).map((box) => solidOf(box, NEARLY));
     for (const row of this.#marked) {
-      words[row] = boxes.some((box) => holds(box, positions, 3 * row)) ? moved : (this.#kinds[row] as number);
+      const [x, y, z] = positions.subarray(3 * row, 3 * row + 3) as unknown as Point;
+      words[row] = solids.some((solid) => holds(solid, x, y, z)) ? moved : (this.#kinds[row] as number);
     }
     const attribute = this.#geometry.getAttribute("tint");
     attribute.needsUpdate = true;
@@ -146,15 +160,6 @@ class Part {
     this.#geometry.dispose();
     this.#material.dispose();
   }
-}
-
-/** Tell whether a box holds a point, or nearly (5 cm). */
-function holds({ min, max }: Box, positions: Float32Array, at: number): boolean {
-  for (let axis = 0; axis < 3; axis++) {
-    const value = positions[at + axis] as number;
-    if (value < (min[axis] as number) - 0.05 || value > (max[axis] as number) + 0.05) return false;
-  }
-  return true;
 }
 
 /** Return the upright box around a box that was transformed. */

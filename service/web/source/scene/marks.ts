@@ -17,6 +17,8 @@ import {
 } from "three";
 import type { DepthModes, PerspectiveCamera, Ray, WebGLRenderer } from "three";
 
+import { centreOf, edgesOf, entryOf, solidOf } from "./boxes.ts";
+import type { Solid } from "./boxes.ts";
 import { colourOfKind, colourOfState } from "./colours.ts";
 import type { Box, Mark, Point, TileMark } from "./types.ts";
 
@@ -26,6 +28,7 @@ const AFTER = 2;
 const BOTH = BEFORE | AFTER;
 
 const MARGIN = 0.04; // metres between an object and its outline
+const HIDDEN = 0.25; // of its strength, of what is behind something
 const DIMMED = 0.25; // of its strength, of what is not selected
 
 interface Line {
@@ -40,7 +43,7 @@ interface Line {
 }
 
 interface Face {
-  box: Box;
+  solid: Solid;
   colour: string;
   alpha: number;
   sides: number;
@@ -98,14 +101,15 @@ precision highp float;
 uniform mat4 viewMatrix, projectionMatrix;
 uniform int side;
 in vec3 position;
-in vec3 least, most;
+in vec3 centre, reach;
 in vec4 tone;
-in float sides;
+in vec2 style;
 out vec4 colour;
 void main() {
-  gl_Position = (int(sides) & side) == 0
-    ? vec4(2.0, 2.0, 2.0, 1.0)
-    : projectionMatrix * viewMatrix * vec4(mix(least, most, position), 1.0);
+  float c = cos(style.x), s = sin(style.x);
+  vec3 corner = reach * (2.0 * position - 1.0);
+  vec4 world = vec4(centre + vec3(c * corner.x - s * corner.y, s * corner.x + c * corner.y, corner.z), 1.0);
+  gl_Position = (int(style.y) & side) == 0 ? vec4(2.0, 2.0, 2.0, 1.0) : projectionMatrix * viewMatrix * world;
   colour = tone;
 }`;
 
@@ -121,22 +125,15 @@ export class Marks {
   #tiles: TileMark[] = [];
   #selected: string | null = null;
   readonly #group = new Group();
-  readonly #lines = new InstancedBufferGeometry();
-  readonly #faces = new InstancedBufferGeometry();
   readonly #shared = { size: { value: new Vector2() }, ratio: { value: 1 }, side: { value: BOTH } };
-  readonly #materials: RawShaderMaterial[];
+  readonly #meshes: Mesh<InstancedBufferGeometry, RawShaderMaterial>[];
 
   constructor() {
-    this.#lines.setAttribute("corner", new BufferAttribute(new Float32Array([0, -1, 1, -1, 1, 1, 0, 1]), 2));
-    this.#lines.setIndex([0, 1, 2, 0, 2, 3]);
-    this.#faces.setAttribute("position", new BufferAttribute(cube(), 3));
-    this.#faces.setIndex(CUBE_FACES);
-    const [hidden, seen, filled] = [this.#lineMaterial(GreaterDepth, 0.22), this.#lineMaterial(LessEqualDepth, 1), this.#faceMaterial()];
-    this.#materials = [hidden, seen, filled];
-    for (const [geometry, material] of [[this.#faces, filled], [this.#lines, hidden], [this.#lines, seen]] as const) {
-      const mesh = new Mesh(geometry, material);
+    const materials = [this.#faceMaterial(), this.#lineMaterial(GreaterDepth, HIDDEN), this.#lineMaterial(LessEqualDepth, 1)];
+    this.#meshes = materials.map((material) => new Mesh(new InstancedBufferGeometry(), material));
+    for (const [order, mesh] of this.#meshes.entries()) {
       mesh.frustumCulled = false;
-      mesh.renderOrder = this.#group.children.length;
+      mesh.renderOrder = order;
       this.#group.add(mesh);
     }
     this.#rebuild();
@@ -185,15 +182,20 @@ export class Marks {
   }
 
   dispose(): void {
-    for (const part of [this.#lines, this.#faces, ...this.#materials]) part.dispose();
+    for (const { geometry, material } of this.#meshes) [geometry, material].map((part) => part.dispose());
   }
 
   #rebuild(): void {
     const strength = (id: string) => (this.#selected === null || this.#selected === id ? 1 : DIMMED);
     const marks = this.#marks.map((mark) => partsOf(mark, strength(mark.id), mark.id === this.#selected));
     const tiles = this.#tiles.map((tile) => partsOfTile(tile, strength(tile.id), tile.id === this.#selected));
-    fillLines(this.#lines, [...tiles, ...marks].flatMap(({ lines }) => lines));
-    fillFaces(this.#faces, [...tiles, ...marks].flatMap(({ faces }) => faces));
+    const faces = facesOf([...tiles, ...marks].flatMap((part) => part.faces));
+    const lines = linesOf([...tiles, ...marks].flatMap((part) => part.lines));
+    for (const [i, mesh] of this.#meshes.entries()) {
+      mesh.geometry.dispose(); // a renderer keeps how many instances a geometry had first
+      mesh.geometry = i === 0 ? faces : lines;
+      mesh.visible = mesh.geometry.instanceCount > 0;
+    }
   }
 
   #lineMaterial(depthFunc: DepthModes, strength: number): RawShaderMaterial {
@@ -234,11 +236,11 @@ function partsOf({ box, kind, from, muted }: Mark, strength: number, selected: b
   const [width, fill] = selected ? [3.5, 0.22] : [2, 0.1];
   const gone = kind === "disappeared";
   const sides = gone ? BEFORE : kind === "appeared" || from !== undefined ? AFTER : BOTH;
-  const now = outline(box, MARGIN).map((edge) => ({ ...edge, colour, alpha, width, dashed: gone, sides }));
-  const faces: Face[] = [{ box, colour, alpha: fill * alpha, sides }];
+  const now = edgesOf(solidOf(box, MARGIN)).map((edge) => ({ ...edge, colour, alpha, width, dashed: gone, sides }));
+  const faces: Face[] = [{ solid: solidOf(box, MARGIN), colour, alpha: fill * alpha, sides }];
   if (from === undefined) return { lines: now, faces };
-  const before = outline(from, MARGIN).map((edge) => ({ ...edge, colour, alpha, width, dashed: true, sides: BEFORE }));
-  const way: Line = { start: centre(from), end: centre(box), colour, alpha, width, dashed: true, sides: BOTH };
+  const before = edgesOf(solidOf(from, MARGIN)).map((edge) => ({ ...edge, colour, alpha, width, dashed: true, sides: BEFORE }));
+  const way: Line = { start: centreOf(from), end: centreOf(box), colour, alpha, width, dashed: true, sides: BOTH };
   return { lines: [...now, ...before, way], faces };
 }
 
@@ -248,38 +250,32 @@ function partsOfTile({ box, state, score }: TileMark, strength: number, selected
   const colour = colourOfState(state);
   const alpha = strength * (state === "changed" ? 0.5 + 0.5 * (score ?? 0.5) : 0.5);
   const [width, fill] = selected ? [3, 0.16] : [1.2, 0.06];
-  const lines = outline(box, -0.02).map((edge) => ({ ...edge, colour, alpha, width, dashed: state !== "changed", sides: BOTH }));
-  return { lines, faces: [{ box, colour, alpha: fill * alpha, sides: BOTH }] };
+  const lines = edgesOf(solidOf(box, -0.02)).map((edge) => ({ ...edge, colour, alpha, width, dashed: state !== "changed", sides: BOTH }));
+  return { lines, faces: [{ solid: solidOf(box, -0.02), colour, alpha: fill * alpha, sides: BOTH }] };
 }
 
-/** Return the 12 edges of a box that is `margin` metres larger on each side. */
-function outline({ min, max }: Box, margin: number): { start: Point; end: Point }[] {
-  const corner = (bits: number): Point => [0, 1, 2].map((axis) => ((bits >> axis) & 1 ? max[axis]! + margin : min[axis]! - margin)) as Point;
-  const edges: { start: Point; end: Point }[] = [];
-  for (let bits = 0; bits < 8; bits++) {
-    for (const axis of [1, 2, 4]) if ((bits & axis) === 0) edges.push({ start: corner(bits), end: corner(bits | axis) });
-  }
-  return edges;
-}
-
-function centre({ min, max }: Box): Point {
-  return [(min[0] + max[0]) / 2, (min[1] + max[1]) / 2, (min[2] + max[2]) / 2];
-}
-
-function fillLines(geometry: InstancedBufferGeometry, lines: Line[]): void {
+function linesOf(lines: Line[]): InstancedBufferGeometry {
+  const geometry = new InstancedBufferGeometry();
+  geometry.setAttribute("corner", new BufferAttribute(new Float32Array([0, -1, 1, -1, 1, 1, 0, 1]), 2));
+  geometry.setIndex([0, 1, 2, 0, 2, 3]);
   fill(geometry, "start", 3, lines.map(({ start }) => start));
   fill(geometry, "end", 3, lines.map(({ end }) => end));
   fill(geometry, "tone", 4, lines.map(({ colour, alpha }) => toneOf(colour, alpha)));
   fill(geometry, "style", 3, lines.map(({ width, dashed, sides }) => [width, dashed ? 1 : 0, sides]));
   geometry.instanceCount = lines.length;
+  return geometry;
 }
 
-function fillFaces(geometry: InstancedBufferGeometry, faces: Face[]): void {
-  fill(geometry, "least", 3, faces.map(({ box }) => box.min));
-  fill(geometry, "most", 3, faces.map(({ box }) => box.max));
+function facesOf(faces: Face[]): InstancedBufferGeometry {
+  const geometry = new InstancedBufferGeometry();
+  geometry.setAttribute("position", new BufferAttribute(cube(), 3));
+  geometry.setIndex(CUBE_FACES);
+  fill(geometry, "centre", 3, faces.map(({ solid }) => solid.centre));
+  fill(geometry, "reach", 3, faces.map(({ solid }) => solid.half));
   fill(geometry, "tone", 4, faces.map(({ colour, alpha }) => toneOf(colour, alpha)));
-  fill(geometry, "sides", 1, faces.map(({ sides }) => [sides]));
+  fill(geometry, "style", 2, faces.map(({ solid, sides }) => [solid.yaw, sides]));
   geometry.instanceCount = faces.length;
+  return geometry;
 }
 
 /** Put the values of each instance into an attribute, of which at least one entry stands there (WebGL wants a buffer). */
@@ -294,32 +290,14 @@ function toneOf(colour: string, alpha: number): number[] {
   return [r, g, b, alpha];
 }
 
-/** Return the id of the box, `margin` metres larger on each side, that a ray meets first; null: of none (slab test). */
+/** Return the id of the box, `margin` metres larger on each side, that a ray meets first; null: of none. */
 function nearest(ray: Ray, boxes: { id: string; box: Box }[], margin: number): string | null {
   let [best, distance]: [string | null, number] = [null, Infinity];
-  const [origin, direction] = [ray.origin.toArray(), ray.direction.toArray()];
   for (const { id, box } of boxes) {
-    const near = entry(origin, direction, box, margin);
+    const near = entryOf(solidOf(box, margin), ray.origin.toArray(), ray.direction.toArray());
     if (near !== null && near < distance) [best, distance] = [id, near];
   }
   return best;
-}
-
-/** Return how far along a ray it enters a box (0 where it begins inside); null where it misses. */
-function entry(origin: number[], direction: number[], { min, max }: Box, margin: number): number | null {
-  let [near, far] = [0, Infinity];
-  for (let axis = 0; axis < 3; axis++) {
-    const [from, along] = [origin[axis] as number, direction[axis] as number];
-    const [low, high] = [(min[axis] as number) - margin, (max[axis] as number) + margin];
-    if (along === 0) {
-      if (from < low || from > high) return null;
-      continue;
-    }
-    const [a, b] = [(low - from) / along, (high - from) / along];
-    near = Math.max(near, Math.min(a, b));
-    far = Math.min(far, Math.max(a, b));
-  }
-  return near <= far ? near : null;
 }
 
 function cube(): Float32Array {

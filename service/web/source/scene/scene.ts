@@ -4,6 +4,7 @@ import "./scene.css";
 
 import { ColorManagement, LinearSRGBColorSpace, MathUtils, Scene as Group, Vector4, WebGLRenderer } from "three";
 
+import { around, grown } from "./boxes.ts";
 import { Rig } from "./camera.ts";
 import { FileLayer, fetchWhole } from "./layers.ts";
 import type { LoadedLayer } from "./layers.ts";
@@ -15,6 +16,7 @@ type Event = "pick" | "view" | "drawn";
 type Listener = (id: string | null) => void;
 
 const CLICK = 5; // CSS pixels that a pointer may go for it to be a click
+const AROUND = 1; // metres around what is flown to
 const REST_MS = 180; // without a change: the camera has come to rest
 const SMOOTH_MS = 40; // of a frame, aimed at while the camera moves
 const MOST_PIXEL_RATIO = 2;
@@ -79,17 +81,19 @@ export class Scene {
   async load(layer: Layer, source: CloudSource, progress: (share: number) => void, signal?: AbortSignal): Promise<void> {
     const ticket = {};
     this.#loading.set(layer, ticket);
-    const loaded = await this.#loaded(source, progress, signal);
+    const loaded = await this.#loaded(layer, source, progress, signal);
     if (signal?.aborted === true || this.#loading.get(layer) !== ticket) {
       loaded.dispose();
       throw new DOMException("another cloud was asked for", "AbortError");
     }
     this.unload(layer);
     this.#layers.set(layer, loaded);
-    this.#points.add(loaded.present, loaded.lost);
+    this.#points.add(loaded.group);
     loaded.paintMoved(this.#marks.moved);
     this.#fit();
-    this.#invalidate();
+    await loaded.ready; // a tileset asks for what the first view shows
+    if (this.#layers.get(layer) === loaded) this.#fit();
+    progress(1);
   }
 
   unload(layer: Layer): void {
@@ -97,7 +101,7 @@ export class Scene {
     this.#loading.delete(layer);
     if (loaded === undefined) return;
     this.#layers.delete(layer);
-    this.#points.remove(loaded.present, loaded.lost);
+    this.#points.remove(loaded.group);
     loaded.dispose();
     this.#announced = false;
     this.#invalidate();
@@ -127,9 +131,8 @@ export class Scene {
   }
 
   flyTo(box: Box): void {
-    const around = grown(box, 1.2);
     this.#viewChosen = true;
-    this.#rig.fly(this.#rig.viewOf(around, "here"), this.#frameMs);
+    this.#rig.fly(this.#rig.viewOf(grown(box, AROUND), "here"), this.#frameMs);
   }
 
   topDown(): void {
@@ -149,7 +152,7 @@ export class Scene {
   /** Bounds of what is loaded. */
   get extent(): Box | null {
     const boxes = [...this.#layers.values()].map(({ bounds }) => bounds);
-    return boxes.length === 0 ? null : boxes.reduce(around);
+    return boxes.length === 0 ? null : around(boxes);
   }
 
   /** Return a height just under the ceiling, by the histogram of heights; null where there is no ceiling. */
@@ -219,7 +222,16 @@ export class Scene {
     return this.#layers.get("reference") ?? this.#layers.get("survey");
   }
 
-  async #loaded(source: CloudSource, progress: (share: number) => void, signal: AbortSignal | undefined): Promise<LoadedLayer> {
+  async #loaded(
+    layer: Layer,
+    source: CloudSource,
+    progress: (share: number) => void,
+    signal: AbortSignal | undefined,
+  ): Promise<LoadedLayer> {
+    if (source.kind === "tileset") {
+      const { openTileset } = await import("./tileset.ts");
+      return openTileset(source, layer, this.#fetch, this.#uniforms, () => this.#invalidate(), signal);
+    }
     const file = await fetchWhole(source, this.#fetch, progress, signal);
     return new FileLayer(file, source, this.#uniforms);
   }
@@ -233,6 +245,8 @@ export class Scene {
     if (!this.#sectionChosen) this.#uniforms.section.value.set(-1e9, ceiling ?? 1e9);
     this.#rig.extent = extent;
     if (!this.#viewChosen) this.#rig.view = this.#rig.viewOf(extent, "first");
+    this.#eyeDome.grain = Math.max(...[...this.#layers.values()].map(({ spacing }) => spacing));
+    this.#invalidate();
   }
 
   #highlight(): void {
@@ -286,7 +300,7 @@ export class Scene {
     const flying = this.#rig.advance();
     if (this.#moving) this.#adapt(now);
     this.#draw();
-    if (!this.#announced && this.#layers.size > 0) this.#announce();
+    if (!this.#announced && [...this.#layers.values()].some(({ drawable }) => drawable)) this.#announce();
     if (flying) this.#invalidate();
   }
 
@@ -303,13 +317,11 @@ export class Scene {
   #draw(): void {
     const { camera } = this.#rig;
     this.#rig.clip();
-    let more = false;
     for (const layer of this.#layers.values()) {
       layer.thin(this.#moving ? this.#share : 1);
-      more = layer.update(camera, this.#renderer) || more;
+      layer.update(camera, this.#renderer);
     }
     for (const half of this.#shown === "split" ? (["before", "after"] as const) : [null]) this.#drawHalf(half);
-    if (more) this.#invalidate();
   }
 
   #drawHalf(half: "before" | "after" | null): void {
@@ -333,10 +345,8 @@ export class Scene {
   /** Points that were lost are the map's: they are seen with it. */
   #showLayers(half: "before" | "after" | null): void {
     const which = half === null ? this.#shown : half === "before" ? "reference" : "survey";
-    const [reference, survey] = [this.#layers.get("reference"), this.#layers.get("survey")];
-    if (reference !== undefined) reference.present.visible = which !== "survey";
-    if (survey !== undefined) survey.present.visible = which !== "reference";
-    if (survey !== undefined) survey.lost.visible = which !== "survey";
+    this.#layers.get("reference")?.show(which !== "survey", false);
+    this.#layers.get("survey")?.show(which !== "reference", which !== "survey");
   }
 
   /** Tell once that the first points are on the screen; reading a pixel back waits for the graphics processor. */
@@ -377,14 +387,4 @@ export class Scene {
     const ray = this.#rig.rayThrough(((x - frame.left - left) / width) * 2 - 1, 1 - ((y - frame.top) / frame.height) * 2);
     this.#emit("pick", this.#marks.pick(ray));
   }
-}
-
-function grown({ min, max }: Box, margin: number): Box {
-  return { min: min.map((value) => value - margin) as Point, max: max.map((value) => value + margin) as Point };
-}
-
-/** Return the box around two. */
-function around(a: Box, b: Box): Box {
-  const pairs = (one: Point, other: Point, pick: (x: number, y: number) => number) => one.map((value, axis) => pick(value, other[axis] as number)) as Point;
-  return { min: pairs(a.min, b.min, Math.min), max: pairs(a.max, b.max, Math.max) };
 }
