@@ -6,7 +6,7 @@ import { fileURLToPath } from "node:url";
 
 import { build } from "esbuild";
 
-import { unusedShaders } from "./shaders.mjs";
+import { unusedParts } from "./unused.mjs";
 
 const SOURCE = dirname(fileURLToPath(import.meta.url));
 const BUILT = join(SOURCE, "..", "built");
@@ -51,7 +51,7 @@ const { metafile } = await build({
   target: "es2022",
   minify: true,
   metafile: true,
-  plugins: [unusedShaders],
+  plugins: [unusedParts],
   legalComments: "none", // all licences are in licences.txt
   logLevel: "warning",
 });

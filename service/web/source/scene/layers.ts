@@ -17,14 +17,18 @@ const NEARLY = 0.05; // metres that a point of an object may lie outside of its 
 
 /** A layer that is loaded. */
 export interface LoadedLayer {
-  /** What the visit saw. */
-  readonly present: Group;
-  /** Of a survey: what the map has and the survey has not; empty for others. */
-  readonly lost: Group;
+  readonly group: Group;
   readonly bounds: Box;
   readonly levels: Levels;
-  /** Fetch and drop parts for a camera and a picture of so many pixels; returns whether more will come. */
-  update(camera: PerspectiveCamera, renderer: WebGLRenderer): boolean;
+  /** Metres between neighbouring points; 0: they differ. */
+  readonly spacing: number;
+  /** Resolves once there are points to draw. */
+  readonly ready: Promise<void>;
+  readonly drawable: boolean;
+  /** Fetch and drop parts for what a camera sees. */
+  update(camera: PerspectiveCamera, renderer: WebGLRenderer): void;
+  /** Draw what the visit saw; and, of a survey, what the map has and the survey has not. */
+  show(present: boolean, lost: boolean): void;
   /** Draw a part of the points alone, 0..1. */
   thin(share: number): void;
   /** Paint the points of objects that were moved as such. */
@@ -70,10 +74,14 @@ function joined(pieces: Uint8Array[], bytes: number): ArrayBuffer {
 
 /** The cloud of one PLY file. */
 export class FileLayer implements LoadedLayer {
-  readonly present = new Group();
-  readonly lost = new Group();
+  readonly group = new Group();
   readonly bounds: Box;
   readonly levels: Levels;
+  readonly spacing: number;
+  readonly ready = Promise.resolve();
+  readonly drawable = true;
+  readonly #present = new Group();
+  readonly #lost = new Group();
   readonly #parts: Part[];
 
   constructor(file: ArrayBuffer, source: CloudSource, uniforms: PointUniforms) {
@@ -81,16 +89,18 @@ export class FileLayer implements LoadedLayer {
     const matrix = matrixOf(source);
     this.bounds = transformed(cloud.bounds, matrix);
     this.levels = cloud.levels;
-    const parts = [[cloud.present, this.present], [cloud.lost, this.lost]] as const;
+    this.spacing = cloud.spacing;
+    const parts = [[cloud.present, this.#present], [cloud.lost, this.#lost]] as const;
     this.#parts = parts.flatMap(([points, group]) => (points === null ? [] : [new Part(points, cloud.spacing, cloud.bounds, group, uniforms)]));
-    for (const group of [this.present, this.lost]) {
-      group.matrixAutoUpdate = false;
-      group.matrix.copy(matrix);
-    }
+    this.group.add(this.#present, this.#lost);
+    this.group.matrixAutoUpdate = false;
+    this.group.matrix.copy(matrix);
   }
 
-  update(): boolean {
-    return false;
+  update(): void {}
+
+  show(present: boolean, lost: boolean): void {
+    [this.#present.visible, this.#lost.visible] = [present, lost];
   }
 
   thin(share: number): void {

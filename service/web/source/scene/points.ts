@@ -4,12 +4,14 @@ import { KIND_COLOURS, MOVING_COLOUR, STATE_COLOURS, bytesOf } from "./colours.t
 import { boundsOf, levelsOf } from "./heights.ts";
 import type { Levels } from "./heights.ts";
 import type { PlyPoints } from "./ply.ts";
-import type { Box } from "./types.ts";
+import type { Box, Layer } from "./types.ts";
 
 /** Alpha of a tint: the point takes the colour of its height, a faint one, that of its object, or one that it brings. */
 export const RAMP = 0;
 export const FAINT = 64;
 export const MARKED = 128;
+/** As MARKED, of what the map has and the survey has not. */
+export const GONE = 160;
 export const OWN = 255;
 
 /** Points ready to be drawn, in an order of which each beginning is a fair sample. */
@@ -127,6 +129,27 @@ function kindTints(): Uint32Array {
 function stateTints(): Uint32Array {
   const states = ["unchanged", "changed", "inconsistent", "unobserved"];
   return tableOf(states.map((state, code) => [STATE_COLOURS[state], code === 0 ? RAMP : MARKED]));
+}
+
+/** Return tints of colours (red, green, blue each), of which a survey's are those of `scalar_kind` and tell of it. */
+export function tintsOfBytes(colours: Uint8Array, layer: Layer): Uint8Array {
+  const tints = new Uint8Array((4 * colours.length) / 3);
+  copy(tints, Uint32Array.from({ length: colours.length / 3 }, (_, row) => row), colours);
+  if (layer === "reference") return tints;
+  const told: [string | undefined, number][] = [["#969696", RAMP], ["#aaaaaa", RAMP], ["#e1e1e1", RAMP], ["#d7d7d7", FAINT]];
+  told.push([KIND_COLOURS["appeared"], MARKED], [KIND_COLOURS["disappeared"], GONE]);
+  for (const [colour, alpha] of told) {
+    const [r, g, b] = bytesOf(colour ?? "#000000");
+    for (let i = 0; i < tints.length; i += 4) {
+      if (near(tints[i], r) && near(tints[i + 1], g) && near(tints[i + 2], b)) tints[i + 3] = alpha;
+    }
+  }
+  return tints;
+}
+
+/** Tell whether a channel is another one, give or take what is lost where colours are kept linear in bytes. */
+function near(channel: number | undefined, wanted: number): boolean {
+  return Math.abs((channel ?? 0) - wanted) <= 4;
 }
 
 function tableOf(tints: [string | undefined, number][]): Uint32Array {

@@ -81,17 +81,19 @@ export class Scene {
   async load(layer: Layer, source: CloudSource, progress: (share: number) => void, signal?: AbortSignal): Promise<void> {
     const ticket = {};
     this.#loading.set(layer, ticket);
-    const loaded = await this.#loaded(source, progress, signal);
+    const loaded = await this.#loaded(layer, source, progress, signal);
     if (signal?.aborted === true || this.#loading.get(layer) !== ticket) {
       loaded.dispose();
       throw new DOMException("another cloud was asked for", "AbortError");
     }
     this.unload(layer);
     this.#layers.set(layer, loaded);
-    this.#points.add(loaded.present, loaded.lost);
+    this.#points.add(loaded.group);
     loaded.paintMoved(this.#marks.moved);
     this.#fit();
-    this.#invalidate();
+    await loaded.ready; // a tileset asks for what the first view shows
+    if (this.#layers.get(layer) === loaded) this.#fit();
+    progress(1);
   }
 
   unload(layer: Layer): void {
@@ -99,7 +101,7 @@ export class Scene {
     this.#loading.delete(layer);
     if (loaded === undefined) return;
     this.#layers.delete(layer);
-    this.#points.remove(loaded.present, loaded.lost);
+    this.#points.remove(loaded.group);
     loaded.dispose();
     this.#announced = false;
     this.#invalidate();
@@ -220,7 +222,16 @@ export class Scene {
     return this.#layers.get("reference") ?? this.#layers.get("survey");
   }
 
-  async #loaded(source: CloudSource, progress: (share: number) => void, signal: AbortSignal | undefined): Promise<LoadedLayer> {
+  async #loaded(
+    layer: Layer,
+    source: CloudSource,
+    progress: (share: number) => void,
+    signal: AbortSignal | undefined,
+  ): Promise<LoadedLayer> {
+    if (source.kind === "tileset") {
+      const { openTileset } = await import("./tileset.ts");
+      return openTileset(source, layer, this.#fetch, this.#uniforms, () => this.#invalidate(), signal);
+    }
     const file = await fetchWhole(source, this.#fetch, progress, signal);
     return new FileLayer(file, source, this.#uniforms);
   }
@@ -234,6 +245,8 @@ export class Scene {
     if (!this.#sectionChosen) this.#uniforms.section.value.set(-1e9, ceiling ?? 1e9);
     this.#rig.extent = extent;
     if (!this.#viewChosen) this.#rig.view = this.#rig.viewOf(extent, "first");
+    this.#eyeDome.grain = Math.max(...[...this.#layers.values()].map(({ spacing }) => spacing));
+    this.#invalidate();
   }
 
   #highlight(): void {
@@ -287,7 +300,7 @@ export class Scene {
     const flying = this.#rig.advance();
     if (this.#moving) this.#adapt(now);
     this.#draw();
-    if (!this.#announced && this.#layers.size > 0) this.#announce();
+    if (!this.#announced && [...this.#layers.values()].some(({ drawable }) => drawable)) this.#announce();
     if (flying) this.#invalidate();
   }
 
@@ -304,13 +317,11 @@ export class Scene {
   #draw(): void {
     const { camera } = this.#rig;
     this.#rig.clip();
-    let more = false;
     for (const layer of this.#layers.values()) {
       layer.thin(this.#moving ? this.#share : 1);
-      more = layer.update(camera, this.#renderer) || more;
+      layer.update(camera, this.#renderer);
     }
     for (const half of this.#shown === "split" ? (["before", "after"] as const) : [null]) this.#drawHalf(half);
-    if (more) this.#invalidate();
   }
 
   #drawHalf(half: "before" | "after" | null): void {
@@ -334,10 +345,8 @@ export class Scene {
   /** Points that were lost are the map's: they are seen with it. */
   #showLayers(half: "before" | "after" | null): void {
     const which = half === null ? this.#shown : half === "before" ? "reference" : "survey";
-    const [reference, survey] = [this.#layers.get("reference"), this.#layers.get("survey")];
-    if (reference !== undefined) reference.present.visible = which !== "survey";
-    if (survey !== undefined) survey.present.visible = which !== "reference";
-    if (survey !== undefined) survey.lost.visible = which !== "survey";
+    this.#layers.get("reference")?.show(which !== "survey", false);
+    this.#layers.get("survey")?.show(which !== "reference", which !== "survey");
   }
 
   /** Tell once that the first points are on the screen; reading a pixel back waits for the graphics processor. */

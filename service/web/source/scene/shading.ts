@@ -25,6 +25,9 @@ import type { PerspectiveCamera, WebGLRenderer } from "three";
 
 import type { Theme } from "./types.ts";
 
+/** Pixels of a point, at most. */
+export const LARGEST = 40;
+
 /** What all points of a scene share: the materials of every cloud and tile point to these. */
 export interface PointUniforms {
   [name: string]: { value: unknown };
@@ -49,7 +52,8 @@ uniform mat4 modelMatrix, viewMatrix, projectionMatrix;
 uniform vec2 section, ramp;
 uniform vec3 low, middle, high, back;
 uniform vec3 chosen[4];
-uniform float dim, scale, spacing, share;
+uniform float dim, scale, spacing, share, cap;
+uniform int parts;
 in vec3 position;
 #ifdef TINTED
 in vec4 tint;
@@ -60,7 +64,11 @@ bool inside(vec3 p, vec3 least, vec3 most) { return all(greaterThan(p, least)) &
 
 void main() {
   vec4 world = modelMatrix * vec4(position, 1.0);
-  if (world.z < section.x || world.z > section.y) {
+  int part = 1;
+#ifdef TINTED
+  if (tint.a > 0.55 && tint.a < 0.75) part = 2;
+#endif
+  if (world.z < section.x || world.z > section.y || (parts & part) == 0) {
     gl_Position = vec4(2.0, 2.0, 2.0, 1.0);
     return;
   }
@@ -77,7 +85,7 @@ void main() {
   }
   vec4 eye = viewMatrix * world;
   gl_Position = projectionMatrix * eye;
-  gl_PointSize = clamp(size * spacing * scale * inversesqrt(share) / -eye.z, 1.5, 40.0);
+  gl_PointSize = clamp(size * spacing * scale * inversesqrt(share) / -eye.z, 1.5, cap);
 }`;
 
 const POINT_FRAGMENT = /* glsl */ `
@@ -101,7 +109,7 @@ uniform highp sampler2D depths;
 uniform vec2 planes;
 uniform vec4 area;
 uniform vec3 backLow, backHigh;
-uniform float radius, strength;
+uniform float radius, strength, grain;
 out vec4 painted;
 
 float logDistance(ivec2 pixel) {
@@ -116,11 +124,12 @@ void main() {
   gl_FragDepth = depth;
   if (depth == 1.0) { painted = vec4(back, 1.0); return; }
   float here = logDistance(pixel);
+  float even = log2(1.0 + grain / exp2(here)); // neighbours on one surface differ by that
   float sum = 0.0;
   for (int i = 0; i < 8; i++) {
     float angle = 0.785398 * float(i);
     ivec2 next = pixel + ivec2(round(radius * vec2(cos(angle), sin(angle))));
-    sum += clamp(here - logDistance(next), 0.0, 0.1);
+    sum += clamp(here - logDistance(next) - even, 0.0, 0.1);
   }
   float shade = exp(-strength * sum / 8.0);
   painted = vec4(texelFetch(colours, pixel, 0).rgb * shade, 1.0);
@@ -154,7 +163,7 @@ export function pointMaterial(shared: PointUniforms, spacing: number, tinted: bo
     vertexShader: POINT_VERTEX,
     fragmentShader: POINT_FRAGMENT,
     defines: tinted ? { TINTED: 1 } : {},
-    uniforms: { ...shared, spacing: { value: spacing }, share: { value: 1 } },
+    uniforms: { ...shared, spacing: { value: spacing }, share: { value: 1 }, cap: { value: LARGEST }, parts: { value: 3 } },
   });
 }
 
@@ -179,7 +188,8 @@ export class EyeDome {
       backLow: { value: new Color() },
       backHigh: { value: new Color() },
       radius: { value: 1.4 },
-      strength: { value: 14 },
+      strength: { value: 16 },
+      grain: { value: 0 },
     },
   });
   readonly #pass = new Group();
@@ -198,6 +208,11 @@ export class EyeDome {
     (shown as { value: Vector4 }).value.copy(area);
     (radius as { value: number }).value = 1.4 * pixelRatio;
     renderer.render(this.#pass, this.#camera);
+  }
+
+  /** Take note how far apart points are, metres: smaller steps are no edges. */
+  set grain(metres: number) {
+    (this.#material.uniforms["grain"] as { value: number }).value = metres;
   }
 
   /** Take the colours of a theme, here and for all points. */
