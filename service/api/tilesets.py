@@ -1,7 +1,7 @@
 """Clouds as 3D Tiles 1.1 (OGC 22-025r4), of maps, their versions and large surveys: `tileset.json` and its contents.
 
-A version's tileset is in the map's frame, and everything in it under addresses that are never another's. That of a map
-is a document of one tile, which names the tileset of the version in use, and which may put it on the Earth.
+A version's tileset is in the map's frame, and what lies under the address of a content never changes. That of a map is
+a document of one tile, which names the tileset of the version in use, and which may put it on the Earth.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ Content = Annotated[
     str,
     Path(
         max_length=200,
-        description="as `tileset.json` names it: whose it is, where it begins in the file of all contents, and its bytes",
-        examples=["job-5f0c-0-394208.glb"],
+        description="as `tileset.json` names it: of which tileset, where it begins in the file of all contents, its bytes",
+        examples=["5f0c91b64f2e7a08-0-394208.glb"],
     ),
 ]
 
@@ -107,7 +107,7 @@ async def get_version_tileset_content(
 ) -> Response:
     """Points as GLB: quantised positions (KHR_mesh_quantization), with colours or normals."""
     version = await run_in_threadpool(services.catalog.versions.ready, map_id, number)
-    name = _named(content, owner=version.job_id)
+    name = _named(content, version.tileset)
     key = blob_keys.map_tileset_contents(version.job_id)
     return await content_response(services.catalog.blobs, key, name, media_type=GLB)
 
@@ -134,8 +134,8 @@ async def get_survey_tileset(services: Provided, survey_id: SurveyId) -> Respons
 )
 async def get_survey_tileset_content(services: Provided, survey_id: SurveyId, content: Content) -> Response:
     """Points as GLB: quantised positions (KHR_mesh_quantization), with the colours of `cloud.ply`."""
-    await run_in_threadpool(services.catalog.surveys.ready, survey_id)
-    name = _named(content, owner=survey_id)
+    survey = await run_in_threadpool(services.catalog.surveys.ready, survey_id)
+    name = _named(content, survey.tileset)
     key = blob_keys.survey_tileset_contents(survey_id)
     return await content_response(services.catalog.blobs, key, name, media_type=GLB)
 
@@ -148,10 +148,10 @@ def _require(tileset: Tileset | None, what: str) -> None:
         )
 
 
-def _named(content: str, *, owner: str) -> ContentName:
+def _named(content: str, tileset: Tileset | None) -> ContentName:
     """Read the name of a content. Raises NotFound for one of another tileset, or none."""
     name = ContentName.of(content)
-    if name is None or name.owner != owner:
+    if name is None or tileset is None or not name.is_of(tileset.sha256):
         raise NotFound(f"no content {content[:100]!r}; tileset.json names those there are")
     return name
 

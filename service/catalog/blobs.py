@@ -126,12 +126,15 @@ class Blobs:
         """Return `length` bytes from `offset` on, fewer where the blob ends before. Raises FileNotFoundError."""
         path = self.path(key)
         with _errors():
-            if path is not None:
-                with path.open("rb") as file:
-                    file.seek(offset)
-                    return file.read(length)
-            length = max(min(length, self.size(key) - offset), 0)
-            return bytes(obstore.get_range(self._store, key, start=offset, length=length)) if length else b""
+            size = path.stat().st_size if path is not None else self.size(key)
+            length = max(min(length, size - offset), 0)
+            if not length:
+                return b""
+            if path is None:
+                return bytes(obstore.get_range(self._store, key, start=offset, length=length))
+            with path.open("rb") as file:
+                file.seek(offset)
+                return file.read(length)
 
     def exists(self, key: str) -> bool:
         """Tell whether something complete lies under `key`."""

@@ -333,6 +333,7 @@ class Tileset(Record):
     n_points: int = Field(description="all points of the cloud, each in one content", examples=[5181342])
     contents: int = Field(examples=[214])
     bytes: int = Field(description="of all contents", examples=[62181520])
+    sha256: str = Field(description="of the same; its first digits are part of their addresses")
 
 
 class BuiltSummary(Record):

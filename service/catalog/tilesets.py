@@ -1,8 +1,8 @@
 """Where the contents of a tileset lie: all in one blob, each under an address that says which bytes are its own.
 
 So no index has to be read for a content, and a blob store that takes a while for each request (S3) is asked once. The
-address names what the tileset was made for as well: the id of a job that builds a version, or of a survey. The ids of
-maps and numbers of versions may be given again once a map is deleted; an address of a content is never another's.
+address bears the digest of all contents as well: the ids of maps and the numbers of versions may be given again once a
+map is deleted, but what lies under the address of a content never changes.
 """
 
 from __future__ import annotations
@@ -13,22 +13,17 @@ from typing import Self
 
 from service.catalog.blobs import Blobs
 
-FOLDER = "tileset"  #: of the contents, beside `tileset.json`
 MOST_BYTES = 1 << 24  #: of a content that is answered; those that are written are a tenth of it
-_NAME = re.compile(r"([A-Za-z0-9._-]+)-([0-9]{1,15})-([0-9]{1,8})\.glb")
+_DIGITS = 16  # of the digest
+_NAME = re.compile(r"([0-9a-f]{16})-([0-9]{1,15})-([0-9]{1,8})\.glb")
 _MAGIC = b"glTF\x02\x00\x00\x00"
-
-
-def addresses(owner: str) -> str:
-    """Return the relative address of every content of a tileset, with `{offset}` and `{length}` to be filled in."""
-    return f"{FOLDER}/{owner}-{{offset}}-{{length}}.glb"
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class ContentName:
     """What the last part of a content's address says."""
 
-    owner: str  #: id of the job, or of the survey, that the tileset was made by
+    digest: str  #: the first digits of the SHA-256 of all contents
     offset: int  #: in the blob
     length: int  #: bytes
 
@@ -38,7 +33,16 @@ class ContentName:
         match = _NAME.fullmatch(name)
         if match is None or int(match[3]) > MOST_BYTES:
             return None
-        return cls(owner=match[1], offset=int(match[2]), length=int(match[3]))
+        return cls(digest=match[1], offset=int(match[2]), length=int(match[3]))
+
+    def is_of(self, sha256: str) -> bool:
+        """Tell whether it names a content of the tileset whose contents have this digest."""
+        return self.digest == sha256[:_DIGITS]
+
+
+def address(sha256: str, offset: int, length: int) -> str:
+    """Return the address of a content, relative to `tileset.json`."""
+    return f"tileset/{sha256[:_DIGITS]}-{offset}-{length}.glb"
 
 
 def read_content(blobs: Blobs, key: str, name: ContentName) -> bytes:

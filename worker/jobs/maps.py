@@ -89,7 +89,6 @@ def _put_map(context: Context, built: BuiltMap, card: Card) -> Tileset:
     return put_tileset(
         context,
         lambda: pieces_of(reference.points, colors=reference.colors, normals=reference.normals),
-        owner=job_id,
         document=blob_keys.map_tileset(job_id),
         contents=blob_keys.map_tileset_contents(job_id),
         progress=lambda share: context.report("saving", share),

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import asdict
 
 from service.catalog.records import Tileset
-from service.catalog.tilesets import addresses
+from service.catalog.tilesets import address
 from worker.cloud.tilesets.writer import Pieces, TilesetSettings, write_tileset
 from worker.jobs.step import Context
 
@@ -14,12 +15,11 @@ def put_tileset(
     context: Context,
     pieces: Pieces,
     *,
-    owner: str,
     document: str,
     contents: str,
     progress: Callable[[float], None],
 ) -> Tileset:
-    """Write the tileset of a cloud under the keys `document` and `contents`; its addresses name `owner`.
+    """Write the tileset of a cloud under the keys `document` and `contents`.
 
     A second run writes the same bytes. The contents come first: where the document is, they are.
     """
@@ -31,10 +31,10 @@ def put_tileset(
         binary,
         pieces,
         scratch=folder,
-        address=addresses(owner),
+        address=lambda at: address(at.sha256, at.offset, at.length),
         settings=TilesetSettings(memory_bytes=context.settings.tileset_memory_bytes),
         progress=progress,
     )
     context.catalog.blobs.put_file(contents, binary, move=True)
     context.catalog.blobs.put_file(document, index, move=True)
-    return Tileset(n_points=summary.n_points, contents=summary.contents, bytes=summary.bytes)
+    return Tileset.model_validate(asdict(summary))

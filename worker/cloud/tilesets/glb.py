@@ -147,9 +147,8 @@ def _views(columns: list[NDArray[np.uint8]]) -> list[dict[str, int]]:
 
 
 def _container(document: bytes, binary: bytes) -> bytes:
-    """Return both in chunks (Section 4), each filled up to a multiple of 8 bytes, as 3D Tiles wants contents."""
-    document += b" " * (-(20 + len(document)) % 8 or 0)
-    binary += b"\0" * (-(8 + len(binary)) % 8)
+    """Return both in chunks (Section 4), the first filled up to a multiple of 4 bytes, as the other is."""
+    document += b" " * (-len(document) % 4)
     length = 12 + 8 + len(document) + 8 + len(binary)
     return b"".join(
         [

@@ -8,6 +8,7 @@ is a sort of each part. All contents stand one after the other in one file: thei
 
 from __future__ import annotations
 
+import hashlib
 import json
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -58,6 +59,16 @@ class TilesetSummary:
     n_points: int
     contents: int  #: tiles with points
     bytes: int  #: of all contents
+    sha256: str  #: of the same, hexadecimal
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Content:
+    """Where a content lies."""
+
+    sha256: str  #: of the file of all contents, hexadecimal
+    offset: int  #: in it
+    length: int  #: bytes
 
 
 def pieces_of(
@@ -79,15 +90,14 @@ def write_tileset(
     pieces: Pieces,
     *,
     scratch: Path,
-    address: str = "tileset/{offset}-{length}.glb",
+    address: Callable[[Content], str] = lambda at: f"tileset/{at.offset}-{at.length}.glb",
     settings: TilesetSettings | None = None,
     progress: Callable[[float], None] = lambda _: None,
 ) -> TilesetSummary:
     """Write the tileset of a cloud of at least one point: the document `index`, and all contents in one file.
 
-    `scratch` is an existing folder for as many bytes as the points take. `address` is the relative one of a content,
-    which begins in the file at `offset` and is `length` bytes long. The same points give the same bytes, whatever the
-    memory. Raises ValueError for a cloud without a point.
+    `scratch` is an existing folder for as many bytes as the points take. `address` gives the relative one of a content.
+    The same points give the same bytes, whatever the memory. Raises ValueError for a cloud without a point.
     """
     settings = settings or TilesetSettings()
     lower, upper, n_points, extra_is = _surveyed(pieces)
@@ -105,22 +115,21 @@ def write_tileset(
             parts=parts,
             extra_is=extra_is,
             settings=settings,
-            address=address,
             written=lambda done: progress(0.3 + 0.7 * done / n_points),
         )
         root = builder.build_root()
-        size = file.tell()
-    index.write_text(json.dumps(_document(root, cube), separators=(",", ":")), encoding="utf-8")
-    return TilesetSummary(n_points=n_points, contents=builder.contents, bytes=size)
-
-
-def _document(root: dict[str, Any], cube: Cube) -> dict[str, Any]:
-    """Return tileset.json: without the root there is nothing to see, which is an error of the whole cube."""
-    return {
+    sha256 = builder.digest.hexdigest()
+    for tile, offset, length in builder.contents:
+        tile["content"] = {"uri": address(Content(sha256=sha256, offset=offset, length=length))}
+    document = {
         "asset": {"version": "1.1", "generator": "SPICD"},
-        "geometricError": _rounded(cube.side),
+        "geometricError": _rounded(cube.side),  # of nothing at all
         "root": root | {"refine": "ADD"},
     }
+    index.write_text(json.dumps(document, separators=(",", ":")), encoding="utf-8")
+    return TilesetSummary(
+        n_points=n_points, contents=len(builder.contents), bytes=contents.stat().st_size, sha256=sha256
+    )
 
 
 def _surveyed(pieces: Pieces) -> tuple[NDArray[np.float32], NDArray[np.float32], int, Extra | None]:
@@ -255,10 +264,10 @@ class _Builder:
     parts: _Parts
     extra_is: Extra | None
     settings: TilesetSettings
-    address: str
     written: Callable[[int], None]
-    contents: int = 0
-    points: int = field(default=0)
+    contents: list[tuple[dict[str, Any], int, int]] = field(default_factory=list)  #: tile, offset, length
+    digest: Any = field(default_factory=hashlib.sha256)
+    points: int = 0
 
     def build_root(self) -> dict[str, Any]:
         """Return the tile of everything."""
@@ -311,21 +320,20 @@ class _Builder:
             error = self.cube.spacing(level) if tiles else 0.0
             tile = {"boundingVolume": {"box": _box_of(lower, upper)}, "geometricError": _rounded(error)}
             if len(shown):
-                tile["content"] = {"uri": self._kept(shown)}
+                self._keep(shown, tile)
             if tiles:
                 tile["children"] = tiles
         return _Node(tile=tile, samples=own[upwards], lower=lower, upper=upper)
 
-    def _kept(self, rows: NDArray[Any]) -> str:
-        """Write a content; return its address."""
+    def _keep(self, rows: NDArray[Any], tile: dict[str, Any]) -> None:
+        """Write the content of a tile; its address is known once all are written."""
         extra = rows["extra"] if self.extra_is is not None else None
         content = encode_points(rows["point"], extra, extra_is=self.extra_is)
-        offset = self.file.tell()
+        self.contents.append((tile, self.file.tell(), len(content)))
         self.file.write(content)
-        self.contents += 1
+        self.digest.update(content)
         self.points += len(rows)
         self.written(self.points)
-        return self.address.format(offset=offset, length=len(content))
 
 
 def _box(own: _Points, children: Sequence[_Node]) -> tuple[Floats, Floats]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -95,7 +96,10 @@ def test_every_point_is_in_one_content_and_not_moved_by_more_than_half_a_step(tm
     assert (np.abs(found - points[rows]) <= half[:, None] * 1.001 + 1e-9).all()
     assert max(half) < 0.0003  # of 30 m
     assert tileset.summary == TilesetSummary(
-        n_points=len(points), contents=len(parts), bytes=len(tileset.contents)
+        n_points=len(points),
+        contents=len(parts),
+        bytes=len(tileset.contents),
+        sha256=hashlib.sha256(tileset.contents).hexdigest(),
     )
 
 
