@@ -10,15 +10,15 @@ NODE_VERSION := 24.19.0
 WEB := service/web/source
 BUNDLE := service/web/built/index.html
 
-.PHONY: help web servers tools demo up test test-fast acceptance-shared check format bench chaos fuzz schemathesis load soak openapi client clean
+.PHONY: help web browser servers tools demo up test test-fast acceptance-shared check format bench chaos fuzz schemathesis load soak openapi client clean
 help: ## this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
 
 web: $(WEB)/node_modules/.installed ## build the viewer that the service shows at /
 	@PATH="$(CURDIR)/$(NODE)/bin:$$PATH" npm --prefix $(WEB) run --silent build
 
-demo: $(INSTALLED) $(BUNDLE) ## simulate a building, run the whole service on it, show what changed
-	$(BIN)/spicd-worker demo
+demo: $(INSTALLED) $(BUNDLE) ## simulate a building, run the whole service on it, show what changed; on a terminal the viewer stays
+	$(BIN)/spicd-worker demo --look
 
 up: $(INSTALLED) $(BUNDLE) ## start the service to stay: API, workers, embedded Redis
 	$(BIN)/spicd up
@@ -28,6 +28,9 @@ test: $(INSTALLED) $(BUNDLE) ## every test, on all cores
 
 test-fast: $(INSTALLED) $(BUNDLE) ## the tests that take no longer than a second or so: under a minute on two cores
 	$(BIN)/pytest -m fast -n auto --dist loadscope
+
+browser: ## a headless Chromium for the tests of the viewer, where apt-get may install one
+	@sh docker/browser.sh
 
 servers: $(SERVERS)/bin/moto_server ## an S3 server for tests, in an environment of its own; PostgreSQL has to be there
 

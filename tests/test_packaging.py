@@ -87,6 +87,7 @@ def test_the_hosted_ci_calls_the_commands_of_our_own_on_the_oldest_python() -> N
     assert [line.split(" || ")[0] for line in ours] == [
         "make check",
         "make servers",
+        "make browser",
         "make tools",
         "make web",
         "make test",

@@ -11,11 +11,16 @@ export function metres(length: number): string {
   return size >= 0.095 ? `${(length * 100).toFixed(0)} cm` : `${(length * 100).toFixed(1)} cm`;
 }
 
+/** Write a height in the map's frame, which may lie below its origin. */
+export function height(z: number): string {
+  return `${z.toFixed(2).replace("-", "−")} m`;
+}
+
 /** Write a share or a probability; what is nearly sure does not read as sure, nor what is nearly nothing as nothing. */
 export function percent(share: number | null | undefined): string {
   if (share == null) return "not told";
-  if (share > 0.99 && share < 1) return "over 99 %";
-  if (share > 0 && share < 0.01) return "under 1 %";
+  if (share > 0.99 && share < 1) return ">99 %";
+  if (share > 0 && share < 0.01) return "<1 %";
   return `${Math.round(share * 100)} %`;
 }
 

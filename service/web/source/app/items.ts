@@ -9,7 +9,7 @@ import type {
   SightingProperties,
   TileProperties,
 } from "./documents.ts";
-import { metres } from "./format.ts";
+import { height, metres } from "./format.ts";
 
 export interface Item {
   id: string; // of the object, and of a tile with `tile:` before it; what the link and the scene call it
@@ -138,6 +138,6 @@ export function tileMarkOf(feature: FgTileFeature): TileMark {
 export function whereOf(item: Item): string {
   const at = [0, 1].map((axis) => ((item.box.min[axis]! + item.box.max[axis]!) / 2).toFixed(1)).join(", ");
   const over = item.place?.height_over_floor;
-  if (over == null) return `at ${at}, ${metres(item.box.min[2])} to ${metres(item.box.max[2])} high`;
+  if (over == null) return `at ${at}, ${height(item.box.min[2])} to ${height(item.box.max[2])}`;
   return over < 0.2 ? `at ${at}, on the floor` : `at ${at}, ${metres(over)} over the floor`;
 }

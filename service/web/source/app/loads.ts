@@ -2,6 +2,7 @@
 
 import type { Controller } from "./controller.ts";
 import type {
+  Box,
   Collection,
   FgTileFeature,
   Feature,
@@ -16,14 +17,16 @@ import type {
   SurveyDocument,
   SurveyList,
   SurveySummaryDocument,
+  TileProperties,
   VersionList,
 } from "./documents.ts";
-import { itemOfObject, itemOfSighting, itemOfTile, type Item } from "./items.ts";
+import { boxOf, itemOfObject, itemOfSighting, itemOfTile, type Item } from "./items.ts";
 import type { Place } from "./link.ts";
 import { focusOf, isOpen, NOT_ASKED, type Look } from "./state.ts";
 
 const AT_ONCE = 4;
 const MOST_LOOKS = 8; // surveys that are asked whether they saw the place of an object
+const MOST_LATE = 20; // surveys that came last, of which the latest is looked for
 const MOST_NAMES = 80;
 const FAILED_FOR_MS = 24 * 3_600_000; // for so long a failed job is shown
 
@@ -32,8 +35,8 @@ export async function maps(app: Controller): Promise<void> {
   await app.load("maps", () => app.api.pages("maps?limit=200", (list: MapList) => list.maps, 1000));
   const ids = (app.state.maps.value ?? []).map(({ map_id }) => map_id);
   await eachOf(ids, async (id) => {
-    const list = await app.api.get<SurveyList>(`maps/${id}/surveys?limit=1`);
-    app.update({ latest: { ...app.state.latest, [id]: list.surveys[0] ?? null } });
+    const { surveys } = await app.api.get<SurveyList>(`maps/${id}/surveys?limit=${MOST_LATE}`);
+    app.update({ latest: { ...app.state.latest, [id]: byTime(surveys).at(-1) ?? null } });
   });
 }
 
@@ -60,7 +63,12 @@ export function follow(app: Controller, before: Place): void {
 
 async function surveysOf(app: Controller, id: string): Promise<SurveySummaryDocument[]> {
   const all = await app.api.pages(`maps/${id}/surveys?limit=500`, (list: SurveyList) => list.surveys, 2000);
-  return all.sort((one, other) => Date.parse(one.captured_at) - Date.parse(other.captured_at));
+  return byTime(all);
+}
+
+/** Sort surveys by the time they were captured, which is not the order in which they came. */
+function byTime(surveys: SurveySummaryDocument[]): SurveySummaryDocument[] {
+  return surveys.sort((one, other) => Date.parse(one.captured_at) - Date.parse(other.captured_at));
 }
 
 /** Ask for the objects over all surveys; of a device those that any survey of it saw. */
@@ -122,8 +130,22 @@ async function ofItem(app: Controller): Promise<void> {
   if (app.state.looks.value && app.state.looks.value.id !== item) app.update({ looks: NOT_ASKED });
   await app.load("looks", async () => {
     const history = await app.api.get<ObjectHistory>(`maps/${id}/objects/${encodeURIComponent(item)}`);
-    return { id: item, history, looks: await looksAt(app, history) };
+    const [looks, tiles] = await Promise.all([looksAt(app, history), tilesOf(app, history)]);
+    return { id: item, history, looks, tiles };
   });
+}
+
+/** Return the tiles that an object lies in, as the latest survey that saw it has them. */
+async function tilesOf(app: Controller, { properties }: ObjectHistory): Promise<TileProperties[]> {
+  const wanted = properties.now ?? properties.before;
+  return wanted ? tilesAt(app, properties.survey_id, wanted) : [];
+}
+
+async function tilesAt(app: Controller, survey: string, place: Box): Promise<TileProperties[]> {
+  const { min, max } = boxOf(place);
+  const path = `surveys/${survey}/tiles?bbox=${[min[0], min[1], max[0], max[1]].join(",")}&bbox-crs=map`;
+  const { features } = await app.api.get<Collection<Feature<TileProperties>>>(path);
+  return features.map(({ properties }) => properties).filter(({ tile_id }) => place.tiles.includes(tile_id));
 }
 
 async function looksAt(app: Controller, { properties, sightings }: ObjectHistory): Promise<Look[]> {
@@ -135,14 +157,9 @@ async function looksAt(app: Controller, { properties, sightings }: ObjectHistory
   const place = properties.now ?? properties.before;
   const looks = new Map<string, number | null>();
   if (place) {
-    const xs = place.footprint.map(([x]) => x);
-    const ys = place.footprint.map(([, y]) => y);
-    const box = [Math.min(...xs), Math.min(...ys), Math.max(...xs), Math.max(...ys)].join(",");
     await eachOf(others.slice(-MOST_LOOKS), async ({ survey_id }) => {
-      const path = `surveys/${survey_id}/tiles?bbox=${box}&bbox-crs=map&profile=rfc7946`;
-      const { features } = await app.api.get<Collection<FgTileFeature>>(path);
-      const seen = new Map(features.map(({ properties: tile }) => [tile.tile_id, tile.observed_share ?? 0]));
-      looks.set(survey_id, place.tiles.reduce((total, tile) => total + (seen.get(tile) ?? 0), 0) / place.tiles.length);
+      const tiles = await tilesAt(app, survey_id, place);
+      looks.set(survey_id, tiles.reduce((total, tile) => total + (tile.observed_share ?? 0), 0) / place.tiles.length);
     });
   }
   return others.map((survey) => ({ survey, share: looks.get(survey.survey_id) ?? null }));

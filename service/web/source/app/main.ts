@@ -11,12 +11,17 @@ import { listenForDrops } from "./drops.ts";
 import { shownTheme, Stage } from "./stage.ts";
 import { Page } from "./views/page.tsx";
 
+import { KIND_COLOURS, STATE_COLOURS } from "../scene/colours.ts";
 import type { Scene } from "../scene/scene.ts";
 
 declare global {
   interface Window {
     spicd?: { scene: Scene };
   }
+}
+
+for (const [name, colour] of Object.entries({ ...STATE_COLOURS, ...KIND_COLOURS })) {
+  document.documentElement.style.setProperty(`--${name}`, colour);
 }
 
 const root = document.createElement("div");

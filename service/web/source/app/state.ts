@@ -10,6 +10,7 @@ import type {
   ProblemDocument,
   SurveyDocument,
   SurveySummaryDocument,
+  TileProperties,
   VersionSummaryDocument,
 } from "./documents.ts";
 import { filtered } from "./filters.ts";
@@ -56,6 +57,7 @@ export interface ObjectLooks {
   id: string;
   history: ObjectHistory;
   looks: Look[]; // of surveys that did not see it, since it was first seen
+  tiles: TileProperties[]; // that it lies in, as the latest survey which saw it has them
 }
 
 export interface Sending {

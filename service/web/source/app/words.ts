@@ -1,6 +1,6 @@
 /** What is said of surveys, objects, scans and errors. Nothing found is never said where nothing was judged. */
 
-import { count, percent, whole } from "./format.ts";
+import { count, ordinal, percent, whole } from "./format.ts";
 import type { Counts, JobDocument, MapSummaryDocument, ProblemDocument, SurveySummaryDocument } from "./documents.ts";
 
 export type Tone = "changed" | "quiet" | "doubt" | "failed" | "running";
@@ -61,10 +61,13 @@ function failedSaying({ placement, problem }: SurveySummaryDocument): Saying {
 function readySaying(survey: SurveySummaryDocument): Saying {
   const { changed = 0 } = survey.counts;
   const found = survey.objects ? sum(survey.objects) : changed;
-  const seen = coverage(survey.counts);
   const moving = survey.moving ? ` ${count(survey.moving, "thing")} moved during the visit and ${survey.moving === 1 ? "is" : "are"} not counted.` : "";
-  const more = `${seen}${moving}`;
-  if (!found && !changed) return { tone: "quiet", short: "nothing changed", long: nothingChanged(survey.counts), more };
+  const more = `${coverage(survey.counts)}${moving}`.trim();
+  if (!found && !changed) {
+    const few = lowCoverage(survey.counts);
+    const short = !judged(survey.counts) ? "nothing judged" : few ? "nothing changed in part" : "nothing changed";
+    return { tone: judged(survey.counts) ? "quiet" : "doubt", short, long: nothingChanged(survey.counts), more: few ? more : moving.trim() };
+  }
   if (!found) {
     return { tone: "quiet", short: "no object", long: `No object changed, but ${count(changed, "tile")} did.`, more };
   }
@@ -78,22 +81,27 @@ function readySaying(survey: SurveySummaryDocument): Saying {
 export function nothingChanged(counts: Counts): string {
   const { unobserved = 0 } = counts;
   if (!judged(counts)) return "No tile was seen well enough to judge. Nothing is said about change.";
-  const unseen = unobserved ? ` ${whole(unobserved)} ${unobserved === 1 ? "was" : "were"} not seen.` : "";
-  return `Nothing changed in ${count(judged(counts), "judged tile")}.${unseen}`;
+  const { inconsistent = 0 } = counts;
+  const unseen = unobserved ? `; ${whole(unobserved)} ${unobserved === 1 ? "was" : "were"} not seen` : "";
+  const doubted = inconsistent ? `; ${whole(inconsistent)} ${inconsistent === 1 ? "is" : "are"} in doubt` : "";
+  return `Nothing changed in ${count(judged(counts), "judged tile")}${unseen}${doubted}.`;
 }
 
 /** Say how much of a map a survey saw; empty where it was all. */
 export function coverage(counts: Counts): string {
   const { tiles = 0, unobserved = 0, inconsistent = 0 } = counts;
   const words: string[] = [];
-  const share = tiles ? unobserved / tiles : 0;
-  if (share >= 0.25) {
-    words.push(`${percent(share)} of the map was not seen (${whole(unobserved)} of ${count(tiles, "tile")}): nothing is said about it.`);
+  if (lowCoverage(counts)) {
+    words.push(`${percent(unobserved / tiles)} of the map was not seen (${whole(unobserved)} of ${count(tiles, "tile")}): nothing is said about it.`);
   } else if (unobserved) {
     words.push(`${whole(unobserved)} of ${count(tiles, "tile")} not seen.`);
   }
   if (inconsistent) words.push(`${count(inconsistent, "tile")} in doubt: the registration there is not sure.`);
   return words.join(" ");
+}
+
+function lowCoverage({ tiles = 0, unobserved = 0 }: Counts): boolean {
+  return unobserved >= tiles * 0.25 && unobserved > 0;
 }
 
 function judged(counts: Counts): number {
@@ -125,7 +133,7 @@ export function objectsOf({ objects }: Pick<MapSummaryDocument, "objects">): str
 
 function runningWords(job?: JobDocument): string {
   if (!job) return "running";
-  return job.queue_position ? `queued, ${job.queue_position} ahead or next` : `${job.progress} %`;
+  return job.queue_position ? `waits, ${ordinal(job.queue_position)}` : `${job.progress} %`;
 }
 
 /** Say how far a job is. */

@@ -92,7 +92,7 @@ function Row({ item, chosen, choose }: { item: Item; chosen: boolean; choose: ()
       <span class="item-more">
         {item.status && <span class={`status status-${item.status}`}>{STATUSES[item.status]?.[0] ?? item.status}</span>}
         {item.history?.transient && <span class="status">comes and goes</span>}
-        <span>since {ago(item.firstSeen)}</span>
+        <span title={ago(item.firstSeen)}>since {instant(item.firstSeen)}</span>
         <span>{whereOf(item)}</span>
         {item.device && <span>{item.device}</span>}
       </span>

@@ -2,7 +2,7 @@
 
 import { Fragment, h } from "preact";
 
-import type { FgTileFeature, SightingProperties, TileProperties } from "../documents.ts";
+import type { SightingProperties, TileProperties } from "../documents.ts";
 import { ago, count, instant, metres, percent } from "../format.ts";
 import { whereOf, type Item } from "../items.ts";
 import type { Show } from "../link.ts";
@@ -114,7 +114,7 @@ function AboutObject({ app, item }: Props & { item: Item }) {
       <Fact name="Judged" hint="share of it that both visits could judge">
         <Share value={seen.observed_share} label="Share that both visits could judge" />
       </Fact>
-      <Fact name="Seen through" hint="scans of the other visit whose rays went through where it is">
+      <Fact name="Seen past" hint="scans of the other visit whose rays went through where it is">
         by {count(seen.scans_seen_through, "scan")} of the {item.kind === "disappeared" ? "survey" : "map"}
       </Fact>
       {motion && (
@@ -180,15 +180,13 @@ function AboutTile({ tile, item }: { tile: TileProperties; item: Item }) {
   );
 }
 
-/** The tiles that an object lies in, as the survey in focus tells them. */
+/** The tiles that an object lies in, as the latest survey which saw it tells them. */
 function Tiles({ app, state, item }: Props & { item: Item }) {
-  const { place } = item;
-  const seen = new Map<string, FgTileFeature>();
-  for (const features of Object.values(state.tiles)) for (const one of features) seen.set(one.properties.tile_id, one);
-  if (!place || focusOf(state)?.survey_id !== item.surveyId) return null;
+  const { value } = state.looks;
+  if (value?.id !== item.id) return null;
   return (
     <section>
-      <h3>In {count(place.tiles.length, "tile")}</h3>
+      <h3>In {count(value.tiles.length, "tile")}</h3>
       <table>
         <thead>
           <tr>
@@ -200,8 +198,8 @@ function Tiles({ app, state, item }: Props & { item: Item }) {
           </tr>
         </thead>
         <tbody>
-          {place.tiles.map((id) => (
-            <TileRow key={id} id={id} tile={seen.get(id)?.properties} show={() => app.go({ list: "tiles", item: `tile:${id}` })} />
+          {value.tiles.map((tile) => (
+            <TileRow key={tile.tile_id} tile={tile} show={() => app.go({ list: "tiles", item: `tile:${tile.tile_id}` })} />
           ))}
         </tbody>
       </table>
@@ -209,22 +207,19 @@ function Tiles({ app, state, item }: Props & { item: Item }) {
   );
 }
 
-function TileRow({ id, tile, show }: { id: string; tile: TileProperties | undefined; show: () => void }) {
-  const name = id.replace("tile_", "").replaceAll("_", " ");
-  if (!tile) {
-    return (
-      <tr class="faint">
-        <td>{name}</td>
-        <td colSpan={4}>not changed by itself</td>
-      </tr>
-    );
-  }
+function TileRow({ tile, show }: { tile: TileProperties; show: () => void }) {
+  const name = tile.tile_id.replace("tile_", "").replaceAll("_", " ");
   return (
-    <tr>
+    <tr title={TILE_STATES[tile.state]}>
       <td>
-        <button class="as-link" onClick={show}>
-          {name}
-        </button>
+        <i class={`swatch state-${tile.state}`} />{" "}
+        {tile.state === "changed" ? (
+          <button class="as-link" onClick={show}>
+            {name}
+          </button>
+        ) : (
+          name
+        )}
       </td>
       <td>{tile.score === null ? "none" : percent(tile.score)}</td>
       <td>{tile.observed_share === null ? "not told" : percent(tile.observed_share)}</td>

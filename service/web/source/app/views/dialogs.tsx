@@ -6,7 +6,7 @@ import type { Controller } from "../controller.ts";
 import { KEYS } from "../keys.ts";
 import type { Question } from "../state.ts";
 import { capital } from "../words.ts";
-import type { Props } from "./page.tsx";
+import { ThemeButton, type Props } from "./page.tsx";
 import { shown } from "./upload.tsx";
 
 export function Dialogs({ app, state }: Props) {
@@ -15,7 +15,7 @@ export function Dialogs({ app, state }: Props) {
   return (
     <>
       <dialog ref={(element) => shown(element, dialog === "help")} onClose={() => dialog === "help" && close()} aria-labelledby="help-title">
-        <Help close={close} />
+        <Help app={app} state={state} close={close} />
       </dialog>
       <dialog ref={(element) => shown(element, dialog === "key")} onClose={() => dialog === "key" && close()} aria-labelledby="key-title">
         {dialog === "key" && <KeyForm app={app} refused={state.asksKey?.detail ?? ""} had={state.hasKey} />}
@@ -36,7 +36,7 @@ export function Dialogs({ app, state }: Props) {
   );
 }
 
-function Help({ close }: { close: () => void }) {
+function Help({ app, state, close }: Pick<Props, "app" | "state"> & { close: () => void }) {
   return (
     <form method="dialog">
       <h2 id="help-title">Keys</h2>
@@ -57,6 +57,7 @@ function Help({ close }: { close: () => void }) {
         here.
       </p>
       <div class="row end">
+        <ThemeButton app={app} state={state} always />
         <button class="primary" onClick={close}>
           Close
         </button>

@@ -74,11 +74,11 @@ function Panel(props: Props) {
         ))}
       </div>
       <div id="panel-body" class="panel-body" role="tabpanel" aria-labelledby={`tab-${tab}`}>
-        <OpenJobs app={app} state={state} />
         {tab === "changes" && <Changes {...props} />}
         {tab === "survey" && <SurveyTab {...props} />}
         {tab === "map" && <MapTab {...props} />}
       </div>
+      <OpenJobs app={app} state={state} />
     </section>
   );
 }

@@ -66,19 +66,28 @@ function Head({ app, state }: Props) {
       </span>
       <div class="actions">
         {place.map && map.value?.status === "ready" && (
-          <button onClick={() => app.update({ upload: newUpload(place.map) })}>Add survey</button>
+          <button aria-label="Add survey" onClick={() => app.update({ upload: newUpload(place.map) })}>
+            Add<span class="wide-only"> survey</span>
+          </button>
         )}
         {!place.map && <button onClick={() => app.update({ upload: newUpload(null) })}>New map</button>}
         {place.map && <button onClick={() => share(app)}>Share</button>}
-        <button class="wide-only" title={themeTitle(state.theme)} onClick={() => app.useTheme(nextTheme(state))}>
-          {shownTheme(state) === "dark" ? "Light" : "Dark"}
-        </button>
+        <ThemeButton app={app} state={state} />
         {state.hasKey && <button onClick={() => app.useKey(null)}>Forget key</button>}
         <button aria-label="Keys and help" title="Keys and help (?)" onClick={() => app.update({ dialog: "help" })}>
           ?
         </button>
       </div>
     </header>
+  );
+}
+
+/** Switches between light and dark; on a small screen it is among the keys and help. */
+export function ThemeButton({ app, state, always }: Pick<Props, "app" | "state"> & { always?: boolean }) {
+  return (
+    <button type="button" class={always ? "" : "wide-only"} title={themeTitle(state.theme)} onClick={() => app.useTheme(nextTheme(state))}>
+      {shownTheme(state) === "dark" ? "Light" : "Dark"}
+    </button>
   );
 }
 

@@ -16,6 +16,7 @@ interface ScansProps {
 export function Scans({ scans, names, placing }: ScansProps) {
   const refused = scans.filter(({ accepted }) => accepted === false);
   const accepted = scans.filter((scan) => scan.accepted);
+  const sure = accepted.some(({ confidence }) => confidence !== null); // it is not asked of the scans of a map
   const waiting = scans.length - refused.length - accepted.length;
   return (
     <section>
@@ -35,12 +36,13 @@ export function Scans({ scans, names, placing }: ScansProps) {
               <th>Scan</th>
               <th title="share of its points that lie on the map">Fitness</th>
               <th title="root mean square distance of those points">RMSE</th>
-              <th title="that it stands where it was taken">Sure</th>
+              {sure && <th title="that it stands where it was taken">Sure</th>}
+              <th title="where it stands, one sigma in the direction that is held worst">±</th>
             </tr>
           </thead>
           <tbody>
             {accepted.map((scan) => (
-              <Accepted key={scan.scan_id} scan={scan} name={names[scan.scan_id] || scan.scan_id} />
+              <Accepted key={scan.scan_id} scan={scan} sure={sure} name={names[scan.scan_id] || scan.scan_id} />
             ))}
           </tbody>
         </table>
@@ -49,19 +51,19 @@ export function Scans({ scans, names, placing }: ScansProps) {
   );
 }
 
-function Accepted({ scan, name }: { scan: ScanOutcome; name: string }) {
-  const sigma = scan.translation_sigma === null ? "" : `stands within ${metres(scan.translation_sigma)} (one sigma)`;
+function Accepted({ scan, name, sure }: { scan: ScanOutcome; name: string; sure: boolean }) {
   return (
     <>
-      <tr title={sigma}>
+      <tr>
         <td class="name">{name}</td>
         <td>{scan.fitness === null ? "" : percent(scan.fitness)}</td>
         <td>{scan.rmse === null ? "" : metres(scan.rmse)}</td>
-        <td>{scan.confidence === null ? "not asked" : percent(scan.confidence)}</td>
+        {sure && <td>{scan.confidence === null ? "not asked" : percent(scan.confidence)}</td>}
+        <td>{scan.translation_sigma === null ? "" : metres(scan.translation_sigma)}</td>
       </tr>
       {scan.warnings.length > 0 && (
         <tr>
-          <td colSpan={4}>
+          <td colSpan={5}>
             <Warnings warnings={scan.warnings} />
           </td>
         </tr>

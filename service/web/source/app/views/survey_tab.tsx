@@ -27,6 +27,7 @@ export function SurveyTab(props: Props) {
   const { tone, long, more } = sayingOf(focus, jobOf(state, focus.job_id));
   const job = jobOf(state, focus.job_id);
   const { value, problem } = state.survey;
+  const failedAlone = focus.status === "failed" && focus.placement?.state !== "refused"; // else each scan says why
   return (
     <div class="about">
       <h2>
@@ -34,14 +35,15 @@ export function SurveyTab(props: Props) {
         {instant(focus.captured_at)}
       </h2>
       <p class={`saying tone-${tone}`}>{long}</p>
-      {focus.status === "failed" && focus.problem ? <Problem problem={focus.problem} /> : more && <p>{more}</p>}
+      {failedAlone && focus.problem ? <Problem problem={focus.problem} /> : more && focus.status === "ready" && <p>{more}</p>}
       <Warnings warnings={focus.warnings} />
       <Tally survey={focus} />
       <dl class="facts">
         <Fact name="Placement" hint="how sure it is that the scans stand where they were taken">
           {focus.placement ? (
             <>
-              {focus.placement.state.replace("_", " ")} <Share value={focus.placement.confidence} label="Confidence of the placement" />
+              {focus.placement.state.replace("_", " ")}{" "}
+              {focus.placement.confidence !== null && <Share value={focus.placement.confidence} label="Confidence of the placement" />}
             </>
           ) : (
             "not told"

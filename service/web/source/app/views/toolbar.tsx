@@ -3,7 +3,7 @@
 import { Fragment, h } from "preact";
 
 import { toggled } from "../filters.ts";
-import { metres, percent, whole } from "../format.ts";
+import { height, percent, whole } from "../format.ts";
 import type { Show } from "../link.ts";
 import { focusOf, sectionOf, showOf, type LayerState } from "../state.ts";
 import { TILE_STATES } from "../words.ts";
@@ -85,7 +85,7 @@ function Section({ app, state }: Props) {
   const slider = (name: string, value: number, change: (value: number) => void) => (
     <label>
       <span>
-        {name} <output>{metres(value)}</output>
+        {name} <output>{height(value)}</output>
       </span>
       <input type="range" min={low} max={high} step={0.05} value={value} onInput={({ currentTarget }) => change(Number(currentTarget.value))} />
     </label>
@@ -96,7 +96,7 @@ function Section({ app, state }: Props) {
       {slider("From", section[0], (value) => set([value, Math.max(section[1], value + 0.1)]))}
       <label class="check">
         <input type="checkbox" checked={state.place.section === null} disabled={ceiling === null} onChange={() => app.go({ section: state.place.section === null ? [low, high] : null })} />
-        {ceiling === null ? "no ceiling was found" : `cut the ceiling, at ${metres(ceiling)}`}
+        {ceiling === null ? "no ceiling was found" : `cut the ceiling, at ${height(ceiling)}`}
       </label>
     </div>
   );
