@@ -33,7 +33,7 @@ from service.api.http.submission import (
 )
 from service.catalog import blob_keys
 from service.catalog.idempotency import Answer, Once
-from service.catalog.records import Anchor, Built, JobRecord, MapRecord, MapStatus, MapSummary
+from service.catalog.records import Anchor, Built, JobRecord, MapRecord, MapStatus, MapSummary, Tileset
 
 router = APIRouter(tags=["maps"])
 MapId = Annotated[Id, Path()]
@@ -310,18 +310,19 @@ def _links(record: MapSummary, request: HttpRequest) -> list[Link]:
     ]
     if record.status == "ready":
         links += [
-            *file_links(request, here),
+            *file_links(request, here, record.tileset),
             link(request, f"{here}/changes", "changes", "application/geo+json"),
             link(request, f"{here}/objects", "objects", "application/geo+json"),
         ]
     return links
 
 
-def file_links(request: HttpRequest, here: str) -> list[Link]:
+def file_links(request: HttpRequest, here: str, tileset: Tileset | None) -> list[Link]:
     """Return the links to the files of a map, or of a version of one, that lies at `here`."""
     return [
         link(request, f"{here}/manifest", "manifest"),
         link(request, f"{here}/cloud.ply", "cloud", bodies.RAW),
+        *([link(request, f"{here}/tileset.json", "tileset")] if tileset is not None else []),
     ]
 
 

@@ -256,6 +256,8 @@ def _links(record: SurveySummary, request: HttpRequest) -> list[Link]:
             link(request, f"{here}/cloud.ply", "cloud", bodies.RAW),
             link(request, f"{here}/picture.png", "preview", "image/png"),
         ]
+    if record.tileset is not None:
+        links.append(link(request, f"{here}/tileset.json", "tileset"))
     if _refused(record):
         links.append(link(request, f"{here}/picture.png", "preview", "image/png"))
     if record.status == "ready" and record.objects is not None:

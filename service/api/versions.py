@@ -211,5 +211,5 @@ def _links(record: VersionSummary, request: HttpRequest) -> list[Link]:
     if record.survey_id is not None:
         links.append(link(request, f"/surveys/{record.survey_id}", "survey"))
     if record.status == "ready":
-        links += file_links(request, here)
+        links += file_links(request, here, record.tileset)
     return links

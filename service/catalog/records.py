@@ -327,6 +327,15 @@ class ObjectRecord(Record):
         return self
 
 
+class Tileset(Record):
+    """How large the tileset of a cloud is (3D Tiles 1.1)."""
+
+    n_points: int = Field(description="all points of the cloud, each in one content", examples=[5181342])
+    contents: int = Field(examples=[214])
+    bytes: int = Field(description="of all contents", examples=[62181520])
+    sha256: str = Field(description="of the same; its first digits are part of their addresses")
+
+
 class BuiltSummary(Record):
     """What lists tell of maps and of versions alike."""
 
@@ -337,6 +346,9 @@ class BuiltSummary(Record):
     scan_count: int = Field(description="scans that it is made of, accepted or not", examples=[25])
     bounds: Bounds | None = Field(description="metres, map frame")  #: None until it is built
     counts: dict[str, int] = Field(examples=[{"points": 181342, "tiles": 172, "scans": 25, "accepted": 24}])
+    tileset: Tileset | None = Field(
+        description="of the fused cloud, `tileset.json`; null until it is built, and of what an earlier release built"
+    )
     job_id: str  #: of the job that builds it, and so of its files (`blob_keys.map_folder`)
     problem: Problem | None
     created: Utc
@@ -422,6 +434,10 @@ class SurveySummary(Record):
     moving: int | None = Field(
         description="things that moved while the visit lasted, people for the most part; they are no objects",
         examples=[3],
+    )
+    tileset: Tileset | None = Field(
+        description="of the coloured cloud, `tileset.json`; null until it is done, and where the cloud is small enough to "
+        "be read whole"
     )
     job_id: str
     problem: Problem | None

@@ -29,6 +29,7 @@ from service.catalog.records import (
     SurveyRecord,
     SurveySummary,
     TileRecord,
+    Tileset,
     TileState,
 )
 from service.catalog.scans import (
@@ -153,6 +154,7 @@ class Surveys:
         threshold: float,
         objects: Iterable[ObjectRecord] | None = None,
         moving: int | None = None,
+        tileset: Tileset | None = None,
     ) -> None:
         """Record tiles and objects, replacing those of an earlier run; `jobs.succeed` makes the survey ready.
 
@@ -179,6 +181,7 @@ class Surveys:
             row.counts = {"tiles": len(tiles), **{state: by_state[state] for state in get_args(TileState)}}
             row.objects = {kind: by_kind[kind] for kind in get_args(ObjectKind)} if told else None
             row.moving = moving
+            row.tileset = None if tileset is None else tileset.model_dump()
             row.updated = now()
             if row.status == "ready":  # a step that was thought lost runs beside its second run, and is late
                 history.rewrite(session, row.map_id)

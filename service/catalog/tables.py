@@ -159,6 +159,7 @@ class MapVersion(Base):
     bounds: Mapped[dict[str, Any] | None]
     counts: Mapped[dict[str, int]]
     registration: Mapped[dict[str, Any] | None]
+    tileset: Mapped[dict[str, Any] | None]  #: None of what earlier releases built
     created: Mapped[datetime]
     updated: Mapped[datetime]
 
@@ -219,6 +220,7 @@ class Survey(Base):
     counts: Mapped[dict[str, int]]
     objects: Mapped[dict[str, int] | None]
     moving: Mapped[int | None]
+    tileset: Mapped[dict[str, Any] | None]
     job_id: Mapped[str]
     created: Mapped[datetime]
     updated: Mapped[datetime]

@@ -20,6 +20,7 @@ from service.catalog.records import (
     Page,
     Position,
     ScanOutcome,
+    Tileset,
     VersionRecord,
     VersionSummary,
 )
@@ -122,6 +123,7 @@ class Versions:
         bounds: Bounds,
         counts: Mapping[str, int],
         registration: Mapping[str, Any] | None = None,
+        tileset: Tileset | None = None,
     ) -> None:
         """Record what was built, replacing an earlier run's result; `jobs.succeed` makes it ready.
 
@@ -135,6 +137,7 @@ class Versions:
             row.bounds = bounds.model_dump(mode="json")
             row.counts = dict(counts)
             row.registration = None if registration is None else dict(registration)
+            row.tileset = None if tileset is None else tileset.model_dump()
             row.updated = now()
 
     def delete(self, map_id: str, number: int) -> None:

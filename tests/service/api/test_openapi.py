@@ -4,14 +4,20 @@ from __future__ import annotations
 
 import json
 import re
+import threading
+import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import pytest
+from fastapi.openapi.utils import get_openapi
 
 from service.api import openapi
+from service.api.app import create_app
 from service.api.http.description import not_null, operations, schemas_under
+from service.settings import Settings
 
 PROJECT = Path(__file__).resolve().parents[3]
 WRITTEN = PROJECT / openapi.FILE
@@ -82,6 +88,7 @@ def test_every_call_of_the_public_api_is_described(document: dict[str, Any]) -> 
         "DELETE /maps/{map_id}",
         "GET /maps/{map_id}/manifest",
         "GET /maps/{map_id}/cloud.ply",
+        "GET /maps/{map_id}/tileset.json",
         "PUT /maps/{map_id}/anchor",
         "DELETE /maps/{map_id}/anchor",
         "POST /maps/{map_id}/versions",
@@ -90,6 +97,8 @@ def test_every_call_of_the_public_api_is_described(document: dict[str, Any]) -> 
         "DELETE /maps/{map_id}/versions/{number}",
         "GET /maps/{map_id}/versions/{number}/manifest",
         "GET /maps/{map_id}/versions/{number}/cloud.ply",
+        "GET /maps/{map_id}/versions/{number}/tileset.json",
+        "GET /maps/{map_id}/versions/{number}/tileset/{content}",
         "POST /maps/{map_id}/models",
         "POST /maps/{map_id}/surveys",
         "GET /maps/{map_id}/surveys",
@@ -102,6 +111,8 @@ def test_every_call_of_the_public_api_is_described(document: dict[str, Any]) -> 
         "GET /surveys/{survey_id}/tiles",
         "GET /surveys/{survey_id}/cloud.ply",
         "GET /surveys/{survey_id}/picture.png",
+        "GET /surveys/{survey_id}/tileset.json",
+        "GET /surveys/{survey_id}/tileset/{content}",
         "GET /",
         "GET /conformance",
         "GET /processes",
@@ -217,6 +228,23 @@ def test_forms_admit_their_own_files_and_no_other_field(document: dict[str, Any]
 
 
 @pytest.mark.slow
+def test_first_requests_that_come_together_have_it_made_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    app, made, real = create_app(Settings(data_dir=tmp_path)), [], get_openapi
+
+    def slowly(**given: Any) -> dict[str, Any]:
+        made.append(threading.current_thread().name)
+        time.sleep(0.05)
+        return real(**given)
+
+    monkeypatch.setattr("service.api.app.get_openapi", slowly)
+    with ThreadPoolExecutor(4) as pool:
+        documents = list(pool.map(lambda _: app.openapi(), range(4)))
+    assert len(made) == 1
+    assert all(document is documents[0] for document in documents)
+
+
 def test_importing_the_api_brings_neither_torch_nor_the_worker() -> None:
     import subprocess
     import sys
