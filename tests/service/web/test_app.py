@@ -68,3 +68,20 @@ def test_every_word_of_the_api_has_words_for_people(table: str, known: Any) -> N
     body = re.search(rf"export const {table}:.*?= \{{\n(.*?)^\}};", text, re.MULTILINE | re.DOTALL)
     assert body is not None
     assert set(get_args(known)) <= set(re.findall(r"^  (\w+):", body[1], re.MULTILINE))
+
+
+def test_the_page_for_operators_has_every_key_and_every_member_of_a_link() -> None:
+    page = (ROOT / "docs" / "viewer.md").read_text()
+    keys = re.search(
+        r"KEYS: [^=]*= \[\n(.*?)^\];", (SOURCE / "keys.ts").read_text(), re.MULTILINE | re.DOTALL
+    )
+    members = re.search(
+        r"const words: [^=]*= \[\n(.*?)^  \];", (SOURCE / "link.ts").read_text(), re.MULTILINE | re.DOTALL
+    )
+    assert keys is not None
+    assert members is not None
+    pressed = [key for shown in re.findall(r'^  \["([^"]+)"', keys[1], re.MULTILINE) for key in shown.split()]
+    named = re.findall(r'^    \["(\w+)"', members[1], re.MULTILINE)
+    assert len(pressed) > 15
+    assert len(named) > 10
+    assert [one for one in [*pressed, *named, "tiles"] if f"`{one}`" not in page] == []
