@@ -8,24 +8,25 @@ TOOLS := build/tools
 NODE := build/node
 NODE_VERSION := 24.19.0
 WEB := service/web/source
+BUNDLE := service/web/built/index.html
 
 .PHONY: help web browser servers tools demo up test test-fast acceptance-shared check format bench chaos fuzz schemathesis load soak openapi client clean
 help: ## this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
 
-web: $(NODE)/.node-$(NODE_VERSION) $(WEB)/node_modules/.installed ## build the viewer that the service shows at /
+web: $(WEB)/node_modules/.installed ## build the viewer that the service shows at /
 	@PATH="$(CURDIR)/$(NODE)/bin:$$PATH" npm --prefix $(WEB) run --silent build
 
-demo: $(INSTALLED) ## simulate a building, run the whole service on it, show what changed; on a terminal the viewer stays
+demo: $(INSTALLED) $(BUNDLE) ## simulate a building, run the whole service on it, show what changed; on a terminal the viewer stays
 	$(BIN)/spicd-worker demo --look
 
-up: $(INSTALLED) ## start the service to stay: API, workers, embedded Redis
+up: $(INSTALLED) $(BUNDLE) ## start the service to stay: API, workers, embedded Redis
 	$(BIN)/spicd up
 
-test: $(INSTALLED) ## every test, on all cores
+test: $(INSTALLED) $(BUNDLE) ## every test, on all cores
 	$(BIN)/pytest -n auto --dist loadscope
 
-test-fast: $(INSTALLED) ## the tests that take no longer than a second or so: under a minute on two cores
+test-fast: $(INSTALLED) $(BUNDLE) ## the tests that take no longer than a second or so: under a minute on two cores
 	$(BIN)/pytest -m fast -n auto --dist loadscope
 
 browser: ## a headless Chromium for the tests of the viewer, where apt-get may install one
@@ -76,7 +77,7 @@ client: $(INSTALLED) $(TOOLS)/.installed ## write anew what service/client has o
 	$(BIN)/python .ci/client.py
 
 clean: ## remove the environment and everything made
-	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache *.egg-info build demo bench
+	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache *.egg-info build demo bench service/web/built $(WEB)/node_modules
 
 $(INSTALLED): pyproject.toml docker/constraints.txt docker/system-libraries.sh
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "SPICD needs Python 3.11 or later; name one: make PYTHON=python3.12")'
@@ -90,6 +91,11 @@ $(INSTALLED): pyproject.toml docker/constraints.txt docker/system-libraries.sh
 $(SERVERS)/bin/moto_server:
 	@$(PYTHON) -m venv $(SERVERS)
 	@$(SERVERS)/bin/python -m pip install --quiet --disable-pip-version-check 'moto[s3]==5.2.5' 'flask==3.1.3' 'flask-cors==6.0.5'
+
+# Where npm's registry does not answer all else goes on: the page at / then says that it is not built.
+$(BUNDLE): $(shell find $(WEB) -name node_modules -prune -o -type f -print)
+	@if $(MAKE) --silent $(WEB)/node_modules/.installed >/dev/null 2>&1; then $(MAKE) --silent web; \
+		else echo "The viewer is not built, for its packages cannot be had here; make web says why."; fi
 
 # Node comes from PyPI, the packages by the lock file, from whatever registries the machine is set up for.
 $(NODE)/.node-$(NODE_VERSION):

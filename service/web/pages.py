@@ -58,13 +58,13 @@ _NOT_BUILT = """\
 """
 
 
-def add_viewer(app: FastAPI, *, built: Path = BUILT) -> None:
+def add_viewer(app: FastAPI) -> None:
     """Add the files that the page loads, `/web/{name}`, to an app; `/` itself is the landing page's."""
 
     async def asset(request: Request) -> Response:
-        return await run_in_threadpool(_asset, built, request.path_params["name"])
+        return await run_in_threadpool(_asset, request.app.state.viewer, request.path_params["name"])
 
-    app.state.viewer = built
+    app.state.viewer = BUILT
     app.add_route("/web/{name}", asset, include_in_schema=False)
 
 

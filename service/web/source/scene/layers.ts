@@ -20,7 +20,7 @@ export interface LoadedLayer {
   readonly group: Group;
   readonly bounds: Box;
   readonly levels: Levels;
-  /** Metres between neighbouring points; 0: they differ. */
+  /** Metres between neighbouring points, of a tileset where they are closest. */
   readonly spacing: number;
   /** Resolves once there are points to draw. */
   readonly ready: Promise<void>;

@@ -245,7 +245,6 @@ export class Scene {
     if (!this.#sectionChosen) this.#uniforms.section.value.set(-1e9, ceiling ?? 1e9);
     this.#rig.extent = extent;
     if (!this.#viewChosen) this.#rig.view = this.#rig.viewOf(extent, "first");
-    this.#eyeDome.grain = Math.max(...[...this.#layers.values()].map(({ spacing }) => spacing));
     this.#invalidate();
   }
 
@@ -321,6 +320,7 @@ export class Scene {
       layer.thin(this.#moving ? this.#share : 1);
       layer.update(camera, this.#renderer);
     }
+    this.#eyeDome.grain = Math.max(0, ...[...this.#layers.values()].map(({ spacing }) => spacing));
     for (const half of this.#shown === "split" ? (["before", "after"] as const) : [null]) this.#drawHalf(half);
   }
 

@@ -74,7 +74,7 @@ export class TilesetLayer implements LoadedLayer {
   readonly group = new Group();
   readonly ready: Promise<void>;
   readonly bounds: Box;
-  readonly spacing = 0;
+  spacing = 0;
   levels: Levels;
   drawable = false;
   readonly #tiles: TilesRenderer;
@@ -146,7 +146,9 @@ export class TilesetLayer implements LoadedLayer {
     const bounds = boundsOf(positions);
     if (bounds === null) return 0.05;
     if (!this.drawable) [this.levels, this.drawable] = [levelsOf(positions, bounds), true];
-    return spacingOf(positions, bounds);
+    const spacing = spacingOf(positions, bounds);
+    this.spacing = this.spacing === 0 ? spacing : Math.min(this.spacing, spacing);
+    return spacing;
   }
 }
 
