@@ -10,7 +10,7 @@ NODE_VERSION := 24.19.0
 WEB := service/web/source
 BUNDLE := service/web/built/index.html
 
-.PHONY: help web browser servers tools demo up test test-fast acceptance-shared check format bench chaos fuzz schemathesis load soak openapi client clean
+.PHONY: help web screenshots browser servers tools demo up test test-fast acceptance-shared check format bench chaos fuzz schemathesis load soak openapi client clean
 help: ## this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
 
@@ -28,6 +28,9 @@ test: $(INSTALLED) $(BUNDLE) ## every test, on all cores
 
 test-fast: $(INSTALLED) $(BUNDLE) ## the tests that take no longer than a second or so: under a minute on two cores
 	$(BIN)/pytest -m fast -n auto --dist loadscope
+
+screenshots: $(INSTALLED) web browser ## draw the pictures of docs/viewer-pictures.md and the README anew: two minutes
+	$(BIN)/python -m tests.browser.screenshots
 
 browser: ## a headless Chromium for the tests of the viewer, where apt-get may install one
 	@sh docker/browser.sh
