@@ -1,11 +1,13 @@
 /** Holds the state, changes it, and keeps the address of the page the same as what is shown. */
 
 import { Api, ApiError, problemOf } from "./api.ts";
-import type { CloudEvent } from "./documents.ts";
+import type { CloudEvent, Counts } from "./documents.ts";
 import { follow, type Line } from "./follow.ts";
+import { count } from "./format.ts";
 import { NOWHERE, readPlace, writePlace, type Place } from "./link.ts";
 import * as loads from "./loads.ts";
 import { firstState, isOpen, nothingOfAMap, type Loaded, type Question, type State, type Theme } from "./state.ts";
+import { kinds } from "./words.ts";
 
 const KEY = "spicd-key"; // in sessionStorage: it goes with the tab
 const THEME = "spicd-theme"; // in localStorage
@@ -62,7 +64,7 @@ export class Controller {
 
   /** Go to a map, or to the list of maps. */
   open(map: string | null): void {
-    this.go({ ...NOWHERE, map });
+    this.go({ ...NOWHERE, map, embed: this.state.place.embed });
   }
 
   #arrive(place: Place): void {
@@ -106,7 +108,7 @@ export class Controller {
       this.tell("This map was deleted.", "bad");
     }
     for (const { type, data } of events) {
-      if (type === "survey.ready") this.tell("A survey is ready.");
+      if (type === "survey.ready") this.tell(`A survey is ready${foundBy(data)}.`);
       if (type === "survey.failed") this.tell("A survey failed; the timeline says why.", "bad");
       if (type === "version.ready" && map) this.tell(`Version ${String(data["version"])} of the map is ready.`);
     }
@@ -186,6 +188,13 @@ export class Controller {
     localStorage.setItem(THEME, theme);
     this.update({ theme });
   }
+}
+
+/** Say in short what an event tells that a survey found; a survey in doubt tells no objects. */
+function foundBy({ objects, counts }: CloudEvent["data"]): string {
+  if (objects) return `: ${kinds(objects as Counts) || "no object changed"}`;
+  const { changed = 0 } = (counts ?? {}) as Counts;
+  return changed ? `: ${count(changed, "changed tile")}` : "";
 }
 
 function isStep(from: Place, to: Place): boolean {

@@ -46,13 +46,18 @@ export function filtered(
   const begin = beginOf(filters.since, now);
   return items.filter(
     (item) =>
-      (!filters.kinds.length || filters.kinds.includes(item.kind)) &&
+      (!filters.kinds.length || filters.kinds.some((kind) => isKind(item, kind))) &&
       (!filters.statuses.length || item.status === null || filters.statuses.includes(item.status)) &&
       (!filters.device || item.device === filters.device) &&
       (!begin || new Date(item.firstSeen) >= begin) &&
       item.probability >= filters.minScore &&
       (!filters.inSection || !section || (item.box.max[2] > section[0] && item.box.min[2] < section[1])),
   );
+}
+
+/** Tell whether an item is of a kind; a tile where things appeared and disappeared is of both. */
+function isKind({ kind }: Item, wanted: string): boolean {
+  return kind === wanted || (kind === "both" && (wanted === "appeared" || wanted === "disappeared"));
 }
 
 /** Count how many filters are set. */

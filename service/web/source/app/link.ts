@@ -17,6 +17,7 @@ export interface Place {
   tab: Tab;
   list: "objects" | "tiles";
   filters: Filters;
+  embed: boolean; // in a frame of another page: the scene and the timeline alone
 }
 
 export const NOWHERE: Place = {
@@ -30,6 +31,7 @@ export const NOWHERE: Place = {
   tab: "changes",
   list: "objects",
   filters: NO_FILTERS,
+  embed: false,
 };
 
 const SHOWS = ["reference", "survey", "both", "split"];
@@ -62,6 +64,7 @@ export function readPlace(fragment: string): Place {
       minScore: share(said.get("min_score")),
       inSection: said.has("in_section"),
     },
+    embed: said.has("embed"),
   };
 }
 
@@ -85,6 +88,7 @@ export function writePlace(place: Place): string {
     ["since", filters.since],
     ["min_score", filters.minScore ? String(filters.minScore) : null],
     ["in_section", filters.inSection ? "1" : null],
+    ["embed", place.embed ? "1" : null],
   ];
   const said = words.filter(([, value]) => value).map(([name, value]) => `${name}=${plain(value as string)}`);
   if (place.map && place.tiles.join() !== NOWHERE.tiles.join()) said.push(`tiles=${place.tiles.join(",")}`);

@@ -163,12 +163,17 @@ export function shownTheme({ theme }: State): "light" | "dark" {
   return matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light";
 }
 
+/** Return the version of the map that is looked at: what the survey in focus was compared with, else the one in use. */
+export function referenceVersion(state: State): number {
+  const focus = state.place.survey || state.place.item ? focusOf(state) : null;
+  return focus?.map_version ?? (state.map.value as MapDocument).version;
+}
+
 /** Return the cloud of the map, of the version that the survey in focus was compared with where it is looked at. */
 function referenceOf(state: State): CloudSource | null {
   const map = state.map.value as MapDocument;
   if (map.status !== "ready") return null;
-  const focus = state.place.survey || state.place.item ? focusOf(state) : null;
-  const version = focus?.map_version ?? map.version;
+  const version = referenceVersion(state);
   const base = `maps/${map.map_id}`;
   if (version !== map.version) return { url: `${base}/versions/${version}/cloud.ply`, kind: "ply" };
   const tileset = map.links.find(({ rel }) => rel === "tileset");

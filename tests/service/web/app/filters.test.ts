@@ -2,8 +2,8 @@ import assert from "node:assert/strict";
 import { test } from "node:test";
 
 import { active, beginOf, filtered, NO_FILTERS, tally, toggled } from "../../../../service/web/source/app/filters.ts";
-import { itemOfObject } from "../../../../service/web/source/app/items.ts";
-import { box, object } from "./samples.ts";
+import { itemOfObject, itemOfTile } from "../../../../service/web/source/app/items.ts";
+import { box, object, tile } from "./samples.ts";
 
 const THURSDAY = new Date(2026, 2, 5, 15, 30); // 5 March 2026, local time
 
@@ -27,6 +27,12 @@ test("kinds, statuses, device and probability each keep what they name", () => {
   assert.deepEqual(ids({ statuses: ["still_there"] }), ["old"]);
   assert.deepEqual(ids({ device: "robot-8" }), ["late"]);
   assert.deepEqual(ids({ minScore: 0.7 }), ["late", "upstairs"]);
+});
+
+test("a tile where something appeared and something disappeared is of both kinds", () => {
+  const both = [itemOfTile(tile({ appeared: 3, disappeared: 4 }))];
+  for (const kind of ["appeared", "disappeared", "both"]) assert.equal(filtered(both, { ...NO_FILTERS, kinds: [kind] }).length, 1);
+  assert.equal(filtered(both, { ...NO_FILTERS, kinds: ["moved"] }).length, 0);
 });
 
 test("since Monday is since the night to this week's Monday", () => {

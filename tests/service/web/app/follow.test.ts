@@ -11,7 +11,7 @@ function stream(text: string): Response {
 }
 
 /** Follow with scripted answers; ends with the last of them. Returns what was asked and what was told. */
-async function followed(answers: ((headers: Headers, url: string) => Response)[]) {
+async function followed(answers: ((headers: Headers, signal: AbortSignal) => Response)[]) {
   const ended = new AbortController();
   const asked: { url: string; after: string | null }[] = [];
   const told: string[] = [];
@@ -23,7 +23,7 @@ async function followed(answers: ((headers: Headers, url: string) => Response)[]
       ended.abort();
       throw new DOMException("gone", "AbortError");
     }
-    return answer(headers, String(input));
+    return answer(headers, init.signal as AbortSignal);
   };
   const follower: Follower = {
     onEvents: (events) => told.push(...events.map(({ sequence }) => sequence)),
@@ -61,20 +61,17 @@ test("without a key that is known it stops until there is one", async () => {
 
 test("where something holds the stream back it asks again and again, and misses nothing", async (context) => {
   context.mock.timers.enable({ apis: ["setTimeout"] });
-  const held = (headers: Headers): Response => {
+  const heldBack = (headers: Headers, signal: AbortSignal) => {
     assert.equal(headers.get("Accept"), "text/event-stream");
-    queueMicrotask(() => context.mock.timers.tick(6000));
-    return new Response(new ReadableStream()); // nothing ever comes
-  };
-  const heldBack = (headers: Headers) => {
-    const answer = held(headers);
-    queueMicrotask(() => context.mock.timers.tick(6000));
-    return answer;
+    setImmediate(() => context.mock.timers.tick(6000));
+    const nothing = new ReadableStream({
+      start: (controller) => signal.addEventListener("abort", () => controller.error(new DOMException("gone", "AbortError"))),
+    });
+    return new Response(nothing);
   };
   const list = (cursor: string, ...sequences: string[]) =>
     Response.json({ cursor, events: sequences.map((sequence) => ({ type: "survey.ready", subject: "s", sequence, data: {} })), links: [] });
-  const run = followed([heldBack, () => list("7"), () => list("8", "8")]);
-  const { asked, told } = await run;
+  const { asked, told } = await followed([heldBack, () => list("7"), () => list("8", "8")]);
   assert.deepEqual(told, ["polling", "8"]);
   assert.deepEqual(asked.slice(1).map(({ url }) => new URL(url).search), ["?limit=1", "?after=7&wait=20", "?after=8&wait=20"]);
 });

@@ -20,6 +20,7 @@ test("a place is the same after it was written and read", () => {
     tab: "survey",
     list: "tiles",
     filters: { kinds: ["appeared", "moved"], statuses: ["new"], device: "robot 7/ä", since: "monday", minScore: 0.5, inSection: true },
+    embed: true,
   };
   assert.deepEqual(readPlace(`#${writePlace(place)}`), place);
 });

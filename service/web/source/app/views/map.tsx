@@ -4,7 +4,6 @@ import { h } from "preact";
 
 import type { Tab } from "../link.ts";
 import { chosenItem, shownItems } from "../state.ts";
-import { progressOf } from "../words.ts";
 import { jobOf } from "../state.ts";
 import { Changes } from "./changes.tsx";
 import { Details } from "./details.tsx";
@@ -105,8 +104,7 @@ function Unready({ app, state }: Props) {
     <main id="main" class="maps" tabIndex={-1}>
       {map.status === "building" ? (
         <Empty title="This map is being built.">
-          <p>{job ? progressOf(job) : "Its job waits."}</p>
-          {job && <progress max={100} value={job.progress} aria-label="Progress of the map" />}
+          {!job && <p>Its job waits.</p>}
           <p class="faint">The page goes on by itself when it is ready. It may be left meanwhile.</p>
         </Empty>
       ) : (

@@ -2,9 +2,10 @@
 
 import { h } from "preact";
 
+import type { MapDocument } from "../documents.ts";
 import { count, extent, instant, whole } from "../format.ts";
 import type { Props } from "./page.tsx";
-import { Fact, Problem } from "./parts.tsx";
+import { Download, Fact, Problem } from "./parts.tsx";
 import { Scans } from "./scans.tsx";
 
 export function MapTab({ app, state }: Pick<Props, "app" | "state">) {
@@ -24,13 +25,14 @@ export function MapTab({ app, state }: Pick<Props, "app" | "state">) {
           <code>{map.map_id}</code>
         </Fact>
       </dl>
-      {map.status === "ready" && (
-        <div class="row">
-          <a href={`maps/${map.map_id}/cloud.ply`} onClick={(event) => state.hasKey && download(event, app, map.map_id)}>
-            Download the cloud (PLY)
-          </a>
-        </div>
-      )}
+      <div class="row">
+        {map.status === "ready" && (
+          <Download app={app} path={`maps/${map.map_id}/cloud.ply`} name={`${map.map_id}.ply`}>
+            Cloud (PLY)
+          </Download>
+        )}
+        <button onClick={() => remove({ app }, map)}>Delete the map</button>
+      </div>
       <Versions state={state} />
       <Scans scans={map.scans} names={state.names} placing={map.status === "building"} />
     </div>
@@ -56,15 +58,14 @@ function Versions({ state }: Pick<Props, "state">) {
   );
 }
 
-/** Fetch a file with the key, which a plain link cannot bring, and hand it to the browser. */
-function download(event: Event, app: Props["app"], map: string): void {
-  event.preventDefault();
-  void app.attempt(async () => {
-    const answer = await app.api.fetch(`maps/${map}/cloud.ply`);
-    const link = document.createElement("a");
-    link.href = URL.createObjectURL(await answer.blob());
-    link.download = `${map}.ply`;
-    link.click();
-    URL.revokeObjectURL(link.href);
+function remove({ app }: Pick<Props, "app">, map: MapDocument): void {
+  app.ask({
+    title: "Delete this map?",
+    text: `${map.name ?? map.map_id} goes with its versions, its surveys and what they found. Its scans stay. This cannot be undone.`,
+    yes: "Delete it",
+    act: async () => {
+      await app.api.send("DELETE", `maps/${map.map_id}`);
+      app.open(null);
+    },
   });
 }

@@ -19,7 +19,7 @@ export interface Props {
 export function Page(props: Props) {
   const { state } = props;
   return (
-    <div class="page">
+    <div class={`page ${state.place.embed ? "embedded" : ""}`}>
       <a class="skip" href="#main" onClick={(event) => focusMain(event)}>
         Skip to the content
       </a>

@@ -2,6 +2,7 @@
 
 import { Fragment, h, type ComponentChildren } from "preact";
 
+import type { Controller } from "../controller.ts";
 import type { ProblemDocument, ScanWarning } from "../documents.ts";
 import { percent } from "../format.ts";
 import { adviceOn, capital, REASONS } from "../words.ts";
@@ -67,6 +68,32 @@ export function Fact({ name, children, hint }: { name: string; children: Compone
 /** Show a dot in the colour of a kind, with a sign for who does not see colours. */
 export function Kind({ kind }: { kind: string }) {
   return <span class={`kind kind-${kind}`} aria-hidden="true" />;
+}
+
+interface DownloadProps {
+  app: Controller;
+  path: string;
+  name: string; // of the file
+  children: ComponentChildren;
+}
+
+/** A link to a file; where a key is needed, which a plain link cannot bring, the page fetches the file. */
+export function Download({ app, path, name, children }: DownloadProps) {
+  const fetched = (event: Event) => {
+    event.preventDefault();
+    void app.attempt(async () => {
+      const link = document.createElement("a");
+      link.href = URL.createObjectURL(await (await app.api.fetch(path)).blob());
+      link.download = name;
+      link.click();
+      URL.revokeObjectURL(link.href);
+    });
+  };
+  return (
+    <a href={path} download={name} onClick={(event) => app.state.hasKey && fetched(event)}>
+      {children}
+    </a>
+  );
 }
 
 /** A place of the same size that says what is waited for. */

@@ -8,7 +8,7 @@ import { focusOf, isOpen, jobOf } from "../state.ts";
 import { sayingOf, sum, TILE_STATES } from "../words.ts";
 import { Retry } from "./jobs.tsx";
 import type { Props } from "./page.tsx";
-import { Empty, Fact, Problem, Share, Waiting, Warnings } from "./parts.tsx";
+import { Download, Empty, Fact, Problem, Share, Waiting, Warnings } from "./parts.tsx";
 import { Scans } from "./scans.tsx";
 
 const STATES = ["unchanged", "changed", "inconsistent", "unobserved"] as const;
@@ -62,11 +62,27 @@ export function SurveyTab(props: Props) {
       <div class="row">
         {focus.status === "failed" && <Retry app={app} jobId={focus.job_id} />}
         {canBeTakenOver(focus) && <button onClick={() => takeOver(props, focus)}>Take over into the map</button>}
+        {focus.status === "ready" && <Files app={app} survey={focus} />}
         {!(job && isOpen(job)) && <button onClick={() => remove(props, focus)}>Delete</button>}
       </div>
       {problem && <Problem problem={problem} />}
       {value ? <Scans scans={value.scans} names={state.names} placing={focus.status === "running"} /> : !problem && <Waiting>Asking for its scans…</Waiting>}
     </div>
+  );
+}
+
+function Files({ app, survey }: { app: Props["app"]; survey: SurveySummaryDocument }) {
+  const here = `surveys/${survey.survey_id}`;
+  const files: [string, string][] = [["cloud.ply", "PLY"], ["picture.png", "Picture"], ["tiles", "Tiles (GeoJSON)"]];
+  if (survey.objects) files.push(["objects", "Objects (GeoJSON)"]);
+  return (
+    <>
+      {files.map(([file, word]) => (
+        <Download app={app} path={`${here}/${file}`} name={`${survey.survey_id}-${file}${file.includes(".") ? "" : ".geojson"}`}>
+          {word}
+        </Download>
+      ))}
+    </>
   );
 }
 

@@ -47,15 +47,16 @@ function Visit({ state, survey, before, choose }: VisitProps) {
   const { tone, short, long } = sayingOf(survey, jobOf(state, survey.job_id));
   const gap = before ? Date.parse(survey.captured_at) - Date.parse(before.captured_at) : 0;
   const chosen = survey.survey_id === state.place.survey;
+  const inFocus = survey.survey_id === focusOf(state)?.survey_id;
   return (
     <li>
       {gap > 1.5 * DAY_MS && <span class="gap">{Math.round(gap / DAY_MS)} days</span>}
       <button
-        class={`visit tone-${tone} ${survey.survey_id === focusOf(state)?.survey_id ? "in-focus" : ""}`}
+        class={`visit tone-${tone} ${inFocus ? "in-focus" : ""}`}
         id={`visit-${survey.survey_id}`}
         aria-pressed={chosen}
         title={long}
-        ref={(element) => intoSight(element, chosen)}
+        ref={(element) => intoSight(element, chosen || inFocus)}
         onClick={choose}
       >
         <strong>{instant(survey.captured_at)}</strong>
@@ -67,7 +68,7 @@ function Visit({ state, survey, before, choose }: VisitProps) {
 
 const inSight = new WeakSet<Element>();
 
-/** Scroll to a survey when it becomes the chosen one, and not again. */
+/** Scroll to a survey when it becomes the one that is compared, and not again. */
 function intoSight(element: HTMLElement | null, chosen: boolean): void {
   if (!element) return;
   if (chosen && !inSight.has(element)) element.scrollIntoView({ block: "nearest", inline: "nearest" });

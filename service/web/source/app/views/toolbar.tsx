@@ -7,6 +7,7 @@ import { height, percent, whole } from "../format.ts";
 import type { Show } from "../link.ts";
 import { focusOf, sectionOf, showOf, type LayerState } from "../state.ts";
 import { TILE_STATES } from "../words.ts";
+import { referenceVersion } from "../stage.ts";
 import type { Props } from "./page.tsx";
 import { Kind } from "./parts.tsx";
 
@@ -21,6 +22,7 @@ const STATES = ["changed", "inconsistent", "unobserved"];
 
 export function Over(props: Props) {
   const { app, stage, state } = props;
+  const version = referenceVersion(state);
   const none = !focusOf(state) || focusOf(state)?.status !== "ready";
   return (
     <>
@@ -44,6 +46,9 @@ export function Over(props: Props) {
           Section
         </button>
       </div>
+      {version !== state.map.value?.version && (
+        <p class="over reference-version">The reference is version {version}, which this survey was compared with; in use is {state.map.value?.version}.</p>
+      )}
       {state.sectionOpen && <Section {...props} />}
       {showOf(state) === "split" && state.stage.survey.loaded && (
         <div class="over split-words" aria-hidden="true">
