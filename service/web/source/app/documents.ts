@@ -83,6 +83,8 @@ export interface VersionSummaryDocument {
   status: "building" | "ready" | "failed";
   survey_id: string | null;
   base_version: number | null;
+  counts: Counts;
+  links: Link[];
   created: string;
   problem: ProblemDocument | null;
 }
