@@ -265,9 +265,9 @@ def test_a_map_with_an_anchor_lies_on_the_earth_where_that_is_asked_for(
 def test_what_a_tileset_names_takes_the_parameter_that_cesium_hands_on(
     client: TestClient, uris: list[str]
 ) -> None:
-    for path in ("tileset.json", *uris):
-        plain = client.get(f"/maps/lobby/versions/1/{path}")
-        handed_on = client.get(f"/maps/lobby/versions/1/{path}?crs=EPSG%3A4978")
+    for path in ("/maps/lobby/versions/1/tileset.json", *uris):
+        plain = client.get(path)
+        handed_on = client.get(f"{path}?crs=EPSG%3A4978")
         assert plain.status_code == handed_on.status_code == 200
         assert handed_on.content == plain.content
 

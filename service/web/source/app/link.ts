@@ -34,6 +34,7 @@ export const NOWHERE: Place = {
   embed: false,
 };
 
+const ID = /^[\w-]{1,64}$/; // of anything, as the API takes it: nothing else becomes part of a path
 const SHOWS = ["reference", "survey", "both", "split"];
 const TABS = ["changes", "survey", "map"];
 const STATES = ["changed", "inconsistent", "unobserved"];
@@ -41,15 +42,15 @@ const STATES = ["changed", "inconsistent", "unobserved"];
 /** Read a fragment, with or without its `#`; what cannot be read counts as left out. */
 export function readPlace(fragment: string): Place {
   const said = new URLSearchParams(fragment.replace(/^#/, ""));
-  const text = (name: string) => said.get(name) || null;
+  const id = (name: string) => (ID.test(said.get(name) ?? "") ? said.get(name) : null);
   const oneOf = <T extends string>(name: string, known: string[]) =>
     known.includes(said.get(name) ?? "") ? (said.get(name) as T) : null;
   const list = (name: string) => (said.get(name) ?? "").split(",").filter(Boolean);
-  const tile = text("tile");
+  const tile = id("tile");
   return {
-    map: text("map"),
-    survey: text("survey"),
-    item: text("object") ?? (tile && `tile:${tile}`),
+    map: id("map"),
+    survey: id("survey"),
+    item: id("object") ?? (tile && `tile:${tile}`),
     show: oneOf<Show>("show", SHOWS),
     view: readView(said.get("view")),
     section: readSection(said.get("section")),

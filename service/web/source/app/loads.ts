@@ -19,6 +19,7 @@ import type {
   SurveySummaryDocument,
   TileProperties,
   VersionList,
+  VersionSummaryDocument,
 } from "./documents.ts";
 import { boxOf, itemOfObject, itemOfSighting, itemOfTile, type Item } from "./items.ts";
 import type { Place } from "./link.ts";
@@ -45,7 +46,7 @@ export async function map(app: Controller, again = false): Promise<void> {
   const id = app.state.place.map as string;
   await app.load("map", () => app.api.get<MapDocument>(`maps/${id}`));
   if (!app.state.map.value || app.state.place.map !== id) return;
-  await app.load("surveys", () => surveysOf(app, id));
+  await Promise.all([app.load("surveys", () => surveysOf(app, id)), app.load("versions", () => versionsOf(app, id))]);
   if (again) app.update({ tiles: {}, looks: NOT_ASKED });
   if (app.state.map.value.status === "ready") await Promise.all([objects(app), ofSurvey(app), ofItem(app)]);
   if (app.state.place.tab === "map") await ofTab(app);
@@ -69,6 +70,10 @@ async function surveysOf(app: Controller, id: string): Promise<SurveySummaryDocu
 /** Sort surveys by the time they were captured, which is not the order in which they came. */
 function byTime(surveys: SurveySummaryDocument[]): SurveySummaryDocument[] {
   return surveys.sort((one, other) => Date.parse(one.captured_at) - Date.parse(other.captured_at));
+}
+
+async function versionsOf(app: Controller, id: string): Promise<VersionSummaryDocument[]> {
+  return (await app.api.get<VersionList>(`maps/${id}/versions?limit=100`)).versions;
 }
 
 /** Ask for the objects over all surveys; of a device those that any survey of it saw. */
@@ -165,11 +170,10 @@ async function looksAt(app: Controller, { properties, sightings }: ObjectHistory
   return others.map((survey) => ({ survey, share: looks.get(survey.survey_id) ?? null }));
 }
 
-/** Ask for what the open tab shows beside: versions and the names of scans. */
+/** Ask for what the open tab shows beside: the names of scans. */
 async function ofTab(app: Controller): Promise<void> {
   const { place, map: shown, survey } = app.state;
   if (place.tab === "map") {
-    await app.load("versions", async () => (await app.api.get<VersionList>(`maps/${place.map}/versions?limit=100`)).versions);
     await names(app, (shown.value?.scans ?? []).map(({ scan_id }) => scan_id));
   }
   if (place.tab === "survey") await names(app, (survey.value?.scans ?? []).map(({ scan_id }) => scan_id));

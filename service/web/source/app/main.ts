@@ -8,7 +8,7 @@ import { Api } from "./api.ts";
 import { Controller } from "./controller.ts";
 import { listen } from "./keys.ts";
 import { listenForDrops } from "./drops.ts";
-import { shownTheme, Stage } from "./stage.ts";
+import { drawing, shownTheme, Stage } from "./stage.ts";
 import { Page } from "./views/page.tsx";
 
 import { KIND_COLOURS, STATE_COLOURS } from "../scene/colours.ts";
@@ -40,5 +40,6 @@ const stage = new Stage(app);
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => app.update({}));
 listen(app, stage);
 listenForDrops(app);
+if (app.state.place.map) drawing().catch(() => {}); // the stage says why, if it cannot
 app.update({});
 app.start();

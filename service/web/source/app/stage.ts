@@ -10,6 +10,11 @@ import { chosenItem, focusOf, NO_LAYER, sectionOf, showOf, shownItems, type Laye
 const MOST_POINTS = 1_000_000; // of a cloud that is loaded whole, where there is a tileset of it
 const PADDING = 0.6; // metres around an object that the camera flies to
 
+/** Fetch what draws; asked for early, it is there when the map is known. */
+export function drawing(): Promise<typeof import("../scene/scene.ts")> {
+  return import("../scene/scene.ts");
+}
+
 export class Stage {
   #scene: Scene | null = null;
   #container: HTMLElement | null = null;
@@ -37,7 +42,7 @@ export class Stage {
 
   async #begin(container: HTMLElement): Promise<void> {
     try {
-      const { Scene } = await import("../scene/scene.ts");
+      const { Scene } = await drawing();
       if (container !== this.#container) return;
       const scene = new Scene(container, { fetch: this.#app.api.fetch as typeof fetch });
       this.#scene = scene;
@@ -47,12 +52,16 @@ export class Stage {
         this.#told = scene.view;
         this.#app.go({ view: this.#told });
       });
-      scene.on("drawn", () => this.#app.update({ stage: { ...this.#app.state.stage, drawn: true } }));
+      scene.on("drawn", () => this.#drawn(scene));
       this.sync(this.#app.state);
     } catch (error) {
       const problem = `This browser cannot draw in 3D (${(error as Error).message}). The lists and their details are all there.`;
       this.#app.update({ stage: { ...this.#app.state.stage, problem } });
     }
+  }
+
+  #drawn({ extent, suggestedCeiling }: Scene): void {
+    this.#app.update({ stage: { ...this.#app.state.stage, drawn: true, extent, ceiling: suggestedCeiling } });
   }
 
   #end(): void {
@@ -169,21 +178,31 @@ export function referenceVersion(state: State): number {
   return focus?.map_version ?? (state.map.value as MapDocument).version;
 }
 
-/** Return the cloud of the map, of the version that the survey in focus was compared with where it is looked at. */
+/** Return the cloud of the map, of the version that is looked at; null until it is known which it is. */
 function referenceOf(state: State): CloudSource | null {
   const map = state.map.value as MapDocument;
   if (map.status !== "ready") return null;
   const version = referenceVersion(state);
   const base = `maps/${map.map_id}`;
-  if (version !== map.version) return { url: `${base}/versions/${version}/cloud.ply`, kind: "ply" };
-  const tileset = map.links.find(({ rel }) => rel === "tileset");
-  if (tileset && (map.counts["points"] ?? 0) > MOST_POINTS) return { url: tileset.href, kind: "tileset" };
-  return { url: `${base}/cloud.ply`, kind: "ply" };
+  if (version === map.version) return cloudOf(map, `${base}/cloud.ply`);
+  if (!state.versions.value) return null;
+  const older = state.versions.value.find((one) => one.version === version);
+  const path = `${base}/versions/${version}/cloud.ply`;
+  return older ? cloudOf(older, path) : { url: path, kind: "ply" };
+}
+
+/** Return the tileset of a large cloud that has one, else its PLY, which is loaded whole. */
+function cloudOf({ links, counts }: Pick<MapDocument, "links" | "counts">, ply: string): CloudSource {
+  const tileset = links.find(({ rel }) => rel === "tileset");
+  return tileset && (counts["points"] ?? 0) > MOST_POINTS ? { url: tileset.href, kind: "tileset" } : { url: ply, kind: "ply" };
 }
 
 function surveyOf(state: State): CloudSource | null {
   const focus = focusOf(state);
-  return focus?.status === "ready" ? { url: `surveys/${focus.survey_id}/cloud.ply`, kind: "ply" } : null;
+  if (focus?.status !== "ready") return null;
+  const tileset = focus.links.find(({ rel }) => rel === "tileset"); // a survey has one where its cloud is large
+  if (tileset) return { url: tileset.href, kind: "tileset" };
+  return { url: `surveys/${focus.survey_id}/cloud.ply`, kind: "ply" };
 }
 
 /** Return a box around an item, and where it was, with some room. */

@@ -42,6 +42,13 @@ test("what cannot be read counts as left out", () => {
   assert.deepEqual(place, { ...NOWHERE, map: "lobby" });
 });
 
+test("an id that is none does not become part of a path", () => {
+  for (const id of ["../jobs", "a/b", "a?b", "%2e%2e", "x".repeat(65), "a b"]) {
+    const place = readPlace(`#map=${encodeURIComponent(id)}&survey=${id}&object=${id}`);
+    assert.deepEqual([place.map, place.survey, place.item], [null, null, null]);
+  }
+});
+
 test("a camera is kept to the centimetre", () => {
   const place = { ...NOWHERE, map: "lobby", view: { position: [1.23456, 2, 3], target: [0, 0, 0] } } as Place;
   assert.equal(writePlace(place), "map=lobby&view=1.23,2,3,0,0,0");
