@@ -37,7 +37,9 @@ export async function maps(app: Controller): Promise<void> {
   const ids = (app.state.maps.value ?? []).map(({ map_id }) => map_id);
   await eachOf(ids, async (id) => {
     const { surveys } = await app.api.get<SurveyList>(`maps/${id}/surveys?limit=${MOST_LATE}`);
-    app.update({ latest: { ...app.state.latest, [id]: byTime(surveys).at(-1) ?? null } });
+    const inOrder = byTime(surveys);
+    const found = { survey: inOrder.at(-1) ?? null, result: inOrder.findLast(({ status }) => status === "ready") ?? null };
+    app.update({ latest: { ...app.state.latest, [id]: found } });
   });
 }
 

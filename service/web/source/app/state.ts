@@ -60,6 +60,12 @@ export interface ObjectLooks {
   tiles: TileProperties[]; // that it lies in, as the latest survey which saw it has them
 }
 
+/** The survey of a map that was captured last, and the last that has a result; null: there is none. */
+export interface Latest {
+  survey: SurveySummaryDocument | null;
+  result: SurveySummaryDocument | null;
+}
+
 export interface Sending {
   name: string;
   size: number; // bytes
@@ -93,7 +99,7 @@ export interface State {
   hasKey: boolean;
   asksKey: ProblemDocument | null; // of the request that was refused
   maps: Loaded<MapSummaryDocument[]>;
-  latest: Record<string, SurveySummaryDocument | null>; // by map; null: there is none
+  latest: Record<string, Latest>; // by map
   jobs: JobDocument[]; // that wait or run, and those that failed last
   map: Loaded<MapDocument>;
   versions: Loaded<VersionSummaryDocument[]>;

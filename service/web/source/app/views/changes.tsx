@@ -7,7 +7,7 @@ import { ago, count, instant, percent } from "../format.ts";
 import { whereOf, type Item } from "../items.ts";
 import { allItems, focusOf, jobOf, shownItems, type State } from "../state.ts";
 import { KINDS, sayingOf, STATUSES } from "../words.ts";
-import type { Props } from "./page.tsx";
+import { newUpload, type Props } from "./page.tsx";
 import { Empty, Kind, Problem, Waiting } from "./parts.tsx";
 
 export function Changes(props: Props) {
@@ -118,7 +118,10 @@ function NothingYet({ app, state }: Pick<Props, "app" | "state">) {
   if (!surveys.value.length) {
     return (
       <Empty title="No survey yet.">
-        <p>Nothing has been compared with this map. Drop the scans of a visit on the page to add one.</p>
+        <p>Nothing has been compared with this map. Drop the scans of a later visit anywhere on the page, or choose them:</p>
+        <button class="primary" onClick={() => app.update({ upload: newUpload(place.map) })}>
+          Add a survey
+        </button>
       </Empty>
     );
   }

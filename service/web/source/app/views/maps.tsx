@@ -5,7 +5,7 @@ import { h } from "preact";
 import type { MapSummaryDocument, SurveySummaryDocument } from "../documents.ts";
 import { ago, count, extent, instant, whole } from "../format.ts";
 import { writePlace } from "../link.ts";
-import { isOpen, jobOf, placeOf, type State } from "../state.ts";
+import { isOpen, jobOf, placeOf, type Latest, type State } from "../state.ts";
 import { objectsOf, progressOf, sayingOf } from "../words.ts";
 import { JobRow } from "./jobs.tsx";
 import { follow, newUpload, type Props } from "./page.tsx";
@@ -72,10 +72,13 @@ function statusOf(state: State, map: MapSummaryDocument): string {
   return job ? `building: ${progressOf(job).toLowerCase()}` : "building";
 }
 
-function latestOf(state: State, map: MapSummaryDocument, latest: SurveySummaryDocument | null | undefined): string {
+function latestOf(state: State, map: MapSummaryDocument, latest: Latest | undefined): string {
   if (map.status !== "ready") return "";
   if (latest === undefined) return "…";
-  if (latest === null) return "No survey yet: nothing has been compared with it.";
-  const { short } = sayingOf(latest, jobOf(state, latest.job_id));
-  return `Last survey ${instant(latest.captured_at)} (${ago(latest.captured_at)}): ${short}`;
+  const { survey, result } = latest;
+  if (survey === null) return "No survey yet: nothing has been compared with it.";
+  const told = (one: SurveySummaryDocument) =>
+    `${instant(one.captured_at)} (${ago(one.captured_at)}): ${sayingOf(one, jobOf(state, one.job_id)).short}`;
+  const before = result && result !== survey ? `; last result ${told(result)}` : "";
+  return `Last survey ${told(survey)}${before}`;
 }
