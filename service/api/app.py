@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 from collections.abc import AsyncIterator
 from importlib.metadata import PackageNotFoundError, version
+from threading import Lock
 from typing import Any
 
 from fastapi import Depends, FastAPI
@@ -62,6 +63,7 @@ from service.catalog.patience import REQUESTS
 from service.dispatch import Dispatcher
 from service.queue import JobQueue
 from service.settings import Settings
+from service.web.pages import add_viewer
 from service.webhooks.deliverer import Deliverer
 from service.webhooks.sending import Sender
 
@@ -128,36 +130,48 @@ class Api(FastAPI):
 
     under: str = ""  #: the path that something in front has the API under
 
+    def __init__(self, **settings: Any) -> None:
+        self._describing = Lock()
+        super().__init__(**settings)
+
     def build_middleware_stack(self) -> ASGIApp:
         """Return the app; log and headers lie around it all, for unexpected errors are answered outside of middleware."""
         stack = PrefixMiddleware(super().build_middleware_stack(), self.under)
         return RequestLog(SecurityHeadersMiddleware(stack))
 
     def openapi(self) -> dict[str, Any]:
-        """Return the OpenAPI document: what FastAPI derives, and the bodies that are read by hand."""
-        if self.openapi_schema is None:
-            document = get_openapi(
-                title=self.title,
-                version=self.version,
-                summary=self.summary,
-                description=self.description,
-                routes=self.routes,
-                tags=self.openapi_tags,
-            )
-            schemas = document.setdefault("components", {}).setdefault("schemas", {})
-            for mode, unseen in UNSEEN.items():
-                pairs = [(model, mode) for model in unseen]
-                _, derived = models_json_schema(pairs, ref_template="#/components/schemas/{model}")
-                schemas.update(derived["$defs"])
-            for replaced in ("HTTPValidationError", "ValidationError"):  # by problems
-                schemas.pop(replaced, None)
-            document["webhooks"] = receivers.described()
-            add_conditions(document)
-            secured(document, problems.documented("unauthorized", "forbidden"))
-            _leaving_out(schemas)
-            _refusing_unknown(document)
-            self.openapi_schema = mended(document)
-        return self.openapi_schema
+        """Return the OpenAPI document: what FastAPI derives, and the bodies that are read by hand.
+
+        It is made once: pydantic's and FastAPI's making of schemas is not for several threads at a time, and the first
+        requests of a page come together.
+        """
+        with self._describing:
+            if self.openapi_schema is None:
+                self.openapi_schema = self._described()
+            return self.openapi_schema
+
+    def _described(self) -> dict[str, Any]:
+        document = get_openapi(
+            title=self.title,
+            version=self.version,
+            summary=self.summary,
+            description=self.description,
+            routes=self.routes,
+            tags=self.openapi_tags,
+        )
+        schemas = document.setdefault("components", {}).setdefault("schemas", {})
+        for mode, unseen in UNSEEN.items():
+            pairs = [(model, mode) for model in unseen]
+            _, derived = models_json_schema(pairs, ref_template="#/components/schemas/{model}")
+            schemas.update(derived["$defs"])
+        for replaced in ("HTTPValidationError", "ValidationError"):  # by problems
+            schemas.pop(replaced, None)
+        document["webhooks"] = receivers.described()
+        add_conditions(document)
+        secured(document, problems.documented("unauthorized", "forbidden"))
+        _leaving_out(schemas)
+        _refusing_unknown(document)
+        return mended(document)
 
 
 def _leaving_out(schemas: dict[str, Any]) -> None:
@@ -202,6 +216,7 @@ def create_app(settings: Settings, *, queue: Queue | None = None) -> FastAPI:
     problems.add_handlers(app)
     idempotency.add_handler(app)
     add_pages(app)
+    add_viewer(app)
     for part in (
         landing,
         scans,

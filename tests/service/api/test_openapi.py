@@ -4,14 +4,20 @@ from __future__ import annotations
 
 import json
 import re
+import threading
+import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import pytest
+from fastapi.openapi.utils import get_openapi
 
 from service.api import openapi
+from service.api.app import create_app
 from service.api.http.description import not_null, operations, schemas_under
+from service.settings import Settings
 
 PROJECT = Path(__file__).resolve().parents[3]
 WRITTEN = PROJECT / openapi.FILE
@@ -304,6 +310,23 @@ def test_a_stream_is_described_with_its_framing(document: dict[str, Any]) -> Non
 
 
 @pytest.mark.slow
+def test_first_requests_that_come_together_have_it_made_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    app, made, real = create_app(Settings(data_dir=tmp_path)), [], get_openapi
+
+    def slowly(**given: Any) -> dict[str, Any]:
+        made.append(threading.current_thread().name)
+        time.sleep(0.05)
+        return real(**given)
+
+    monkeypatch.setattr("service.api.app.get_openapi", slowly)
+    with ThreadPoolExecutor(4) as pool:
+        documents = list(pool.map(lambda _: app.openapi(), range(4)))
+    assert len(made) == 1
+    assert all(document is documents[0] for document in documents)
+
+
 def test_importing_the_api_brings_neither_torch_nor_the_worker() -> None:
     import subprocess
     import sys
