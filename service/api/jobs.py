@@ -22,7 +22,7 @@ from service.api.http.submission import LOOK_AGAIN_S, SUBMITTED, accepted, dismi
 from service.api.models import model_path
 from service.catalog.events import EventFilter
 from service.catalog.idempotency import Answer
-from service.catalog.records import JobRecord, JobStatus
+from service.catalog.records import EventType, JobRecord, JobStatus
 from service.catalog.steps import JobKind
 from service.catalog.tables import now
 from service.dispatch import queue_positions
@@ -136,7 +136,8 @@ async def _awaited(services: Services, job_id: str, wait_s: float) -> JobRecord:
     if wait_s == 0 or job.status not in OPEN:
         return job
     listeners.require_room()
-    wanted = EventFilter(types=("job.ended",), maps=(job.map_id,))
+    ended: tuple[EventType, ...] = ("job.ended",)
+    wanted = EventFilter(types=ended, maps=(job.map_id,))
     with listeners.joined():
         cursor = await listeners.last()
         job = await look()  # it may have ended before the cursor
