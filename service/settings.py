@@ -73,7 +73,9 @@ class Settings(BaseSettings):
     )
     max_connections: int = Field(400, gt=0, description="open connections to the API at a time")
     max_listeners: int = Field(
-        200, gt=0, description="of these, that may wait for events (`GET /events`) at a time"
+        200,
+        gt=0,
+        description="of these, that may wait for events or a job (`GET /events`, `GET /jobs/{id}?wait=`) at a time",
     )
     max_scan_points: int = Field(50_000_000, gt=0, description="most points that one scan may declare")
     step_memory_bytes: int | None = Field(

@@ -175,12 +175,15 @@ class Api(FastAPI):
 
 
 def _leaving_out(schemas: dict[str, Any]) -> None:
-    """Require of features and collections, which are written by hand, no member that comes with one parameter alone."""
-    for schema in schemas.values():
+    """Require no member that comes with one parameter alone, where answers are written by hand.
+
+    These are collections, features and their properties.
+    """
+    for name, schema in schemas.items():
         members = schema.get("properties", {})
-        if "features" in members or "geometry" in members:
-            alone = {name for name, member in members.items() if member.get("default", "") is None}
-            schema["required"] = [name for name in schema["required"] if name not in alone]
+        if "features" in members or "geometry" in members or name.endswith("Properties"):
+            alone = {member for member, described in members.items() if described.get("default", "") is None}
+            schema["required"] = [member for member in schema["required"] if member not in alone]
 
 
 def _refusing_unknown(document: dict[str, Any]) -> None:

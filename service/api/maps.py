@@ -279,7 +279,10 @@ def list_map_scans(
 
 @router.delete("/maps/{map_id}", status_code=204, summary="Delete a map", responses=NAMED)
 async def delete_map(services: Provided, map_id: MapId) -> None:
-    """With its versions, surveys, jobs and files; jobs that still run are stopped first. Its scans stay."""
+    """With its versions, surveys, jobs and files; jobs that still run are stopped first. Its scans stay.
+
+    Its jobs are a 404 from then on; of those that were stopped `job.ended` is told nevertheless.
+    """
     await delete(services, _delete, services, map_id)
 
 

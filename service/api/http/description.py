@@ -17,6 +17,8 @@ _EXAMPLES = {
     "scan_id": "scan-2b1f",
     "survey_id": "survey-91c4",
     "survey": "survey-91c4",
+    "change": "change-5c02",
+    "change_id": "change-5c02",
     "object_id": "object-77aa",
     "job_id": "job-5f0c",
     "webhook_id": "webhook-2d7e",

@@ -17,6 +17,7 @@ from fastapi.openapi.utils import get_openapi
 from service.api import openapi
 from service.api.app import create_app
 from service.api.http.description import not_null, operations, schemas_under
+from service.catalog.deliveries import SCHEDULE
 from service.settings import Settings
 
 PROJECT = Path(__file__).resolve().parents[3]
@@ -299,6 +300,13 @@ def test_a_receiver_of_webhooks_is_told_what_it_gets(document: dict[str, Any]) -
         "webhook-signature",
     ]
     assert list(call["requestBody"]["content"]) == ["application/cloudevents+json"]
+    units = ((3600, "h"), (60, "min"), (1, "s"))
+    waits = [
+        next((wait.seconds // size, unit) for size, unit in units if wait.seconds >= size)
+        for wait in SCHEDULE
+    ]
+    words = [f"{count} {unit}" for count, unit in waits]
+    assert f"after {', '.join(words[:-1])} and {words[-1]}" in call["description"]
     sent = schemas_under(call, document)
     assert {"WebhookEvent", "PingEvent", "ChangeEvent", "ChangeData"} <= sent.keys()
 
