@@ -16,7 +16,7 @@ from service.catalog.catalog import Catalog, open_catalog
 from service.catalog.changes import ChangeFilter
 from service.catalog.events import EventFilter, FeedCursor
 from service.catalog.publication import tell
-from service.catalog.records import ChangeRecord, EventRecord, EventType, ObjectRecord, Problem
+from service.catalog.records import ChangeRecord, EventRecord, EventType, ObjectRecord, Problem, TileState
 from service.catalog.tables import Event, TileChange, now
 from service.errors import Gone
 from service.settings import Settings
@@ -326,7 +326,8 @@ def test_a_list_that_is_followed_is_the_list_that_is_asked_for(catalog: Catalog,
         if surveys and rng.random() < 0.25:
             catalog.surveys.delete(surveys.pop(rng.randrange(len(surveys))))
         else:
-            states = {i: rng.choice(("changed", "changed", "unchanged")) for i in rng.sample(range(5), 3)}
+            seen: list[TileState] = ["changed", "changed", "unchanged"]
+            states = {i: rng.choice(seen) for i in rng.sample(range(5), 3)}
             tiles = [tile(i, 0, state, score=rng.random()) for i, state in states.items()]
             when = NOON + timedelta(days=rng.randrange(-9, 10))
             surveys.append(add_survey(catalog, tiles, captured_at=when)[0])
