@@ -31,7 +31,7 @@ def read_feed(
     after: FeedCursor,
     limit: int,
 ) -> Published[T]:
-    """Return at most `limit` rows of `matching` behind a cursor; the last element of each is its row of `table`.
+    """Return at most `limit` rows of `matching` behind a cursor, and as many withdrawn; the last element of each is its row of `table`.
 
     First what was told before and anew since, and in `withdrawn` what of it `matching` does not take (any more); then,
     where all of that was said, what is new. `session` sees one state of all tables. Raises Gone.

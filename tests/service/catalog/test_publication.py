@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import random
 import threading
 from collections.abc import Iterator
+from dataclasses import dataclass, field
 from datetime import timedelta
 from pathlib import Path
 
@@ -14,7 +16,7 @@ from service.catalog.catalog import Catalog, open_catalog
 from service.catalog.changes import ChangeFilter
 from service.catalog.events import EventFilter, FeedCursor
 from service.catalog.publication import tell
-from service.catalog.records import EventRecord, EventType, ObjectRecord, Problem
+from service.catalog.records import ChangeRecord, EventRecord, EventType, ObjectRecord, Problem, TileState
 from service.catalog.tables import Event, TileChange, now
 from service.errors import Gone
 from service.settings import Settings
@@ -310,6 +312,62 @@ def test_pages_from_the_beginning_go_on_though_the_events_were_swept(catalog: Ca
     assert len(set(seen)) == 5
     with pytest.raises(Gone):  # what was withdrawn since is not known any more
         catalog.changes.published(LOBBY, after=FeedCursor(1, 1))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_list_that_is_followed_is_the_list_that_is_asked_for(catalog: Catalog, seed: int) -> None:
+    """Surveys come in any order and go again; readers with small pages, with filters and without, come between."""
+    rng = random.Random(seed)
+    add_map(catalog)
+    wanted = [LOBBY, ChangeFilter(map_id="lobby", min_score=0.8), ChangeFilter(map_id="lobby", until=NOON)]
+    readers = [Reader(catalog, one, limit) for one, limit in zip(wanted, (2, 1, 3), strict=True)]
+    surveys: list[str] = []
+    for _ in range(14):
+        if surveys and rng.random() < 0.25:
+            catalog.surveys.delete(surveys.pop(rng.randrange(len(surveys))))
+        else:
+            seen: list[TileState] = ["changed", "changed", "unchanged"]
+            states = {i: rng.choice(seen) for i in rng.sample(range(5), 3)}
+            tiles = [tile(i, 0, state, score=rng.random()) for i, state in states.items()]
+            when = NOON + timedelta(days=rng.randrange(-9, 10))
+            surveys.append(add_survey(catalog, tiles, captured_at=when)[0])
+        for reader in readers:
+            for _ in range(rng.randrange(3)):
+                reader.look()
+    for reader in readers:
+        while reader.look():
+            pass
+        listed = catalog.changes.page(reader.wanted, limit=100).items
+        assert reader.kept == {change.change_id: change for change in listed}
+
+
+@dataclass
+class Reader:
+    """Who follows the changes of a map, and keeps a list of them."""
+
+    catalog: Catalog
+    wanted: ChangeFilter
+    limit: int
+    cursor: FeedCursor = BEGINNING
+    kept: dict[str | None, ChangeRecord] = field(default_factory=dict)
+    new: set[str | None] = field(default_factory=set)  #: told as new so far
+
+    def look(self) -> bool:
+        """Take in one page; returns whether there is more."""
+        page = self.catalog.changes.published(self.wanted, after=self.cursor, limit=self.limit)
+        assert max(len(page.items), len(page.withdrawn)) <= self.limit
+        for number, change in enumerate(page.items):
+            if number >= page.updated:
+                assert change.change_id not in self.new  # as new it is told once
+                self.new.add(change.change_id)
+            elif self.wanted == LOBBY:
+                assert change.change_id in self.new
+            self.kept[change.change_id] = change
+        for gone in page.withdrawn:
+            self.kept.pop(gone.subject, None)
+        assert page.more or page.cursor.told == page.cursor.since
+        self.cursor = FeedCursor.read(str(page.cursor))
+        return page.more
 
 
 # objects
