@@ -217,9 +217,9 @@ class ModelEvent(Envelope):
 
 
 class ChangeEvent(Envelope):
-    """A change of a tile is seen for the first time."""
+    """A change of a tile is seen for the first time, or what is known of it is another than was told."""
 
-    type: Literal["change.told"]
+    type: Literal["change.told", "change.updated"]
     sequence: Sequence
     data: ChangeData
 
@@ -233,9 +233,11 @@ class ChangeWithdrawnEvent(Envelope):
 
 
 class ObjectEvent(Envelope):
-    """An object is seen for the first time, is gone or there again, or was taken over by a version of the map."""
+    """An object is seen for the first time, is gone or there again, was taken over by a version, or is known otherwise."""
 
-    type: Literal["object.told", "object.gone_again", "object.seen_again", "object.accepted"]
+    type: Literal[
+        "object.told", "object.updated", "object.gone_again", "object.seen_again", "object.accepted"
+    ]
     sequence: Sequence
     data: ObjectData
 

@@ -242,7 +242,7 @@ class ObjectData(TypedDict):
 
 
 class ObjectEvent(TypedDict):
-    """An object is seen for the first time, is gone or there again, or was taken over by a version of the map."""
+    """An object is seen for the first time, is gone or there again, was taken over by a version, or is known otherwise."""
 
     data: ObjectData
     datacontenttype: Literal["application/json"]
@@ -252,7 +252,9 @@ class ObjectEvent(TypedDict):
     specversion: Literal["1.0"]
     subject: str
     time: str
-    type: Literal["object.told", "object.gone_again", "object.seen_again", "object.accepted"]
+    type: Literal[
+        "object.told", "object.updated", "object.gone_again", "object.seen_again", "object.accepted"
+    ]
 
 
 class ObjectProperties(TypedDict):
@@ -291,7 +293,7 @@ class ObjectProperties(TypedDict):
     status: Literal["new", "still_there", "gone_again", "unknown", "accepted"]
     survey_id: str
     transient: bool
-    updated: bool | None
+    updated: NotRequired[bool]
     volume: float
     yaw_degrees: float
     z_max: float
@@ -662,7 +664,7 @@ class TileProperties(TypedDict):
     threshold: float | None
     tile_id: str
     tile_index: list[int]
-    updated: bool | None
+    updated: NotRequired[bool]
     z_max: float
     z_min: float
 
@@ -951,7 +953,7 @@ class ChangeData(TypedDict):
 
 
 class ChangeEvent(TypedDict):
-    """A change of a tile is seen for the first time."""
+    """A change of a tile is seen for the first time, or what is known of it is another than was told."""
 
     data: ChangeData
     datacontenttype: Literal["application/json"]
@@ -961,7 +963,7 @@ class ChangeEvent(TypedDict):
     specversion: Literal["1.0"]
     subject: str
     time: str
-    type: Literal["change.told"]
+    type: Literal["change.told", "change.updated"]
 
 
 class ChangeWithdrawnData(TypedDict):
