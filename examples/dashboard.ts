@@ -12,33 +12,34 @@ const [url, jobId] = process.argv.slice(2);
 if (url === undefined || jobId === undefined) {
   throw new Error("node dashboard.js URL JOB");
 }
-const api = createClient<paths>({
+const options = {
   baseUrl: url,
   headers: { Authorization: `Bearer ${process.env.SPICD_KEY ?? "none"}` },
-});
+};
+// A client for JSON and one for features: some answers come in more than one media type.
+const api = createClient<paths, "application/json" | "application/problem+json">(options);
+const features = createClient<paths, "application/geo+json" | "application/problem+json">(options);
 
 async function ended(id: string): Promise<Job> {
   for (;;) {
-    const { data: job, error } = await api.GET("/jobs/{job_id}", { params: { path: { job_id: id } } });
+    const { data: job, error } = await api.GET("/jobs/{job_id}", {
+      params: { path: { job_id: id }, query: { wait: 20 } },
+    });
     if (error !== undefined) {
       throw new Error(error.detail);
     }
     if (job.status !== "accepted" && job.status !== "running") {
       return job;
     }
-    await new Promise((resolve) => setTimeout(resolve, 300));
   }
 }
 
 async function changed(mapId: string): Promise<string[]> {
-  const { data, error } = await api.GET("/maps/{map_id}/changes", {
+  const { data, error } = await features.GET("/maps/{map_id}/changes", {
     params: { path: { map_id: mapId }, query: { limit: 1000 } },
   });
   if (error !== undefined) {
     throw new Error(error.detail);
-  }
-  if (typeof data === "string") {
-    throw new Error("a table, which was not asked for");
   }
   return data.features.map((change) => `${change.properties.tile_id} ${change.properties.state}`);
 }

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import time
 import uuid
 from pathlib import Path
 from typing import TypeVar
@@ -64,12 +63,11 @@ def sent(client: AuthenticatedClient, path: Path) -> str:
 def wait(client: AuthenticatedClient, job_id: str) -> None:
     """Return when a job was successful."""
     while True:
-        job = expected(JobDocument, get_job.sync(job_id, client=client))
+        job = expected(JobDocument, get_job.sync(job_id, client=client, wait=20))
         if job.status in ("failed", "dismissed"):
             raise SystemExit(f"job {job_id}: {job.problem}")
         if job.status == "successful":
             return
-        time.sleep(0.3)
 
 
 def report(client: AuthenticatedClient, map_id: str, scan_id: str, cloud: Path) -> None:

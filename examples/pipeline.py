@@ -2,7 +2,7 @@
 
     python examples/pipeline.py monday.pcd tuesday.pcd tuesday-2.pcd
 
-The first file (PLY or PCD) is the earlier visit, the others are the later one. Without files two visits to a
+The first file (PLY, PCD, E57, LAS or LAZ) is the earlier visit, the others are the later one. Without files two visits to a
 room are simulated, between which things come, go and move. `changes.ply` shows the result.
 """
 

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping
 from datetime import datetime
 from typing import Any
 
-from service.catalog.records import EventRecord, rfc3339
+from service.catalog.records import EventRecord, problem_urn, rfc3339
 
 MEDIA_TYPE = "application/cloudevents+json"
 
@@ -18,7 +18,7 @@ def cloud_event(event: EventRecord, *, root: str = "") -> dict[str, Any]:
     """Return the document of an event (CloudEvents 1.0, JSON Event Format 1.0.2); `root` stands before its paths."""
     links = [
         {"href": f"{root}{href}", "rel": rel, "type": media_type}
-        for href, rel, media_type in _links(event.type, event.data, event.sequence)
+        for href, rel, media_type in _links(event.type, event.data)
     ]
     return document(
         event.event_id,
@@ -27,8 +27,14 @@ def cloud_event(event: EventRecord, *, root: str = "") -> dict[str, Any]:
         subject=event.subject,
         time=event.created,
         sequence=event.sequence,
-        data={**event.data, "links": links},
+        data={**event.data, **_problem(event.data), "links": links},
     )
+
+
+def _problem(data: Mapping[str, Any]) -> dict[str, str]:
+    """Return the problem of a job as its document names it; the log has its code."""
+    code = data.get("problem")
+    return {} if code is None else {"problem": problem_urn(code)}
 
 
 def document(
@@ -56,7 +62,7 @@ def document(
     }
 
 
-def _links(type: str, data: Mapping[str, Any], sequence: int) -> Iterator[tuple[str, str, str]]:
+def _links(type: str, data: Mapping[str, Any]) -> Iterator[tuple[str, str, str]]:
     """Yield path, relation and media type of what an event is about, as far as that is still there."""
     json, features = "application/json", "application/geo+json"
     of_map = f"/maps/{data.get('map_id')}"
@@ -70,7 +76,7 @@ def _links(type: str, data: Mapping[str, Any], sequence: int) -> Iterator[tuple[
     elif thing == "model":
         yield f"/models/{data['model'].partition('/')[0]}", "related", json
     elif thing == "change":
-        yield f"{of_map}/changes?after={sequence - 1}&limit=1", "related", features
+        yield f"{of_map}/changes?change={data['change_id']}", "related", features
     elif thing == "object":
         yield f"{of_map}/objects/{data['object_id']}", "related", features
     if data.get("survey_id") is not None:

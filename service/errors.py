@@ -6,9 +6,10 @@ ServiceError
 │   └── NoSuchJob        no_such_job          no job of that id, asked for its results (OGC API - Processes)
 ├── ResultNotReady       result_not_ready     the job still waits or runs (OGC API - Processes)
 ├── NotReady             not_ready            the map is still building, the survey still running
+│   └── Failed           failed               it was not made, and will not be by waiting
 ├── Conflict             conflict             the id is taken, the scan is in use
 ├── BadRequest           bad_request          a value that the schema admits and the service does not
-├── ScanUnreadable       scan_unreadable      an uploaded file that is neither PLY nor PCD
+├── ScanUnreadable       scan_unreadable      an uploaded file that is neither PLY, PCD, E57 nor LAS
 ├── KeyMalformed         idempotency_key_malformed   an Idempotency-Key that is none
 ├── KeyReused            idempotency_key_reused      it came with another request before
 ├── KeyInUse             idempotency_key_in_use      the request under it is being carried out
@@ -72,6 +73,10 @@ class ResultNotReady(ServiceError):
 
 class NotReady(ServiceError):
     code = "not_ready"
+
+
+class Failed(NotReady):
+    code = "failed"
 
 
 class Conflict(ServiceError):

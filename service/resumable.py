@@ -140,7 +140,7 @@ def upload(
     on_sent: OnSent | None = None,
     on_wait: OnWait | None = None,
 ) -> Document:
-    """Send a PLY or PCD and return the scan that it became, as GET /scans/{id} shows it.
+    """Send a PLY, PCD, E57, LAS or LAZ and return the scan that it became, as GET /scans/{id} shows it.
 
     `http` has the base URL and the key. `said` is what POST /scans takes beside the file (`filename captured_at
     device_id pose frame`). An upload of the same file that `memory` knows is gone on with. At the end the SHA-256 that

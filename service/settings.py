@@ -73,7 +73,9 @@ class Settings(BaseSettings):
     )
     max_connections: int = Field(400, gt=0, description="open connections to the API at a time")
     max_listeners: int = Field(
-        200, gt=0, description="of these, that may wait for events (`GET /events`) at a time"
+        200,
+        gt=0,
+        description="of these, that may wait for events or a job (`GET /events`, `GET /jobs/{id}?wait=`) at a time",
     )
     max_scan_points: int = Field(50_000_000, gt=0, description="most points that one scan may declare")
     step_memory_bytes: int | None = Field(
@@ -86,6 +88,11 @@ class Settings(BaseSettings):
         1024**3,
         ge=0,
         description="of the data folder's disk; uploads and jobs that would leave less are refused; 0: off",
+    )
+    tileset_memory_bytes: int = Field(
+        256 * 1024**2,
+        ge=16 * 1024**2,
+        description="about what a step may take to write a tileset; a larger cloud is cut into more parts on the disk",
     )
     job_timeout_s: int = Field(3600, gt=0, description="longest time of one step of a job")
     max_waiting_jobs: int = Field(

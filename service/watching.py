@@ -32,7 +32,7 @@ from service.sidecars import SUFFIXES as SIDECARS
 from service.sidecars import SidecarError, read_sidecar, sidecar_of
 
 DONE, REFUSED, STATE = "done", "refused", ".spicd"
-SUFFIXES = (".ply", ".pcd")
+SUFFIXES = (".ply", ".pcd", ".e57", ".las", ".laz")
 SurveyEach = Literal["file", "folder"]
 _UNFINISHED = (".part", ".partial", ".tmp", ".crdownload", "~")
 _NO_FAULT_OF_THE_FILE = frozenset({401, 403, 404, 405, 412})

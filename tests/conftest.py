@@ -19,6 +19,7 @@ TESTS = Path(__file__).resolve().parent
 #: Folders and files whose tests are all slow; a slow test elsewhere is marked where it stands.
 SLOW = (
     "acceptance",
+    "browser",
     "integration",
     "test_breaking.py",
     "service/api/http/test_uploads.py",

@@ -19,8 +19,10 @@ import httpx
 import numpy as np
 import pytest
 
-from tests.breaking import fuzz_api, fuzz_readers, load, soak
+from tests.breaking import big_maps, fuzz_api, fuzz_readers, load, soak
 from tests.breaking.fuzz_readers import Fuzz, declared_points, run_batch, what_is_wrong
+from tests.breaking.packed_mutations import N as N_PACKED
+from tests.breaking.packed_mutations import packed_samples
 from tests.breaking.requests import Request, Requests
 from tests.breaking.scan_mutations import N, samples
 from tests.support.flaky_link import flaky_links
@@ -29,7 +31,7 @@ from tests.support.traffic import throttled
 from worker.cloud.formats.scan import read_scan
 
 ROOT = Path(__file__).parents[1]
-FILES, CASES = 3000, 600
+FILES, PACKED_FILES, CASES = 3000, 500, 600
 
 
 def test_every_sound_sample_is_read_with_all_its_points() -> None:
@@ -51,8 +53,28 @@ def test_mutated_files_are_read_or_refused_in_order(tmp_path: Path) -> None:
     assert figures["outcomes"]["refused: scan_unreadable"] > FILES / 10
 
 
-def test_a_case_is_the_same_each_time() -> None:
-    first, second = Fuzz(samples(), 3), Fuzz(samples(), 3)
+def test_every_sound_sample_of_a_packed_format_is_read_with_all_its_points() -> None:
+    for sample in packed_samples():
+        with fuzz_readers.memory_file(sample.content) as path:
+            scan = read_scan(path, apart=False)
+        assert (len(scan.points), scan.n_dropped) == (N_PACKED - 1, 1), sample.name
+        assert what_is_wrong(scan, sample.content) is None
+
+
+def test_mutated_packed_files_are_read_or_refused_or_end_their_decoder(tmp_path: Path) -> None:
+    file = tmp_path / "figures.json"
+    command = [sys.executable, "-m", "tests.breaking.fuzz_readers", "--packed", "--files", str(PACKED_FILES)]
+    assert subprocess.run([*command, "--seed", "7", "--json", str(file)], check=False).returncode == 0
+    figures = json.loads(file.read_text())
+    assert figures["cases"] == PACKED_FILES
+    assert figures["outcomes"]["read"] > PACKED_FILES / 10
+    assert figures["outcomes"]["refused: scan_unreadable"] > PACKED_FILES / 10
+
+
+@pytest.mark.parametrize("made", [samples, packed_samples])
+def test_a_case_is_the_same_each_time(made) -> None:
+    sound = made()
+    first, second = Fuzz(sound, 3), Fuzz(sound, 3)
     assert [first.content(i) for i in range(50)] == [second.content(i) for i in range(50)]
 
 
@@ -186,3 +208,17 @@ def test_a_percentile_is_a_value_that_was_measured() -> None:
     assert load.percentile([3.0, 1.0, 2.0], 50) == 2.0
     assert load.percentile([float(i) for i in range(1, 201)], 99) == 198.0
     assert load.percentile([5.0], 99) == 5.0
+
+
+def test_a_made_map_goes_through_the_last_part_of_a_build_with_all_its_points(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, value in (("_STOREYS", 1), ("_CELL", 3.0), ("_ROOM", 3.0)):
+        monkeypatch.setattr(big_maps, name, value)
+    told = big_maps.run(1, tmp_path)
+    assert told["whole"]
+    assert 10_000 < told["points"] < 16_000
+    assert {"cloud.ply", "picture.png", "reference.npz", "tileset.bin", "tileset.json"} <= told[
+        "sizes"
+    ].keys()
+    assert len(big_maps._table([told]).splitlines()) == 2 + len(told["stages"]) + len(told["sizes"]) + 1

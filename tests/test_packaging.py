@@ -15,6 +15,7 @@ from tests.test_imports import ROOT, read_imports, within
 
 #: Imported only where a collector of traces is named (the extra `otel`), and where a recording is read (`ros`).
 OPTIONAL = {"opentelemetry", "rosbags"}
+BUNDLE = "web/built/*"  #: of the viewer, made where its packages can be had
 #: Imported though another package is required, which hands them on as its own.
 HANDED_ON = {
     "anyio": "fastapi",
@@ -86,7 +87,9 @@ def test_the_hosted_ci_calls_the_commands_of_our_own_on_the_oldest_python() -> N
     assert [line.split(" || ")[0] for line in ours] == [
         "make check",
         "make servers",
+        "make browser",
         "make tools",
+        "make web",
         "make test",
     ]
     oldest = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["requires-python"]
@@ -113,8 +116,11 @@ def recipe(target: str) -> list[str]:
 def test_the_files_that_a_package_brings_beside_its_modules_are_there() -> None:
     brought = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["package-data"]
     assert set(brought) == {"service", "worker"}
+    assert brought["service"].count(BUNDLE) == 1
     for package, patterns in brought.items():
         for pattern in patterns:
+            if pattern == BUNDLE and not (ROOT / "service/web/built").exists():
+                continue  # `make web` makes it
             assert list((ROOT / package.replace(".", "/")).glob(pattern)), f"{package}: {pattern}"
 
 

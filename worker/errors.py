@@ -1,7 +1,7 @@
 """What can go wrong in the pipeline, and the stable code of each.
 
 PipelineError
-├── ScanError                scan_unreadable        a file that is not a sound PLY or PCD
+├── ScanError                scan_unreadable        a file that is not a sound PLY, PCD, E57, LAS or LAZ
 │   ├── ScanTooLarge         scan_too_large         more points than the limit
 │   ├── ScanUnits            scan_units             an extent that says millimetres
 │   └── ScanFarAway          scan_far_away          an origin many kilometres away

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 
@@ -24,6 +24,11 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> Path:
 
 def write_bytes(path: Path, *parts: bytes) -> Path:
     """Write these bytes, one part after the other, atomically."""
+    return write_parts(path, parts)
+
+
+def write_parts(path: Path, parts: Iterable[bytes]) -> Path:
+    """Write the parts atomically as they come: one is in memory at a time."""
 
     def write(aside: Path) -> None:
         with aside.open("wb") as file:

@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 from collections.abc import AsyncIterator
 from importlib.metadata import PackageNotFoundError, version
+from threading import Lock
 from typing import Any
 
 from fastapi import Depends, FastAPI
@@ -17,6 +18,7 @@ from starlette.types import ASGIApp
 
 from service.api import (
     changes,
+    event_documents,
     events,
     health,
     jobs,
@@ -25,9 +27,11 @@ from service.api import (
     models,
     objects,
     processes,
+    receivers,
     scans,
     surveys,
     tiles,
+    tilesets,
     tus,
     versions,
     webhooks,
@@ -59,6 +63,7 @@ from service.catalog.patience import REQUESTS
 from service.dispatch import Dispatcher
 from service.queue import JobQueue
 from service.settings import Settings
+from service.web.pages import add_viewer
 from service.webhooks.deliverer import Deliverer
 from service.webhooks.sending import Sender
 
@@ -69,6 +74,29 @@ object by object, what later visits found changed.
 Maps, their versions and surveys are built by jobs: the answer to the POST names the job, \
 and `GET /jobs/{id}` says how far it is.
 Every error is a problem document (RFC 9457) with a stable `type`.
+
+To wait for a job ask `GET /jobs/{id}?wait=20` until it has ended; `GET /events` and webhooks tell of all.
+
+### In TypeScript
+
+With types of openapi-typescript and openapi-fetch. Some answers come in more than one media type: a client for JSON, \
+and one for features, have one type for each answer.
+
+```ts
+const api = createClient<paths, "application/json" | "application/problem+json">({ baseUrl });
+const features = createClient<paths, "application/geo+json" | "application/problem+json">({ baseUrl });
+```
+
+Bytes are typed `string` there. A file is sent as it is by:
+
+```ts
+const { data: scan } = await api.POST("/scans", {
+  params: { query: { filename: "hall.pcd" } },
+  headers: { "Content-Type": "application/octet-stream" },
+  body: file as unknown as string,
+  bodySerializer: (body) => body,
+});
+```
 """
 
 
@@ -92,6 +120,7 @@ UNSEEN: dict[JsonSchemaMode, tuple[type[BaseModel], ...]] = {
         tiles.FgTileCollection,
         *objects.DOCUMENTS,
         events.EventList,
+        event_documents.WebhookEvent,
     ),
 }
 
@@ -101,44 +130,60 @@ class Api(FastAPI):
 
     under: str = ""  #: the path that something in front has the API under
 
+    def __init__(self, **settings: Any) -> None:
+        self._describing = Lock()
+        super().__init__(**settings)
+
     def build_middleware_stack(self) -> ASGIApp:
         """Return the app; log and headers lie around it all, for unexpected errors are answered outside of middleware."""
         stack = PrefixMiddleware(super().build_middleware_stack(), self.under)
         return RequestLog(SecurityHeadersMiddleware(stack))
 
     def openapi(self) -> dict[str, Any]:
-        """Return the OpenAPI document: what FastAPI derives, and the bodies that are read by hand."""
-        if self.openapi_schema is None:
-            document = get_openapi(
-                title=self.title,
-                version=self.version,
-                summary=self.summary,
-                description=self.description,
-                routes=self.routes,
-                tags=self.openapi_tags,
-            )
-            schemas = document.setdefault("components", {}).setdefault("schemas", {})
-            for mode, unseen in UNSEEN.items():
-                pairs = [(model, mode) for model in unseen]
-                _, derived = models_json_schema(pairs, ref_template="#/components/schemas/{model}")
-                schemas.update(derived["$defs"])
-            for replaced in ("HTTPValidationError", "ValidationError"):  # by problems
-                schemas.pop(replaced, None)
-            add_conditions(document)
-            secured(document, problems.documented("unauthorized", "forbidden"))
-            _leaving_out(schemas)
-            _refusing_unknown(document)
-            self.openapi_schema = mended(document)
-        return self.openapi_schema
+        """Return the OpenAPI document: what FastAPI derives, and the bodies that are read by hand.
+
+        It is made once: pydantic's and FastAPI's making of schemas is not for several threads at a time, and the first
+        requests of a page come together.
+        """
+        with self._describing:
+            if self.openapi_schema is None:
+                self.openapi_schema = self._described()
+            return self.openapi_schema
+
+    def _described(self) -> dict[str, Any]:
+        document = get_openapi(
+            title=self.title,
+            version=self.version,
+            summary=self.summary,
+            description=self.description,
+            routes=self.routes,
+            tags=self.openapi_tags,
+        )
+        schemas = document.setdefault("components", {}).setdefault("schemas", {})
+        for mode, unseen in UNSEEN.items():
+            pairs = [(model, mode) for model in unseen]
+            _, derived = models_json_schema(pairs, ref_template="#/components/schemas/{model}")
+            schemas.update(derived["$defs"])
+        for replaced in ("HTTPValidationError", "ValidationError"):  # by problems
+            schemas.pop(replaced, None)
+        document["webhooks"] = receivers.described()
+        add_conditions(document)
+        secured(document, problems.documented("unauthorized", "forbidden"))
+        _leaving_out(schemas)
+        _refusing_unknown(document)
+        return mended(document)
 
 
 def _leaving_out(schemas: dict[str, Any]) -> None:
-    """Require of collections, which are written by hand, no member that comes with one parameter alone."""
-    for schema in schemas.values():
+    """Require no member that comes with one parameter alone, where answers are written by hand.
+
+    These are collections, features and their properties.
+    """
+    for name, schema in schemas.items():
         members = schema.get("properties", {})
-        if "features" in members:
-            alone = {name for name, member in members.items() if member.get("default", "") is None}
-            schema["required"] = [name for name in schema["required"] if name not in alone]
+        if "features" in members or "geometry" in members or name.endswith("Properties"):
+            alone = {member for member, described in members.items() if described.get("default", "") is None}
+            schema["required"] = [member for member in schema["required"] if member not in alone]
 
 
 def _refusing_unknown(document: dict[str, Any]) -> None:
@@ -174,6 +219,7 @@ def create_app(settings: Settings, *, queue: Queue | None = None) -> FastAPI:
     problems.add_handlers(app)
     idempotency.add_handler(app)
     add_pages(app)
+    add_viewer(app)
     for part in (
         landing,
         scans,
@@ -182,6 +228,7 @@ def create_app(settings: Settings, *, queue: Queue | None = None) -> FastAPI:
         versions,
         surveys,
         tiles,
+        tilesets,
         changes,
         objects,
         events,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from datetime import datetime
-from typing import Annotated
+from typing import Annotated, Any
 
 from fastapi import APIRouter, Path, Query
 from fastapi import Request as HttpRequest
@@ -12,7 +12,7 @@ from pydantic import Field
 
 from service.api import features
 from service.api.boxes import bounds_of
-from service.api.features import FeatureResponse, FeaturesRequest, collection_response, form_of
+from service.api.features import FeatureResponse, FeaturesRequest, Form, collection_response, form_of
 from service.api.feeds import After, feed_response, require_alone
 from service.api.http.dependencies import Provided
 from service.api.http.documents import link
@@ -31,7 +31,7 @@ from service.api.tiles import (
 from service.catalog.catalog import Catalog
 from service.catalog.changes import ChangeFilter, ChangeSort, change_order
 from service.catalog.events import FeedCursor
-from service.catalog.records import Anchor, TileState
+from service.catalog.records import Anchor, ChangeRecord, TileState
 from service.errors import NotFound
 
 router = APIRouter(tags=["changes"])
@@ -60,6 +60,9 @@ def span_of(interval: str) -> Span:
 class ChangesRequest(FeaturesRequest):
     """Which changed tiles."""
 
+    change: Annotated[
+        Id | None, Field(description="this change alone, by its `change_id`", examples=["change-5c1d"])
+    ] = None
     survey: Annotated[
         Id | None, Field(description="of this survey only, also what an earlier visit found before")
     ] = None
@@ -110,7 +113,7 @@ class ChangesRequest(FeaturesRequest):
     response_model=None,
     responses={
         **features.documented(TileCollection, FgTileCollection),
-        **documented("not_found", "not_ready", "gone", "invalid_request", "bad_request"),
+        **documented("not_found", "not_ready", "failed", "gone", "invalid_request", "bad_request"),
     },
 )
 def get_changes(
@@ -126,7 +129,8 @@ def get_changes(
     takes it over; a change after that is another one.
 
     With `after` those that were published since an earlier answer, in the order of publication: each once, whatever the
-    order in which surveys come in, so that a visit which is uploaded late is not missed.
+    order in which surveys come in, so that a visit which is uploaded late is not missed; and again with `updated` where
+    something of it changed.
 
     A survey that still runs or failed has no say here; asked for by name it answers 409 and not an empty list,
     for nothing found is not the same as no change.
@@ -147,19 +151,24 @@ def get_changes(
             state=asked.state != "changed",
         )
         feed = catalog.changes.published(wanted, after=FeedCursor.read(asked.after), limit=asked.limit)
-        return feed_response(request, form, TILES, feed, feature, links=[of_map])
+        return feed_response(request, form, TILES, feed, _change, links=[of_map])
     sort, order = asked.sortby, change_order(wanted, asked.sortby)
-    after = decoded_values(asked.cursor, sort or "", [key.type for key in order])
+    after = decoded_values(asked.cursor, sort or "", [key.type for key in order], wanted)
     page = catalog.changes.page(wanted, sort=sort, after=after, limit=asked.limit)
     return collection_response(
         request,
         form,
         TILES,
-        [feature(change, form) for change in page.items],
+        [(_change if wanted.once else feature)(change, form) for change in page.items],
         matched=page.matched,
-        cursor=encoded_values(sort or "", page.following),
+        cursor=encoded_values(sort or "", page.following, wanted),
         links=[of_map],
     )
+
+
+def _change(change: ChangeRecord, form: Form) -> dict[str, Any]:
+    """Return a change that is told once, under its own id: the tile that stands for it may become another survey's."""
+    return feature(change, form) | {"id": change.change_id}
 
 
 def _filter(map_id: str, asked: ChangesRequest, anchor: Anchor | None) -> ChangeFilter:
@@ -167,6 +176,7 @@ def _filter(map_id: str, asked: ChangesRequest, anchor: Anchor | None) -> Change
     since, until = (None, None) if asked.datetime is None else span_of(asked.datetime)
     return ChangeFilter(
         map_id=map_id,
+        change_id=asked.change,
         survey_id=asked.survey,
         repeats=asked.repeats,
         state=asked.state,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import AsyncIterator
-from typing import Annotated, Any, Literal
+from typing import Annotated
 
 from fastapi import APIRouter, Header, Query
 from fastapi import Request as HttpRequest
@@ -14,6 +14,7 @@ from pydantic import Field
 from pydantic_core import to_json
 from starlette.types import Receive, Scope, Send
 
+from service.api.event_documents import CloudEvent
 from service.api.http.access import maps_of_key
 from service.api.http.dependencies import Provided
 from service.api.http.documents import Document, Link, Request, link
@@ -31,6 +32,14 @@ KEEP_ALIVE_S = 15.0  #: between two signs of life (HTML Living Standard, Section
 LONGEST_S = 900.0  #: of one stream: its key is asked for again when it goes on
 _RETRY_MS = 2000  #: after which a browser comes back
 _PAGE = 100
+
+#: How a stream is framed (HTML Living Standard, Section 9.2), for clients that read it themselves.
+STREAM = (
+    f"Entries with an empty line behind each. The first has no data: `id` is where the stream begins, `retry: {_RETRY_MS}` "
+    "the milliseconds after which to come back. Then one entry for each event: `data` is a CloudEvent in JSON, on one "
+    "line, `id` its `sequence`; there is no `event:`, so browsers hand all of them to `onmessage`. A quiet stream has "
+    f"every {KEEP_ALIVE_S:g} s an entry of an empty comment (`:`) and an `id` without data: keep that `id` as well"
+)
 
 _Cursor = Annotated[str, Field(pattern=r"^[0-9]{1,18}$")]
 
@@ -56,29 +65,13 @@ class EventsRequest(Request):
     limit: Annotated[int, Field(ge=1, le=1000, description="most events in one list")] = _PAGE
 
 
-class CloudEvent(Document):
-    """An event (CloudEvents 1.0)."""
-
-    specversion: Literal["1.0"] = "1.0"
-    id: str = Field(description="of the event, the same on every way", examples=["event-6b1f0c"])
-    source: str = Field(examples=["/maps/lobby"])
-    type: EventType = Field(examples=["change.told"])
-    subject: str = Field(description="id of what it is about", examples=["change-5c02"])
-    time: str = Field(examples=["2026-03-05T12:00:00Z"])
-    datacontenttype: Literal["application/json"] = "application/json"
-    sequence: str = Field(description="in the order of publication", examples=["1042"])
-    data: dict[str, Any] = Field(
-        description="ids, facts and `links`; docs/events.md has those of each type",
-        examples=[{"map_id": "lobby", "change_id": "change-5c02", "links": []}],
-    )
-
-
 class EventList(Document):
     """Events in the order of publication."""
 
     events: list[CloudEvent]
     cursor: str = Field(
-        description="what to give as `after` next time, also where nothing was found", examples=["1042"]
+        description="what to give as `after` next time, with the same other parameters, also where nothing was found",
+        examples=["1042"],
     )
     links: list[Link]
 
@@ -92,10 +85,10 @@ class EventList(Document):
             "description": "A list, or with `Accept: text/event-stream` a stream",
             "content": {
                 "application/json": {"schema": {"$ref": "#/components/schemas/EventList"}},
-                "text/event-stream": {"schema": {"type": "string"}},
+                "text/event-stream": {"schema": {"type": "string", "description": STREAM}},
             },
         },
-        **documented("gone", "invalid_request", "bad_request", "unavailable"),
+        **documented("not_found", "gone", "invalid_request", "bad_request", "unavailable"),
     },
 )
 async def get_events(
@@ -108,14 +101,23 @@ async def get_events(
 ) -> Response:
     """Every event once, in the order of publication, and none missed.
 
-    With `Accept: text/event-stream` a stream that goes on for up to fifteen minutes; come back with `Last-Event-ID`, as
-    browsers do by themselves. Else a list, which waits for up to `wait` seconds where there is nothing yet.
+    With `Accept: text/event-stream` a stream (Server-Sent Events) that goes on for up to fifteen minutes; come back with
+    `Last-Event-ID`, the `id` of the last entry, as browsers do by themselves. The first entry has no data: its `id` is
+    where the stream begins, and `retry: 2000` says after how many milliseconds to come back. Then there is one entry for
+    each event: `data` is a CloudEvent, `id` its `sequence`, and no `event:`, so that a browser hands it to `onmessage`. A
+    quiet stream has every 15 seconds an entry of an empty comment and an `id` without data. Before a stream begins an id
+    or cursor that is too old, or ahead of every event, is answered by 410 (`gone`): begin anew with `after=0`.
+
+    Else a list, which waits for up to `wait` seconds where there is nothing yet. Without `after` it begins now, so that
+    the `cursor` of a first answer is where to go on.
 
     A key that is bound to maps gets the events of those.
     """
     listeners = services.listeners
     listeners.require_room()
     wanted = _filter(request, asked)
+    if asked.map is not None:
+        await listeners.check_map(asked.map)
     given = last_event_id or asked.after
     cursor = await listeners.last() if given is None else _read(given)
     root = request.scope.get("root_path", "")
@@ -132,14 +134,12 @@ async def get_events(
         link(request, f"{here}?{request.url.query}", "self"),
         link(request, f"{here}?{following.query}", "next"),
     ]
-    answer = EventList.model_validate(
-        {
-            "events": [cloud_event(event, root=root) for event in page.items],
-            "cursor": str(page.cursor),
-            "links": links,
-        }
-    )
-    return JSONResponse(answer.model_dump(mode="json"), headers={"Cache-Control": "no-store"})
+    answer = {  # an EventList
+        "events": [cloud_event(event, root=root) for event in page.items],
+        "cursor": str(page.cursor),
+        "links": [one.model_dump() for one in links],
+    }
+    return JSONResponse(answer, headers={"Cache-Control": "no-store"})
 
 
 def _filter(request: HttpRequest, asked: EventsRequest) -> EventFilter:

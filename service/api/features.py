@@ -157,7 +157,9 @@ class FgCollection(Document):
 
     type: Literal["FeatureCollection"] = "FeatureCollection"
     conformsTo: tuple[str, ...] = CONFORMS_TO  # noqa: N815 - the standard's name
-    featureType: str = Field(examples=["spicd-tile"])  # noqa: N815
+    featureType: str = Field(  # noqa: N815
+        description="`spicd-tile`, or of objects `spicd-object`", examples=["spicd-tile", "spicd-object"]
+    )
     coordRefSys: str = MAP_FRAME  # noqa: N815
     timeStamp: str = Field(examples=["2026-03-01T12:05:00Z"])  # noqa: N815
     numberMatched: int = Field(examples=[1])  # noqa: N815

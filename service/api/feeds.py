@@ -25,16 +25,28 @@ def _checked(text: str) -> str:
 After = Annotated[
     Annotated[str, AfterValidator(_checked)] | None,
     Field(
-        description="what was published since: the `cursor` of an earlier answer, or 0 for the beginning; the order is "
-        "then that of publication",
+        description="what was published since: the `cursor` of an earlier answer with the same filters, or 0 for the "
+        "beginning; the order is then that of publication, `updated` ones first",
         examples=["0"],
     ),
 ]
 
 FEED_CURSOR = Field(
-    None, description="with `after` alone: what to give as `after` next time, also where nothing was found"
+    None,
+    description="with `after` alone: what to give as `after` next time, here and not at /events, also where nothing was "
+    "found. While there is more the answer has a link `next`; at the end it has `monitor` instead, to ask again later",
 )
-FEED_WITHDRAWN = Field(None, description="with `after` alone: what was told before, and is not any more")
+FEED_WITHDRAWN = Field(
+    None,
+    description="with `after` alone: what was told before and is not any more, or is not what the filters ask for any "
+    "more; ids that you have not had may be among them",
+)
+FEED_UPDATED = Field(
+    None,
+    description="with `after` alone: whether it was told before the cursor and comes again because something of it "
+    "changed, `last_seen` for instance; it takes the place of what you have under the same `id`. With filters it may be "
+    "new to you all the same, where it was not what they ask for until now",
+)
 
 
 class WithdrawnDocument(Document):
@@ -43,6 +55,9 @@ class WithdrawnDocument(Document):
     id: str = Field(examples=["change-5c02"])
     merged_into: str | None = Field(
         description="the change that it turned out to be", examples=["change-11fe"]
+    )
+    filtered: bool = Field(
+        description="it is still told, and not what the filters ask for any more", examples=[False]
     )
 
 
@@ -67,22 +82,28 @@ def feed_response(
         request,
         form,
         kind,
-        [feature(one, form) for one in feed.items],
+        [_marked(feature(one, form), number < feed.updated) for number, one in enumerate(feed.items)],
         matched=feed.matched,
-        following=_feed_next(request, feed.cursor, form.media_type),
+        following=_feed_next(request, feed, form.media_type),
         links=links,
         members=_feed_members(feed.cursor, feed.withdrawn),
     )
 
 
-def _feed_next(request: HttpRequest, cursor: FeedCursor, media_type: str) -> Link:
-    """Return the link to what comes behind an answer, which is there also where nothing is yet."""
+def _marked(feature: Mapping[str, Any], updated: bool) -> Mapping[str, Any]:
+    return {**feature, "properties": {**feature["properties"], "updated": updated}}
+
+
+def _feed_next(request: HttpRequest, feed: Published[Any], media_type: str) -> Link:
+    """Return the link to what is behind an answer; where that is nothing yet, to where it will be (RFC 5989)."""
     path = request.url.path.removeprefix(request.scope.get("root_path", ""))
-    following = request.url.include_query_params(after=str(cursor))
-    return link(request, f"{path}?{following.query}", "next", media_type)
+    following = request.url.include_query_params(after=str(feed.cursor))
+    return link(request, f"{path}?{following.query}", "next" if feed.more else "monitor", media_type)
 
 
 def _feed_members(cursor: FeedCursor, withdrawn: Iterable[Withdrawn]) -> dict[str, Any]:
     """Return the members of an answer that a reader goes on by."""
-    gone = [{"id": one.subject, "merged_into": one.merged_into} for one in withdrawn]
+    gone = [
+        {"id": one.subject, "merged_into": one.merged_into, "filtered": one.filtered} for one in withdrawn
+    ]
     return {"cursor": str(cursor), "withdrawn": gone}

@@ -72,6 +72,22 @@ def from_wgs84(anchor: Anchor) -> FromWgs84:
     return convert
 
 
+def ecef_from_map(anchor: Anchor) -> list[float]:
+    """Return the transform (4, 4) from the frame of a map to Earth-centred coordinates (EPSG:4978), column by column."""
+    longitude, latitude, heading = (
+        math.radians(angle) for angle in (anchor.longitude, anchor.latitude, anchor.heading)
+    )
+    sin_lon, cos_lon = math.sin(longitude), math.cos(longitude)
+    sin_lat, cos_lat = math.sin(latitude), math.cos(latitude)
+    sin_h, cos_h = math.sin(heading), math.cos(heading)
+    east = (-sin_lon, cos_lon, 0.0)
+    north = (-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat)
+    up = (cos_lat * cos_lon, cos_lat * sin_lon, sin_lat)
+    x = (e * sin_h + n * cos_h for e, n in zip(east, north, strict=True))
+    y = (n * sin_h - e * cos_h for e, n in zip(east, north, strict=True))
+    return [*x, 0.0, *y, 0.0, *up, 0.0, *to_ecef(longitude, latitude, anchor.height), 1.0]
+
+
 def to_ecef(longitude: float, latitude: float, height: float) -> Vector3:
     """Return Earth-centred, Earth-fixed x, y, z (metres) of a geodetic position (radians, metres)."""
     normal = _normal(latitude)

@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Path, Query, Request, Response
+from fastapi.concurrency import run_in_threadpool
 from pydantic import Field
 
 from service.api.http.access import maps_of_key
 from service.api.http.dependencies import Provided, Services
 from service.api.http.documents import Document, Link, link
+from service.api.http.documents import Request as Asked
 from service.api.http.fields import Id
 from service.api.http.idempotency import KEYED, Keyed
 from service.api.http.paging import PageRequest, list_links
 from service.api.http.problems import LISTED, NAMED, JobProblem, documented
-from service.api.http.submission import accepted, dismiss, job_headers, run_again
+from service.api.http.submission import LOOK_AGAIN_S, SUBMITTED, accepted, dismiss, job_headers, run_again
 from service.api.models import model_path
+from service.catalog.events import EventFilter
 from service.catalog.idempotency import Answer
-from service.catalog.records import JobRecord, JobStatus
+from service.catalog.records import EventType, JobRecord, JobStatus
 from service.catalog.steps import JobKind
 from service.catalog.tables import now
 from service.dispatch import queue_positions
@@ -27,6 +31,19 @@ RESULTS = "http://www.opengis.net/def/rel/ogc/1.0/results"  #: OGC 18-062r2, Sec
 
 router = APIRouter(tags=["jobs"])
 JobId = Annotated[Id, Path()]
+OPEN = ("accepted", "running")  #: states of a job that has not ended
+_EVENTS = 100  #: of jobs that ended, read at a time
+_LOOKED_AT: dict[int | str, dict[str, Any]] = {
+    200: {
+        "description": "The job",
+        "headers": {
+            "Retry-After": {
+                "description": "seconds after which to ask again; while it has not ended",
+                "schema": {"type": "integer", "examples": [LOOK_AGAIN_S]},
+            }
+        },
+    }
+}
 
 
 class JobsRequest(PageRequest):
@@ -34,6 +51,14 @@ class JobsRequest(PageRequest):
 
     status: JobStatus | None = None
     map_id: Id | None = None
+
+
+class JobRequest(Asked):
+    """How long to wait."""
+
+    wait: Annotated[
+        float, Field(ge=0, le=60, description="seconds that the answer may take while the job has not ended")
+    ] = 0
 
 
 class JobDocument(JobRecord, Document):
@@ -69,18 +94,57 @@ def list_jobs(request: Request, services: Provided, asked: Annotated[JobsRequest
         after=asked.after(),
         limit=asked.limit,
     )
-    links = list_links(request, page, lambda job: (job.created, job.job_id))
+    links = list_links(request, asked, page, lambda job: (job.created, job.job_id))
     waits = _waits(services, page.items)
     return JobList(
         jobs=[job_document(job, request, waits.get(job.job_id)) for job in page.items], links=links
     )
 
 
-@router.get("/jobs/{job_id}", summary="Follow a job", responses=NAMED)
-def get_job(request: Request, services: Provided, job_id: JobId) -> JobDocument:
-    """Its state, stage and progress; a failed job carries its problem."""
-    job = services.catalog.jobs.get(job_id)
-    return job_document(job, request, _waits(services, [job]).get(job_id))
+@router.get("/jobs/{job_id}", summary="Follow a job", responses=_LOOKED_AT | NAMED)
+async def get_job(
+    request: Request,
+    response: Response,
+    services: Provided,
+    job_id: JobId,
+    asked: Annotated[JobRequest, Query()],
+) -> JobDocument:
+    """Its state, stage and progress; a failed job carries its problem.
+
+    To wait for a job ask again with `wait=20` until its `status` is `successful`, `failed` or `dismissed`: the answer
+    comes as soon as it has ended. A client that waits for many jobs follows `GET /events?type=job.ended` instead: first
+    take a `cursor` there, then look at each job once, then go on from the cursor.
+
+    A job goes with the map or survey that it made: once that is deleted it is a 404, though `job.ended` is told.
+    """
+    job = await _awaited(services, job_id, asked.wait)
+    waits = await run_in_threadpool(_waits, services, [job])
+    if job.status in OPEN:
+        response.headers["Retry-After"] = str(LOOK_AGAIN_S)
+    return job_document(job, request, waits.get(job_id))
+
+
+async def _awaited(services: Services, job_id: str, wait_s: float) -> JobRecord:
+    """Return a job; one that has not ended once it has, or after so long. Raises NotFound and Unavailable."""
+    until = time.monotonic() + wait_s
+    listeners = services.listeners
+
+    async def look() -> JobRecord:
+        return await run_in_threadpool(services.catalog.jobs.get, job_id)
+
+    job = await look()
+    if wait_s == 0 or job.status not in OPEN:
+        return job
+    listeners.require_room()
+    ended: tuple[EventType, ...] = ("job.ended",)
+    wanted = EventFilter(types=ended, maps=(job.map_id,))
+    with listeners.joined():
+        cursor = await listeners.last()
+        job = await look()  # it may have ended before the cursor
+        while job.status in OPEN and (left := until - time.monotonic()) > 0 and not listeners.ended:
+            page = await listeners.next(cursor, wanted, limit=_EVENTS, wait_s=left)
+            cursor, job = page.cursor, await look()
+    return job
 
 
 @router.delete(
@@ -101,7 +165,8 @@ async def dismiss_job(request: Request, services: Provided, job_id: JobId) -> Jo
     "/jobs/{job_id}/retry",
     status_code=202,
     summary="Run a failed job again",
-    responses=documented(
+    responses=SUBMITTED
+    | documented(
         "not_found", "conflict", "invalid_request", "disk_full", "queue_unavailable", "queue_full", *KEYED
     ),
 )
@@ -127,7 +192,7 @@ Wait = tuple[int, float]  #: position in its queue, seconds waited
 
 def _waits(services: Services, jobs: Sequence[JobRecord]) -> dict[str, Wait]:
     """Return where the steps stand that wait; nothing is asked where all of `jobs` have ended."""
-    if not any(job.status in ("accepted", "running") for job in jobs):
+    if not any(job.status in OPEN for job in jobs):
         return {}
     instant, open_jobs = now(), services.catalog.jobs.open_jobs()
     positions = queue_positions(open_jobs, instant)

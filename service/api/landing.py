@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from fastapi import APIRouter, Request
+from fastapi import APIRouter, Request, Response
 from pydantic import Field
 
+from service.api.http.dependencies import Provided
 from service.api.http.documents import Document, Link, link
 from service.tile_features import CONFORMS_TO
+from service.web.pages import viewer_page, wants_page
 
 RELATIONS = "http://www.opengis.net/def/rel/ogc/1.0"  #: of links, as OGC names them
 _OPENAPI = "application/vnd.oai.openapi+json;version=3.1"
@@ -28,9 +30,19 @@ class Conformance(Document):
     conformsTo: tuple[str, ...] = Field(examples=[CONFORMS_TO])  # noqa: N815 - the standard's name
 
 
-@router.get("/", summary="Where everything begins")
-async def get_landing_page(request: Request) -> LandingPage:
-    """Links to the lists, to the description of the API and to the processes."""
+@router.get(
+    "/",
+    summary="Where everything begins",
+    response_model=LandingPage,
+    responses={200: {"content": {"text/html": {"schema": {"type": "string"}}}}},
+)
+async def get_landing_page(
+    request: Request, response: Response, services: Provided
+) -> LandingPage | Response:
+    """Links to the lists, to the description of the API and to the processes; for browsers the viewer."""
+    if wants_page(request):
+        return await viewer_page(request, frames=services.settings.origins())
+    response.headers["Vary"] = "Accept"
     return LandingPage(
         title=request.app.title,
         description=request.app.summary,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from fastapi import APIRouter, Path, Query, Response
 from fastapi import Request as HttpRequest
@@ -30,6 +30,7 @@ from service.api.http.paging import (
 )
 from service.api.http.problems import BODY, LISTED, MADE, NAMED, JobProblem, documented
 from service.api.http.submission import (
+    SUBMITTED,
     ScansRequest,
     accepted,
     admit,
@@ -41,9 +42,19 @@ from service.api.http.submission import (
     stop_if_open,
     submit,
 )
+from service.api.manifests import Manifest
 from service.catalog import blob_keys
 from service.catalog.idempotency import Answer, Once
-from service.catalog.records import Anchor, Built, JobRecord, MapRecord, MapStatus, MapSummary, ScanOutcome
+from service.catalog.records import (
+    Anchor,
+    Built,
+    JobRecord,
+    MapRecord,
+    MapStatus,
+    MapSummary,
+    ScanOutcome,
+    Tileset,
+)
 from service.catalog.versions import ScanPosition
 
 router = APIRouter(tags=["maps"])
@@ -209,7 +220,8 @@ class MapList(Document):
     "/maps",
     status_code=202,
     summary="Build a map",
-    responses=documented(
+    responses=SUBMITTED
+    | documented(
         *BODY, "not_found", "conflict", "scan_unreadable", "queue_unavailable", "queue_full", *KEYED
     ),
     openapi_extra=bodies.documented(json=MapRequest, form=MapRequest, file="scans"),
@@ -240,7 +252,7 @@ async def create_map(
 def list_maps(request: HttpRequest, services: Provided, asked: Annotated[PageRequest, Query()]) -> MapList:
     """In short, newest first; a key that is bound to maps sees those."""
     page = services.catalog.maps.page(only=maps_of_key(request), after=asked.after(), limit=asked.limit)
-    links = list_links(request, page, lambda record: (record.created, record.map_id))
+    links = list_links(request, asked, page, lambda record: (record.created, record.map_id))
     maps = [MapSummaryDocument(**dict(record), links=_links(record, request)) for record in page.items]
     return MapList(maps=maps, links=links)
 
@@ -267,14 +279,17 @@ def list_map_scans(
 
 @router.delete("/maps/{map_id}", status_code=204, summary="Delete a map", responses=NAMED)
 async def delete_map(services: Provided, map_id: MapId) -> None:
-    """With its versions, surveys, jobs and files; jobs that still run are stopped first. Its scans stay."""
+    """With its versions, surveys, jobs and files; jobs that still run are stopped first. Its scans stay.
+
+    Its jobs are a 404 from then on; of those that were stopped `job.ended` is told nevertheless.
+    """
     await delete(services, _delete, services, map_id)
 
 
 @router.get(
     "/maps/{map_id}/manifest",
     summary="The tiles of a map",
-    response_model=dict[str, Any],
+    response_model=Manifest,
     responses={200: {"description": "The tile manifest, fields as in Table A1 of the paper"}, **MADE},
 )
 async def get_manifest(services: Provided, map_id: MapId) -> Response:
@@ -293,6 +308,18 @@ async def get_map_cloud(services: Provided, map_id: MapId) -> Response:
     """The fused reference map, in metres."""
     ready = await run_in_threadpool(services.catalog.maps.ready, map_id)
     return await cloud_response(services, ready.job_id, f"{map_id}.ply")
+
+
+@router.get(
+    "/maps/{map_id}/cloud.laz",
+    summary="The cloud of a map, packed",
+    response_class=Response,
+    responses=files.documented(bodies.LAZ, "The fused reference map, LAZ 1.4") | MADE,
+)
+async def get_map_laz(services: Provided, map_id: MapId) -> Response:
+    """The points of `cloud.ply` to the millimetre, for desktops. A map of release 0.1 has none."""
+    ready = await run_in_threadpool(services.catalog.maps.ready, map_id)
+    return await laz_response(services, ready.job_id, f"{map_id}.laz")
 
 
 @router.put(
@@ -373,18 +400,20 @@ def _links(record: MapSummary, request: HttpRequest) -> list[Link]:
     ]
     if record.status == "ready":
         links += [
-            *file_links(request, path),
+            *file_links(request, path, record.tileset),
             link(request, f"{path}/changes", "changes", "application/geo+json"),
             link(request, f"{path}/objects", "objects", "application/geo+json"),
         ]
     return links
 
 
-def file_links(request: HttpRequest, path: str) -> list[Link]:
+def file_links(request: HttpRequest, path: str, tileset: Tileset | None) -> list[Link]:
     """Return the links to the files of a map, or of a version of one, that lies at `path`."""
     return [
         link(request, f"{path}/manifest", "manifest"),
         link(request, f"{path}/cloud.ply", "cloud", bodies.RAW),
+        link(request, f"{path}/cloud.laz", "cloud-laz", bodies.LAZ),
+        *([link(request, f"{path}/tileset.json", "tileset")] if tileset is not None else []),
     ]
 
 
@@ -397,3 +426,9 @@ async def cloud_response(services: Services, job_id: str, filename: str) -> Resp
     """Answer with the cloud of the version that a job built."""
     key = blob_keys.map_cloud(job_id)
     return await blob_response(services.catalog.blobs, key, media_type=bodies.RAW, filename=filename)
+
+
+async def laz_response(services: Services, job_id: str, filename: str) -> Response:
+    """Answer with the packed cloud of the version that a job built."""
+    key = blob_keys.map_laz(job_id)
+    return await blob_response(services.catalog.blobs, key, media_type=bodies.LAZ, filename=filename)

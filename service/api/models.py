@@ -16,7 +16,7 @@ from service.api.http.documents import Document, Link, Request, checked, link
 from service.api.http.fields import Id, Model
 from service.api.http.idempotency import KEYED, Keyed
 from service.api.http.problems import BODY, documented
-from service.api.http.submission import accepted, admit, job_headers, monitor, submit
+from service.api.http.submission import SUBMITTED, accepted, admit, job_headers, monitor, submit
 from service.catalog.idempotency import Answer, Once
 from service.catalog.models import name_for
 from service.catalog.records import JobRecord, ModelRecord, ModelStatus
@@ -77,8 +77,9 @@ class AcceptedModel(Document):
     "/maps/{map_id}/models",
     status_code=202,
     summary="Train a model on a map",
-    responses=documented(
-        *BODY, "not_found", "not_ready", "conflict", "queue_unavailable", "queue_full", *KEYED
+    responses=SUBMITTED
+    | documented(
+        *BODY, "not_found", "not_ready", "failed", "conflict", "queue_unavailable", "queue_full", *KEYED
     ),
     openapi_extra=bodies.documented(json=TrainingRequest),
 )
@@ -116,7 +117,7 @@ def list_models(request: HttpRequest, services: Provided) -> ModelList:
 @router.get(
     "/models/{name}",
     summary="Look at a model",
-    responses=documented("not_found", "not_ready", "invalid_request"),
+    responses=documented("not_found", "not_ready", "failed", "invalid_request"),
 )
 def get_model(
     request: HttpRequest,

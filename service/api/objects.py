@@ -33,6 +33,7 @@ from service.api.features import (
 )
 from service.api.feeds import (
     FEED_CURSOR,
+    FEED_UPDATED,
     FEED_WITHDRAWN,
     After,
     WithdrawnDocument,
@@ -178,6 +179,7 @@ class ObjectProperties(SightingProperties):
     )
     accepted_in_version: int | None = Field(description="of the map, that has taken it over", examples=[None])
     sightings: int = Field(description="surveys that saw it", examples=[2])
+    updated: bool | None = FEED_UPDATED
 
 
 class Interval(Document):
@@ -328,7 +330,7 @@ class ObjectsRequest(FeaturesRequest):
     response_model=None,
     responses={
         **features.documented(SightingCollection, FgSightingCollection),
-        **documented("not_found", "not_ready", "invalid_request", "bad_request"),
+        **documented("not_found", "not_ready", "failed", "invalid_request", "bad_request"),
     },
 )
 def get_survey_objects(
@@ -354,7 +356,7 @@ def get_survey_objects(
         bounds=bounds_of(asked.bbox, asked.bbox_crs, anchor),
         min_probability=asked.min_probability,
     )
-    after = decoded_values(asked.cursor, asked.sortby, sighting_order(asked.sortby))
+    after = decoded_values(asked.cursor, asked.sortby, sighting_order(asked.sortby), wanted)
     page = catalog.objects.of_survey(wanted, sort=asked.sortby, after=after, limit=asked.limit)
     return collection_response(
         request,
@@ -362,7 +364,7 @@ def get_survey_objects(
         SIGHTINGS,
         [_sighting(one, form) for one in page.items],
         matched=page.matched,
-        cursor=encoded_values(asked.sortby, page.following),
+        cursor=encoded_values(asked.sortby, page.following, wanted),
         links=[link(request, f"/surveys/{survey_id}", "survey")],
     )
 
@@ -381,7 +383,7 @@ def _why_none(survey: SurveyRecord) -> str:
     response_model=None,
     responses={
         **features.documented(ObjectCollection, FgObjectCollection),
-        **documented("not_found", "not_ready", "gone", "invalid_request", "bad_request"),
+        **documented("not_found", "not_ready", "failed", "gone", "invalid_request", "bad_request"),
     },
 )
 def get_objects(
@@ -395,7 +397,7 @@ def get_objects(
     A thing keeps its id from survey to survey. What a version of the map has taken over stays in the list as `accepted`.
 
     With `after` those that were published since an earlier answer, in the order of publication: each once, whatever the
-    order in which surveys come in.
+    order in which surveys come in, and again with `updated` where something of it changed.
     """
     anchor = services.catalog.maps.ready(map_id).anchor
     form = form_of(request, asked, anchor)
@@ -407,7 +409,7 @@ def get_objects(
         )
         return feed_response(request, form, OBJECTS, feed, _object, links=[of_map])
     order = object_order(asked.sortby)
-    after = decoded_values(asked.cursor, asked.sortby, [key.type for key in order])
+    after = decoded_values(asked.cursor, asked.sortby, [key.type for key in order], wanted)
     page = services.catalog.objects.page(wanted, sort=asked.sortby, after=after, limit=asked.limit)
     return collection_response(
         request,
@@ -415,7 +417,7 @@ def get_objects(
         OBJECTS,
         [_object(one, form) for one in page.items],
         matched=page.matched,
-        cursor=encoded_values(asked.sortby, page.following),
+        cursor=encoded_values(asked.sortby, page.following, wanted),
         links=[of_map],
     )
 

@@ -16,7 +16,7 @@ from service.api.http.documents import Document, Link, Request, checked, link
 from service.api.http.fields import DeviceId, Frame, Id, Instant, Pose, Text
 from service.api.http.idempotency import KEYED, Keyed, answered
 from service.api.http.paging import PageRequest, list_links
-from service.api.http.problems import BODY, LISTED, NAMED, documented
+from service.api.http.problems import BODY, LISTED, NAMED, documented, located
 from service.api.http.submission import delete, lane
 from service.api.http.uploads import Upload
 from service.catalog.catalog import Catalog
@@ -81,7 +81,12 @@ class ScanList(Document):
     status_code=201,
     summary="Upload a scan",
     responses={
-        200: {"model": ScanDocument, "description": "The same bytes from the same device were here already"},
+        200: {
+            "model": ScanDocument,
+            "description": "The same bytes from the same device were here already",
+            "headers": located("/scans/scan-2b1f", "scan"),
+        },
+        201: {"description": "The scan is kept", "headers": located("/scans/scan-2b1f", "scan")},
         **documented(*BODY, "conflict", "scan_unreadable", *KEYED),
     },
     openapi_extra=bodies.documented(raw=True, form=ScanRequest, file="file"),
@@ -93,12 +98,14 @@ async def upload_scan(
     asked: Annotated[ScanQuery, Query()],
     keyed: Keyed,
 ) -> ScanDocument:
-    """One PLY or PCD, as the raw body or as the field `file` of a form; it is read later, by the job that uses it.
+    """One PLY, PCD, E57, LAS or LAZ, as the raw body or as the field `file` of a form; a job that uses it reads it later.
 
     What is said of the scan stands in the query, or in the form, which wins. The same bytes from the same device
     are one scan: sent again with another `pose` or `captured_at`, these are kept from then on, as the answer shows.
     Maps and surveys that were asked for before stay with what they were asked for with, and a request for one may name
     a pose of its own (`scans`).
+
+    `openapi-typescript` types bytes as `string`: the head of this document has the line that sends a file.
     """
 
     def accept(record: ScanRecord, is_new: bool) -> Answer:
@@ -128,7 +135,7 @@ async def upload_scan(
 def list_scans(request: HttpRequest, services: Provided, asked: Annotated[PageRequest, Query()]) -> ScanList:
     """Newest first."""
     page = services.catalog.scans.page(after=asked.after(), limit=asked.limit)
-    links = list_links(request, page, lambda scan: (scan.created, scan.scan_id))
+    links = list_links(request, asked, page, lambda scan: (scan.created, scan.scan_id))
     return ScanList(scans=[ScanDocument.of_row(scan) for scan in page.items], links=links)
 
 

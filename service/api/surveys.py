@@ -22,6 +22,7 @@ from service.api.http.idempotency import KEYED, Keyed
 from service.api.http.paging import PageRequest, list_links
 from service.api.http.problems import BODY, MADE, NAMED, JobProblem, documented
 from service.api.http.submission import (
+    SUBMITTED,
     ScansRequest,
     accepted,
     admit,
@@ -88,8 +89,16 @@ class SurveyList(Document):
     "/maps/{map_id}/surveys",
     status_code=202,
     summary="Compare a visit with a map",
-    responses=documented(
-        *BODY, "not_found", "not_ready", "scan_unreadable", "queue_unavailable", "queue_full", *KEYED
+    responses=SUBMITTED
+    | documented(
+        *BODY,
+        "not_found",
+        "not_ready",
+        "failed",
+        "scan_unreadable",
+        "queue_unavailable",
+        "queue_full",
+        *KEYED,
     ),
     openapi_extra=bodies.documented(json=SurveyRequest, form=SurveyRequest, file="scans"),
 )
@@ -127,7 +136,7 @@ def list_surveys(
     """Of one map in short, newest first."""
     services.catalog.maps.summary(map_id)
     page = services.catalog.surveys.page(map_id, after=asked.after(), limit=asked.limit)
-    links = list_links(request, page, lambda record: (record.created, record.survey_id))
+    links = list_links(request, asked, page, lambda record: (record.created, record.survey_id))
     surveys = [SurveySummaryDocument(**dict(one), links=_links(one, request)) for one in page.items]
     return SurveyList(surveys=surveys, links=links)
 
@@ -146,6 +155,8 @@ def get_survey(request: HttpRequest, services: Provided, survey_id: SurveyId) ->
 )
 async def delete_survey(services: Provided, survey_id: SurveyId) -> None:
     """With its job and files; a job that still runs is stopped first. Its scans stay.
+
+    Its job is a 404 from then on; of one that was stopped `job.ended` is told nevertheless, with the status `dismissed`.
 
     Versions of the map that took the survey over stay as well; while one is being built of it, this is a conflict.
     """
@@ -166,6 +177,27 @@ async def get_survey_cloud(services: Provided, survey_id: SurveyId) -> Response:
         blob_keys.survey_cloud(survey_id),
         media_type=bodies.RAW,
         filename=f"{survey_id}.ply",
+        immutable=True,
+    )
+
+
+@router.get(
+    "/surveys/{survey_id}/cloud.laz",
+    summary="The coloured cloud of a survey, packed",
+    response_class=Response,
+    responses=files.documented(bodies.LAZ, "The current map coloured by result, LAZ 1.4") | MADE,
+)
+async def get_survey_laz(services: Provided, survey_id: SurveyId) -> Response:
+    """The points of `cloud.ply` to the millimetre, for desktops: `change_score`, `tile_state`, `kind` and `object_id` as extra bytes.
+
+    A survey of release 0.1 has none.
+    """
+    await run_in_threadpool(services.catalog.surveys.ready, survey_id)
+    return await blob_response(
+        services.catalog.blobs,
+        blob_keys.survey_laz(survey_id),
+        media_type=bodies.LAZ,
+        filename=f"{survey_id}.laz",
         immutable=True,
     )
 
@@ -254,8 +286,11 @@ def _links(record: SurveySummary, request: HttpRequest) -> list[Link]:
         links += [
             link(request, f"{here}/tiles", "tiles", features.MEDIA_TYPE),
             link(request, f"{here}/cloud.ply", "cloud", bodies.RAW),
+            link(request, f"{here}/cloud.laz", "cloud-laz", bodies.LAZ),
             link(request, f"{here}/picture.png", "preview", "image/png"),
         ]
+    if record.tileset is not None:
+        links.append(link(request, f"{here}/tileset.json", "tileset"))
     if _refused(record):
         links.append(link(request, f"{here}/picture.png", "preview", "image/png"))
     if record.status == "ready" and record.objects is not None:

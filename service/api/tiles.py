@@ -25,7 +25,7 @@ from service.api.features import (
     form_of,
     plain,
 )
-from service.api.feeds import FEED_CURSOR, FEED_WITHDRAWN, WithdrawnDocument
+from service.api.feeds import FEED_CURSOR, FEED_UPDATED, FEED_WITHDRAWN, WithdrawnDocument
 from service.api.http.dependencies import Provided
 from service.api.http.documents import Document, link
 from service.api.http.fields import Id, readable
@@ -40,7 +40,11 @@ router = APIRouter(tags=["surveys"])
 MinScore = Annotated[float | None, Field(ge=0, le=1, description="probability of change")]
 Bbox = Annotated[
     Annotated[str, readable(numbers_of)] | None,
-    Field(description="what meets this box, in the frame that `bbox-crs` names", examples=["0,0,7.5,4.5"]),
+    Field(
+        description="what meets this box: four numbers with commas between, min x, min y, max x, max y, or six, min x, min "
+        "y, min z, max x, max y, max z, in the frame that `bbox-crs` names (on the Earth x is the longitude, y the latitude)",
+        examples=["0,0,7.5,4.5"],
+    ),
 ]
 BboxCrs = Annotated[
     Crs | None,
@@ -54,7 +58,10 @@ BboxCrs = Annotated[
 ]
 VoxelKinds = Annotated[
     VoxelKind | None,
-    Field(description="tiles with voxels that did so; none of models that tell tiles alone"),
+    Field(
+        description="tiles with voxels that did so; none of models that tell tiles alone. What `moved` is told of objects, "
+        "not of tiles"
+    ),
 ]
 
 
@@ -109,12 +116,16 @@ class TileProperties(Document):
         description="of the change, the same for as long as it is told; null where the tile is not changed",
         examples=["change-5c02"],
     )
+    updated: bool | None = FEED_UPDATED
 
 
 class TileFeature(GeoJsonFeature):
     """One tile."""
 
-    id: str = Field(examples=["survey-91c4.tile_004_002_000"])
+    id: str = Field(
+        description="of the tile in its survey; of a change that is told once that of the change, as in `withdrawn`",
+        examples=["survey-91c4.tile_004_002_000"],
+    )
     properties: TileProperties
 
 
@@ -172,7 +183,7 @@ class TilesRequest(FeaturesRequest):
     response_model=None,
     responses={
         **documented(TileCollection, FgTileCollection),
-        **problems("not_found", "not_ready", "invalid_request", "bad_request"),
+        **problems("not_found", "not_ready", "failed", "invalid_request", "bad_request"),
     },
 )
 def get_tiles(
@@ -192,7 +203,7 @@ def get_tiles(
         min_score=asked.min_score,
         bounds=bounds_of(asked.bbox, asked.bbox_crs, anchor),
     )
-    after = decoded_values(asked.cursor, asked.sortby, [key.type for key in tile_order(asked.sortby)])
+    after = decoded_values(asked.cursor, asked.sortby, [key.type for key in tile_order(asked.sortby)], wanted)
     page = services.catalog.changes.tiles(wanted, sort=asked.sortby, after=after, limit=asked.limit)
     return collection_response(
         request,
@@ -200,7 +211,7 @@ def get_tiles(
         TILES,
         [feature(change, form) for change in page.items],
         matched=page.matched,
-        cursor=encoded_values(asked.sortby, page.following),
+        cursor=encoded_values(asked.sortby, page.following, wanted),
         links=[link(request, f"/surveys/{survey_id}", "survey")],
     )
 

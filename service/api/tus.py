@@ -19,7 +19,7 @@ from pydantic import Field
 from service.api.http import tus
 from service.api.http.dependencies import Provided, Services
 from service.api.http.documents import Document, Link, checked, link
-from service.api.http.problems import JobProblem, documented, response
+from service.api.http.problems import JobProblem, documented, located, response
 from service.api.http.turns import Turn, Turns
 from service.api.http.uploads import HEAD_BYTES, Upload, format_of, shown
 from service.api.scans import ScanRequest, keep_scan
@@ -133,11 +133,15 @@ def get_upload_options(services: Provided) -> Response:
     status_code=201,
     summary="Begin a resumable upload",
     response_class=Response,
-    responses=_TAKES | documented("too_many_uploads"),
+    responses={
+        201: {"description": "The upload is begun", "headers": located("/uploads/upload-7c1d", "upload")},
+        **_TAKES,
+        **documented("too_many_uploads"),
+    },
     openapi_extra=_takes(_LENGTH, _METADATA, _CHECKSUM),
 )
 async def create_upload(request: HttpRequest, services: Provided, receiver: Received) -> Response:
-    """Tell the size of a PLY or PCD in `Upload-Length`; its pieces go to the `Location` of the answer by PATCH.
+    """Tell the size of a PLY, PCD, E57, LAS or LAZ in `Upload-Length`; its pieces go to the `Location` of the answer by PATCH.
 
     `Upload-Metadata` carries what the query of POST /scans does: `filename captured_at device_id pose frame`, each
     value in base64. A body, of the type application/offset+octet-stream, is the first piece.

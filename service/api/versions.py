@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import APIRouter, Path, Query, Response
 from fastapi import Request as HttpRequest
@@ -18,6 +18,7 @@ from service.api.http.idempotency import KEYED, Keyed
 from service.api.http.paging import PageRequest, list_links
 from service.api.http.problems import BODY, MADE, NAMED, JobProblem, documented
 from service.api.http.submission import (
+    SUBMITTED,
     ScansRequest,
     accepted,
     admit,
@@ -28,6 +29,7 @@ from service.api.http.submission import (
     monitor,
     submit,
 )
+from service.api.manifests import Manifest
 from service.api.maps import (
     SCANS_LISTED,
     SCANS_SHOWN,
@@ -37,6 +39,7 @@ from service.api.maps import (
     ScansPageRequest,
     cloud_response,
     file_links,
+    laz_response,
     manifest_response,
     scan_list,
 )
@@ -89,10 +92,12 @@ class VersionList(Document):
     "/maps/{map_id}/versions",
     status_code=202,
     summary="Build a new version of a map",
-    responses=documented(
+    responses=SUBMITTED
+    | documented(
         *BODY,
         "not_found",
         "not_ready",
+        "failed",
         "conflict",
         "scan_unreadable",
         "queue_unavailable",
@@ -133,7 +138,7 @@ def list_versions(
 ) -> VersionList:
     """In short, newest first; the first in the list that is `ready` is the one in use."""
     page = services.catalog.versions.page(map_id, after=asked.after(), limit=asked.limit)
-    links = list_links(request, page, lambda record: (record.created, record.job_id))
+    links = list_links(request, asked, page, lambda record: (record.created, record.job_id))
     versions = [VersionSummaryDocument(**dict(one), links=_links(one, request)) for one in page.items]
     return VersionList(versions=versions, links=links)
 
@@ -177,7 +182,7 @@ async def delete_version(services: Provided, map_id: MapId, number: Number) -> N
 @router.get(
     "/maps/{map_id}/versions/{number}/manifest",
     summary="The tiles of a version of a map",
-    response_model=dict[str, Any],
+    response_model=Manifest,
     responses={200: {"description": "The tile manifest, fields as in Table A1 of the paper"}, **MADE},
 )
 async def get_version_manifest(services: Provided, map_id: MapId, number: Number) -> Response:
@@ -196,6 +201,18 @@ async def get_version_cloud(services: Provided, map_id: MapId, number: Number) -
     """The fused reference map, in metres."""
     version = await run_in_threadpool(services.catalog.versions.ready, map_id, number)
     return await cloud_response(services, version.job_id, f"{map_id}-{number}.ply")
+
+
+@router.get(
+    "/maps/{map_id}/versions/{number}/cloud.laz",
+    summary="The cloud of a version of a map, packed",
+    response_class=Response,
+    responses=files.documented(bodies.LAZ, "The fused reference map, LAZ 1.4") | MADE,
+)
+async def get_version_laz(services: Provided, map_id: MapId, number: Number) -> Response:
+    """The points of `cloud.ply` to the millimetre, for desktops. A map of release 0.1 has none."""
+    version = await run_in_threadpool(services.catalog.versions.ready, map_id, number)
+    return await laz_response(services, version.job_id, f"{map_id}-{number}.laz")
 
 
 def _accepted(request: HttpRequest, record: VersionRecord, job: JobRecord) -> AcceptedVersion:
@@ -239,5 +256,5 @@ def _links(record: VersionSummary, request: HttpRequest) -> list[Link]:
     if record.survey_id is not None:
         links.append(link(request, f"/surveys/{record.survey_id}", "survey"))
     if record.status == "ready":
-        links += file_links(request, here)
+        links += file_links(request, here, record.tileset)
     return links

@@ -15,7 +15,7 @@ from service.api.http.documents import Document, Link, Request, checked, link
 from service.api.http.fields import Id, Text
 from service.api.http.idempotency import KEYED, Keyed, answered
 from service.api.http.paging import PageRequest, list_links
-from service.api.http.problems import BODY, documented
+from service.api.http.problems import BODY, documented, located
 from service.api.http.submission import delete
 from service.catalog.idempotency import Answer
 from service.catalog.records import DeliveryRecord, EventType, WebhookRecord
@@ -29,7 +29,8 @@ Url = Annotated[
     Field(
         min_length=1,
         max_length=2000,
-        description="https; that of a host of the public internet, or in a network of SPICD_WEBHOOK_ALLOWED_NETWORKS",
+        description="https, of a host of the public internet; of one in a network of SPICD_WEBHOOK_ALLOWED_NETWORKS http as "
+        "well",
         examples=["https://example.org/hooks/spicd"],
     ),
 ]
@@ -100,7 +101,13 @@ class DeliveryList(Document):
     "/webhooks",
     status_code=201,
     summary="Have events sent to an address",
-    responses=documented(*BODY, "conflict", *KEYED),
+    responses={
+        201: {
+            "description": "The webhook, with its secret",
+            "headers": located("/webhooks/webhook-2d7e", "webhook"),
+        },
+        **documented(*BODY, "not_found", "conflict", *KEYED),
+    },
     openapi_extra=bodies.documented(json=WebhookRequest),
 )
 async def create_webhook(
@@ -134,7 +141,7 @@ def list_webhooks(
     page = services.catalog.webhooks.page(maps=maps_of_key(request), after=asked.after(), limit=asked.limit)
     return WebhookList(
         webhooks=[_document(request, record) for record in page.items],
-        links=list_links(request, page, lambda record: (record.created, record.webhook_id)),
+        links=list_links(request, asked, page, lambda record: (record.created, record.webhook_id)),
     )
 
 
@@ -229,7 +236,7 @@ def list_deliveries(
     page = services.catalog.webhooks.deliveries(webhook_id, after=asked.after(), limit=asked.limit)
     return DeliveryList(
         deliveries=[_delivery(request, record) for record in page.items],
-        links=list_links(request, page, lambda record: (record.created, record.delivery_id)),
+        links=list_links(request, asked, page, lambda record: (record.created, record.delivery_id)),
     )
 
 

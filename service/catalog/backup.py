@@ -183,8 +183,14 @@ def _named(table: str, row: Mapping[Any, Any]) -> Iterator[str]:
             key(row["job_id"])
             for key in (blob_keys.map_reference, blob_keys.map_manifest, blob_keys.map_cloud)
         )
+        if row["tileset"] is not None:
+            yield blob_keys.map_tileset(row["job_id"])
+            yield blob_keys.map_tileset_contents(row["job_id"])
     elif table == "surveys":
         yield blob_keys.survey_cloud(row["id"])
+        if row["tileset"] is not None:
+            yield blob_keys.survey_tileset(row["id"])
+            yield blob_keys.survey_tileset_contents(row["id"])
     elif table == "models":
         yield blob_keys.model_weights(row["job_id"])
 

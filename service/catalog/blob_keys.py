@@ -62,12 +62,15 @@ def map_folder(job_id: str) -> str:
 
 
 map_cloud = _within(map_folder, "cloud.ply")  #: the fused reference map
+map_laz = _within(map_folder, "cloud.laz")  #: the same, packed; an earlier release kept no such file
 map_reference = _within(
     map_folder, "reference.npz"
 )  #: points, normals and grid, which surveys are compared with
 map_seen = _within(map_folder, "seen.npz")  #: what the map's scans saw; release 0.1 kept no such file
 map_tiles = _within(map_folder, "tiles.npz")  #: where release 0.1 kept the grid; later ones have no such file
 map_manifest = _within(map_folder, "manifest.json")  #: the tile manifest (paper, Table A1)
+map_tileset = _within(map_folder, "tileset.json")  #: the document of the cloud's tileset
+map_tileset_contents = _within(map_folder, "tileset.bin")  #: all of its contents, one after the other
 map_work = _within(map_folder, "work/")  #: what the building of a map remembers of itself while it lasts
 
 
@@ -124,6 +127,11 @@ survey_scores = _within(
     survey_folder, "scores.npz"
 )  #: probabilities of tiles, and of voxels where there are such
 survey_cloud = _within(survey_folder, "cloud.ply")  #: the current map coloured by result
+survey_tileset = _within(
+    survey_folder, "tileset.json"
+)  #: the document of the cloud's tileset, where it is large
+survey_tileset_contents = _within(survey_folder, "tileset.bin")  #: all of its contents
+survey_laz = _within(survey_folder, "cloud.laz")  #: the same, packed; an earlier release kept no such file
 survey_picture = _within(survey_folder, "picture.png")  #: the top view with tiles by state
 
 

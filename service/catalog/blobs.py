@@ -122,6 +122,20 @@ class Blobs:
         with _errors():
             return bytes(obstore.get(self._store, key).bytes())
 
+    def get_range(self, key: str, offset: int, length: int) -> bytes:
+        """Return `length` bytes from `offset` on, fewer where the blob ends before. Raises FileNotFoundError."""
+        path = self.path(key)
+        with _errors():
+            size = path.stat().st_size if path is not None else self.size(key)
+            length = max(min(length, size - offset), 0)
+            if not length:
+                return b""
+            if path is None:
+                return bytes(obstore.get_range(self._store, key, start=offset, length=length))
+            with path.open("rb") as file:
+                file.seek(offset)
+                return file.read(length)
+
     def exists(self, key: str) -> bool:
         """Tell whether something complete lies under `key`."""
         try:

@@ -11,7 +11,8 @@ from sqlalchemy.orm import InstrumentedAttribute, aliased
 
 from service.catalog import tables
 from service.catalog.database import Database
-from service.catalog.events import FeedCursor, Published, check_cursor, withdrawn
+from service.catalog.events import FeedCursor, Published
+from service.catalog.feeds import read_feed
 from service.catalog.keyset import Key, Order, Values, behind, order_by
 from service.catalog.records import Bounds, ChangeRecord, TileRecord, TileState
 
@@ -42,6 +43,7 @@ class ChangeFilter:
     """Which changed tiles are asked for; None takes all."""
 
     map_id: str
+    change_id: str | None = None
     survey_id: str | None = None
     repeats: bool = False  #: each visit's, and not each change once; so it is too where a survey is named
     state: TileState = "changed"  #: another one than `changed` is each visit's as well
@@ -122,20 +124,15 @@ class Changes:
     def published(
         self, wanted: ChangeFilter, *, after: FeedCursor, limit: int = 100
     ) -> Published[ChangeRecord]:
-        """Return changes behind a cursor in the order of publication, each once. Raises Gone."""
-        query = _matching(wanted).where(_TOLD.published > after.told)
+        """Return changes behind a cursor in the order of publication: what was told anew, then what is new.
+
+        Raises Gone.
+        """
+        matching = _matching(wanted)
         with self._database.snapshot() as session:
-            last = check_cursor(session, after.withdrawn)
-            matched = session.scalar(select(func.count()).select_from(query.subquery())) or 0
-            rows = session.execute(query.order_by(_TOLD.published).limit(limit)).all()
-            gone = withdrawn(session, "change.withdrawn", wanted.map_id, after)
-        told = rows[-1][2].published if matched > len(rows) else last
-        return Published(
-            items=tuple(_record(*row) for row in rows),
-            withdrawn=gone,
-            matched=matched,
-            cursor=FeedCursor(told, last),
-        )
+            return read_feed(
+                session, matching, _TOLD, _record, map_id=wanted.map_id, after=after, limit=limit
+            )
 
     def of_survey(self, survey_id: str) -> tuple[ChangeRecord, ...]:
         """Return every tile of a survey, unobserved ones too, in the order of the grid."""
@@ -194,6 +191,8 @@ def _matching(wanted: ChangeFilter) -> _Tiles:
     )
     if wanted.once:
         query = query.where(_TILE.survey_id == _TILE.told_by)
+    if wanted.change_id is not None:
+        query = query.where(_TOLD.change_id == wanted.change_id)
     instant, score = _instant(wanted), _TOLD.max_score if wanted.once else _TILE.score
     if wanted.survey_id is not None:
         query = query.where(_SURVEY.survey_id == wanted.survey_id)

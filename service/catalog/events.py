@@ -8,13 +8,13 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Any, Generic, NamedTuple, TypeVar, cast
 
-from sqlalchemy import ColumnElement, CursorResult, delete, func, select
+from sqlalchemy import ColumnElement, CursorResult, delete, exists, func, or_, select
 from sqlalchemy.orm import Session
 
 from service.catalog.database import Database
 from service.catalog.records import EventRecord, EventType
-from service.catalog.tables import Event, EventLog
-from service.errors import Gone
+from service.catalog.tables import Event, EventLog, Map
+from service.errors import Gone, NotFound
 
 T = TypeVar("T")
 _CURSOR = re.compile(r"[0-9]{1,18}(-[0-9]{1,18})?")
@@ -52,38 +52,42 @@ class EventPage:
 class FeedCursor(NamedTuple):
     """How far a reader has followed the changes or the objects of a map, in numbers of publication."""
 
-    told: int  #: what was told up to this number
-    withdrawn: int  #: what was withdrawn up to this event
+    told: int  #: what was told first up to this number
+    since: int  #: what was told anew, or withdrawn, up to this event
 
     @classmethod
     def read(cls, text: str) -> FeedCursor:
         """Read what `str()` wrote, or `0` for the beginning. Raises ValueError."""
-        told, _, withdrawn = text.partition("-")
+        told, _, since = text.partition("-")
         if not _CURSOR.fullmatch(text):
             raise ValueError(f"{text[:40]!r} is no cursor; give that of an earlier answer, or 0")
-        return cls(int(told), int(withdrawn or told))
+        return cls(int(told), int(since or told))
 
     def __str__(self) -> str:
-        return str(self.told) if self.told == self.withdrawn else f"{self.told}-{self.withdrawn}"
+        return str(self.told) if self.told == self.since else f"{self.told}-{self.since}"
 
 
 class Withdrawn(NamedTuple):
-    """A change or an object that is told no more."""
+    """A change or an object that is told no more, or not under these filters."""
 
+    sequence: int  #: of the event that says so
     subject: str  #: its id
     merged_into: (
         str | None
     )  #: the change that it turned out to be; None: no visit sees it, or it is an object
+    filtered: bool = False  #: it is still told, and not what the filters ask for any more
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Published(Generic[T]):
-    """Some changes or objects in the order in which they were first told."""
+    """Some changes or objects behind a cursor: what was told anew since, then what was told first, in that order."""
 
     items: tuple[T, ...]
-    withdrawn: tuple[Withdrawn, ...]  #: since the cursor, of this map, whether or not a filter took it
+    updated: int  #: so many of them, at the front, were told before
+    withdrawn: tuple[Withdrawn, ...]  #: of this map, whether or not a filter took it
     matched: int  #: behind the cursor, those of later answers among them
     cursor: FeedCursor  #: where to go on, also where nothing was told
+    more: bool  #: whether there is something behind it by now
 
 
 class Events:
@@ -91,6 +95,11 @@ class Events:
 
     def __init__(self, database: Database) -> None:
         self._database = database
+
+    def check_map(self, map_id: str) -> None:
+        """Raise NotFound for a map that neither is there nor has an event that is kept, as one that was deleted has."""
+        with self._database.read() as session:
+            require_known(session, map_id)
 
     def last(self) -> int:
         """Return the number of the latest event, 0 before the first."""
@@ -127,21 +136,30 @@ class Events:
             return cast("CursorResult[Any]", gone).rowcount
 
 
+def require_known(session: Session, map_id: str) -> None:
+    """Raise NotFound for a map of which there is nothing to tell, now or from what is kept."""
+    there = exists().where(Map.map_id == map_id)
+    if not session.scalar(select(or_(there, exists().where(Event.map_id == map_id)))):
+        raise NotFound(f"no map {map_id!r}; GET /maps lists those there are")
+
+
 def extent(session: Session) -> tuple[int, int]:
     """Return the number of the latest event that was swept, and of the latest of all; 0 where there is none."""
     row = session.execute(select(EventLog.swept, EventLog.last)).one_or_none()
     return (0, 0) if row is None else (row.swept, row.last)
 
 
-def withdrawn(session: Session, type: EventType, map_id: str, after: FeedCursor) -> tuple[Withdrawn, ...]:
+def withdrawn(
+    session: Session, type: EventType, map_id: str, after: FeedCursor, *, limit: int
+) -> list[Withdrawn]:
     """Return what was withdrawn of a map behind a cursor; nothing for who begins, and knows of nothing yet."""
     if after == FeedCursor(0, 0):
-        return ()
-    query = select(Event.subject, Event.data).where(
-        Event.map_id == map_id, Event.sequence > after.withdrawn, Event.type == type
+        return []
+    query = select(Event.sequence, Event.subject, Event.data).where(
+        Event.map_id == map_id, Event.sequence > after.since, Event.type == type
     )
-    rows = session.execute(query.order_by(Event.sequence))
-    return tuple(Withdrawn(subject, data.get("merged_into")) for subject, data in rows)
+    rows = session.execute(query.order_by(Event.sequence).limit(limit))
+    return [Withdrawn(sequence, subject, data.get("merged_into")) for sequence, subject, data in rows]
 
 
 def check_cursor(session: Session, cursor: int) -> int:

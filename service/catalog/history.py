@@ -15,7 +15,7 @@ from sqlalchemy.orm import Session
 
 from service.catalog import tables
 from service.catalog.database import Database
-from service.catalog.publication import tell
+from service.catalog.publication import Column, tell
 from service.catalog.records import EventType, ObjectStatus, Place, rfc3339
 from service.catalog.stays import Known, Look, Stay, heir, recognized, stays
 from service.catalog.tables import (
@@ -31,6 +31,11 @@ from service.catalog.tables import (
 from service.catalog.tracking import Accepted, Part, Parts, Side, Sighting, Track, Visit, track_objects
 
 _MANY = 500  #: tiles that a query names; where there are more it reads those of the whole map
+#: Columns of an object that its surveys decide; where one changes it is told anew.
+_TOLD = (
+    "kind", "status", "last_known", "transient", "first_seen", "last_seen", "last_looked", "accepted_in_version",
+    "sightings", "survey_id", "number", "probability", "min_x", "min_y", "min_z", "max_x", "max_y", "max_z",
+)  # fmt: skip
 
 
 def note(session: Session, ready: tables.MapVersion | Survey | tables.Model) -> None:
@@ -115,6 +120,7 @@ def _rewrite_tiles(session: Session, map_id: str, accepted: Sequence[Acceptance]
         rows.setdefault(row.tile_id, []).append(row)
     links: list[dict[str, Any]] = []
     new: list[TileChange] = []
+    updated: list[TileChange] = []
     for tile_id in sorted(looks.keys() | rows.keys()):
         before = rows.get(tile_id, [])
         told_by = {row.survey_id for row in before}
@@ -130,13 +136,29 @@ def _rewrite_tiles(session: Session, map_id: str, accepted: Sequence[Acceptance]
             )
             for row in before
         ]
+        facts = {one.change_id: (_facts(row), one.survey_ids) for row, one in known}
         after = _write_changes(session, map_id, tile_id, found, known)
         links += _links(after, told)
-        new += [row for row, _ in after if row not in before]
+        for row, stay in after:
+            if row.change_id not in facts:
+                new.append(row)
+            elif facts[row.change_id] != (_facts(row), frozenset(stay.survey_ids)):
+                updated.append(row)
     if links:
         session.execute(update(SurveyTile), links)
-    for row in sorted(new, key=lambda row: (-row.max_score, row.tile_id, row.first_seen)):
-        _tell_change(session, row)
+    for row in sorted(new, key=_surest_first):
+        _tell_change(session, row, "change.told", "published")
+    for row in sorted(updated, key=_surest_first):
+        _tell_change(session, row, "change.updated", "updated")
+
+
+def _surest_first(row: TileChange) -> tuple[Any, ...]:
+    return -row.max_score, row.tile_id, row.first_seen
+
+
+def _facts(row: TileChange) -> tuple[Any, ...]:
+    """Return what is told of a change, beside which visits saw it."""
+    return row.survey_id, row.first_seen, row.last_seen, row.max_score
 
 
 def _changes_of(map_id: str) -> Select[TileChange]:
@@ -217,13 +239,14 @@ def _links(
     ]
 
 
-def _tell_change(session: Session, row: TileChange) -> None:
+def _tell_change(session: Session, row: TileChange, event: EventType, column: Column) -> None:
     tell(
         session,
-        "change.told",
+        event,
         row.change_id,
         map_id=row.map_id,
         publishes=TileChange,
+        column=column,
         change_id=row.change_id,
         tile_id=row.tile_id,
         survey_id=row.survey_id,
@@ -254,14 +277,21 @@ def _rewrite_objects(session: Session, map_id: str, accepted: Sequence[Acceptanc
     ]
     tracks = track_objects(_visits(session, map_id, sightings), taken, ids=list(rows))
     named = {track.object_id or new_id("object"): track for track in tracks}
+    quiet: list[MapObject] = []  # what is known of them changed, and not what became of them
     for object_id, track in named.items():
         row = rows.get(object_id)
-        before = None if row is None else (row.last_known, row.accepted_in_version)
+        before = None if row is None else _told_of(row)
         if row is None:
             row = MapObject(object_id=object_id, map_id=map_id, created=now())
             session.add(row)
         _write_track(row, track, sightings)
-        _tell_object(session, row, before)
+        event = _event_of(row, before)
+        if event is not None:
+            _tell_object(session, row, event)
+        elif _told_of(row) != before or any(one.object_id != object_id for _, one in track.sightings):
+            quiet.append(row)
+    for row in quiet:
+        _tell_object(session, row, "object.updated")
     for object_id, row in rows.items():
         if object_id not in named:
             tell(session, "object.withdrawn", object_id, map_id=map_id, object_id=object_id)
@@ -270,17 +300,15 @@ def _rewrite_objects(session: Session, map_id: str, accepted: Sequence[Acceptanc
     return tracks
 
 
-def _tell_object(session: Session, row: MapObject, before: tuple[str, int | None] | None) -> None:
-    """Tell an object that is new, or what became of one that was known: `before` has its last_known and version."""
-    event = _event_of(row, before)
-    if event is None:
-        return
+def _tell_object(session: Session, row: MapObject, event: EventType) -> None:
+    """Tell an object that is new, or anew one that was known."""
     tell(
         session,
         event,
         row.object_id,
         map_id=row.map_id,
-        publishes=MapObject if before is None else None,
+        publishes=MapObject,
+        column="published" if event == "object.told" else "updated",
         object_id=row.object_id,
         kind=row.kind,
         status=row.status,
@@ -289,10 +317,16 @@ def _tell_object(session: Session, row: MapObject, before: tuple[str, int | None
     )
 
 
-def _event_of(row: MapObject, before: tuple[str, int | None] | None) -> EventType | None:
+def _told_of(row: MapObject) -> dict[str, Any]:
+    """Return what is told of an object."""
+    return {name: getattr(row, name) for name in _TOLD}
+
+
+def _event_of(row: MapObject, before: Mapping[str, Any] | None) -> EventType | None:
+    """Return the event of an object that is new, or of what became of one; `before` is what was told of it."""
     if before is None:
         return "object.told"
-    last_known, accepted_in = before
+    last_known, accepted_in = before["last_known"], before["accepted_in_version"]
     if row.accepted_in_version is not None and accepted_in is None:
         return "object.accepted"
     if row.accepted_in_version is None and (row.last_known == "gone_again") != (last_known == "gone_again"):

@@ -375,7 +375,8 @@ def _tell_subject(session: Session, subject: tables.MapVersion | tables.Survey |
         tell(session, event, model, model=model, **about)
     else:
         event = "version.ready" if ready else "version.failed"
-        tell(session, event, subject.job_id, version=subject.version, **about)
+        version = f"{subject.map_id}/{subject.version}"
+        tell(session, event, version, version=subject.version, **about)
 
 
 def new_job(

@@ -12,7 +12,8 @@ from sqlalchemy.orm import aliased
 
 from service.catalog import tables
 from service.catalog.database import Database
-from service.catalog.events import FeedCursor, Published, check_cursor, withdrawn
+from service.catalog.events import FeedCursor, Published
+from service.catalog.feeds import read_feed
 from service.catalog.keyset import Key, Order, Values, behind, order_by
 from service.catalog.records import (
     Bounds,
@@ -126,20 +127,15 @@ class Objects:
     def published(
         self, wanted: ObjectFilter, *, after: FeedCursor, limit: int = 100
     ) -> Published[MapObjectRecord]:
-        """Return objects behind a cursor in the order of publication, each once. Raises Gone."""
-        query = _matching(wanted).where(_OBJECT.published > after.told)
+        """Return objects behind a cursor in the order of publication: what was told anew, then what is new.
+
+        Raises Gone.
+        """
+        matching = _matching(wanted)
         with self._database.snapshot() as session:
-            last = check_cursor(session, after.withdrawn)
-            matched = session.scalar(select(func.count()).select_from(query.subquery())) or 0
-            rows = session.execute(query.order_by(_OBJECT.published).limit(limit)).all()
-            gone = withdrawn(session, "object.withdrawn", wanted.map_id, after)
-        told = rows[-1][2].published if matched > len(rows) else last
-        return Published(
-            items=tuple(_record(*row) for row in rows),
-            withdrawn=gone,
-            matched=matched,
-            cursor=FeedCursor(told, last),
-        )
+            return read_feed(
+                session, matching, _OBJECT, _record, map_id=wanted.map_id, after=after, limit=limit
+            )
 
     def get(self, map_id: str, object_id: str) -> tuple[MapObjectRecord, tuple[SightingRecord, ...]]:
         """Return one object and every sighting of it, in order of time. Raises NotFound."""

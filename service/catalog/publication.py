@@ -9,7 +9,7 @@ that is rolled back gives its numbers back, so there is no gap.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 from sqlalchemy import event, update
 from sqlalchemy.dialects import postgresql, sqlite
@@ -23,6 +23,9 @@ _NOTED = "events"  #: where a session keeps what its transaction tells
 _LOG_ID = 1
 
 Published = type[TileChange] | type[MapObject]
+Column = Literal[
+    "published", "updated"
+]  #: which takes a number: that of the first telling, or of the last since
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -34,6 +37,7 @@ class _Told:
     map_id: str | None
     data: dict[str, Any]
     publishes: Published | None  #: whose row of this id takes the number
+    column: Column
 
 
 def tell(
@@ -43,11 +47,12 @@ def tell(
     *,
     map_id: str | None = None,
     publishes: Published | None = None,
+    column: Column = "published",
     **data: Any,
 ) -> None:
     """Tell that something happened to `subject` (an id), if the session's transaction commits.
 
-    `data` is JSON. With `publishes` the row of that table whose id is `subject` takes the event's number.
+    `data` is JSON. With `publishes` the row of that table whose id is `subject` takes the event's number in `column`.
     """
     told: list[_Told] | None = session.info.get(_NOTED)
     if told is None:
@@ -55,7 +60,9 @@ def tell(
         tallies.noted_in(session)  # locks its rows before ours, in every transaction: nobody waits crosswise
         event.listen(session, "before_commit", _number)
     about = data if map_id is None else {"map_id": map_id, **data}
-    told.append(_Told(type=type, subject=subject, map_id=map_id, data=about, publishes=publishes))
+    told.append(
+        _Told(type=type, subject=subject, map_id=map_id, data=about, publishes=publishes, column=column)
+    )
 
 
 def _number(session: Session) -> None:
@@ -66,7 +73,7 @@ def _number(session: Session) -> None:
     session.flush()
     first = _taken(session, len(told)) + 1
     instant = now()
-    numbers: dict[Published, list[dict[str, Any]]] = {}
+    numbers: dict[tuple[Published, Column], list[dict[str, Any]]] = {}
     for sequence, one in enumerate(told, first):
         session.add(
             Event(
@@ -81,9 +88,10 @@ def _number(session: Session) -> None:
         )
         if one.publishes is not None:
             key = "change_id" if one.publishes is TileChange else "object_id"
-            numbers.setdefault(one.publishes, []).append({key: one.subject, "published": sequence})
+            row = {key: one.subject, one.column: sequence}
+            numbers.setdefault((one.publishes, one.column), []).append(row)
     told.clear()
-    for table, rows in numbers.items():
+    for (table, _), rows in numbers.items():
         session.execute(update(table), rows)
 
 

@@ -46,13 +46,15 @@ ScanReason = Literal[
     "wrong_units",
     "far_from_origin",
     "far_points",
+    "offset_taken_off",
+    "no_sensor_place",
     "missing_returns",
     "odd_density",
     "odd_size",
     "little_coverage",
     "clock",
 ]
-ScanFormat = Literal["ply", "pcd"]
+ScanFormat = Literal["ply", "pcd", "e57", "las", "laz"]
 #: What an API key may do; `admin` is everything.
 Scope = Literal["scans:write", "surveys:write", "maps:write", "changes:read", "admin"]
 WebhookStatus = Literal["active", "disabled"]
@@ -72,8 +74,10 @@ EventType = Literal[
     "model.ready",
     "model.failed",
     "change.told",
+    "change.updated",
     "change.withdrawn",
     "object.told",
+    "object.updated",
     "object.gone_again",
     "object.seen_again",
     "object.accepted",
@@ -117,6 +121,11 @@ class Record(BaseModel):
     def of_row(cls, row: object) -> Self:
         """Return the record of a row of tables.py, whose attributes bear the same names."""
         return cls.model_validate(row, from_attributes=True)
+
+
+def problem_urn(code: str) -> str:
+    """Return the type of a problem with this code, as problem documents and events have it (RFC 9457)."""
+    return f"urn:spicd:problem:{code}"
 
 
 class Problem(Record):
@@ -327,6 +336,15 @@ class ObjectRecord(Record):
         return self
 
 
+class Tileset(Record):
+    """How large the tileset of a cloud is (3D Tiles 1.1)."""
+
+    n_points: int = Field(description="all points of the cloud, each in one content", examples=[5181342])
+    contents: int = Field(examples=[214])
+    bytes: int = Field(description="of all contents", examples=[62181520])
+    sha256: str = Field(description="of the same; its first digits are part of their addresses")
+
+
 class BuiltSummary(Record):
     """What lists tell of maps and of versions alike."""
 
@@ -337,6 +355,9 @@ class BuiltSummary(Record):
     scan_count: int = Field(description="scans that it is made of, accepted or not", examples=[25])
     bounds: Bounds | None = Field(description="metres, map frame")  #: None until it is built
     counts: dict[str, int] = Field(examples=[{"points": 181342, "tiles": 172, "scans": 25, "accepted": 24}])
+    tileset: Tileset | None = Field(
+        description="of the fused cloud, `tileset.json`; null until it is built, and of what an earlier release built"
+    )
     job_id: str  #: of the job that builds it, and so of its files (`blob_keys.map_folder`)
     problem: Problem | None
     created: Utc
@@ -426,6 +447,10 @@ class SurveySummary(Record):
         description="things that moved while the visit lasted, people for the most part; they are no objects",
         examples=[3],
     )
+    tileset: Tileset | None = Field(
+        description="of the coloured cloud, `tileset.json`; null until it is done, and where the cloud is small enough to "
+        "be read whole"
+    )
     job_id: str
     problem: Problem | None
     created: Utc
@@ -466,7 +491,11 @@ class JobRecord(Record):
     job_id: str
     kind: JobKind
     status: JobStatus
-    message: str = Field(description="the stage", examples=["registering"])
+    message: str = Field(
+        description="for people: the stage while it waits or runs, and what became of it once it has ended; of one that "
+        "failed the same sentence as `problem.detail`",
+        examples=["registering"],
+    )
     progress: int = Field(ge=0, le=100, examples=[40])
     created: Utc
     started: Utc | None

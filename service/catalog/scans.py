@@ -39,6 +39,8 @@ OF_THE_FILE: frozenset[ScanReason] = frozenset(
     (
         "far_from_origin",
         "far_points",
+        "offset_taken_off",
+        "no_sensor_place",
         "missing_returns",
         "odd_density",
         "odd_size",
@@ -233,6 +235,26 @@ def new_uses(scans: Iterable[ScanRecord], poses: Mapping[str, Matrix]) -> tuple[
     A pose is of this use: that in `poses`, by the id of the scan, else that of the upload as it is now.
     """
     return tuple(ScanOutcome(scan_id=scan.scan_id, pose=poses.get(scan.scan_id, scan.pose)) for scan in scans)
+
+
+def put_in_place(kind: type[Row], rows: list[Row], scan_id: str, parts: Mapping[str, Matrix | None]) -> None:
+    """Put scans, with their poses by id, in the place of the one that they were taken out of; `rows` are all of one use.
+
+    Does nothing where that is not among the rows, as when it was done already; a scan that is among them stays as it is.
+    """
+    old = next((row for row in rows if row.scan_id == scan_id), None)
+    if old is None:
+        return
+    known = {row.scan_id for row in rows}
+    uses = [ScanOutcome(scan_id=part, pose=pose) for part, pose in parts.items() if part not in known]
+    for row in rows:
+        row.ordinal += len(uses) if row.ordinal > old.ordinal else 0
+    new = [
+        kind(scan_id=use.scan_id, ordinal=old.ordinal + n, **outcome_columns(use))
+        for n, use in enumerate(uses)
+    ]
+    rows.remove(old)
+    rows.extend(new)
 
 
 def outcome_columns(outcome: ScanOutcome) -> dict[str, Any]:

@@ -29,6 +29,7 @@ from service.catalog.records import (
     SurveyRecord,
     SurveySummary,
     TileRecord,
+    Tileset,
     TileState,
 )
 from service.catalog.scans import (
@@ -38,12 +39,13 @@ from service.catalog.scans import (
     known_outcomes,
     new_uses,
     outcome_columns,
+    put_in_place,
     scans_in_order,
     write_outcomes,
 )
 from service.catalog.tables import Survey, SurveyObject, SurveyTile, new_id, now
-from service.catalog.versions import map_row, version_in_use
-from service.errors import Conflict, NotFound, NotReady
+from service.catalog.versions import map_row, tileset_of, version_in_use
+from service.errors import Conflict, Failed, NotFound, NotReady
 
 
 class Surveys:
@@ -115,13 +117,20 @@ class Surveys:
             return SurveyRecord.of_row(_row(session, survey_id))
 
     def ready(self, survey_id: str) -> SurveyRecord:
-        """Return one survey that is done. Raises NotFound and NotReady."""
+        """Return one survey that is done. Raises NotFound, and NotReady or Failed."""
         survey = self.get(survey_id)
-        if survey.status == "running":
-            raise NotReady(f"survey {survey_id!r} is still running; follow job {survey.job_id}")
-        if survey.status == "failed":
-            raise NotReady(f"survey {survey_id!r} has no result; job {survey.job_id} says why")
+        _check_ready(survey.status, survey_id, survey.job_id)
         return survey
+
+    def tileset(self, survey_id: str) -> Tileset:
+        """Return the tileset of a survey that is done; of the scans nothing is read.
+
+        Raises NotFound, also for a survey without a tileset, and NotReady.
+        """
+        with self._database.read() as session:
+            row = _row(session, survey_id)
+            _check_ready(row.status, survey_id, row.job_id)
+            return tileset_of(row.tileset, f"survey {survey_id!r}")
 
     def page(self, map_id: str, *, after: Position | None = None, limit: int = 100) -> Page[SurveySummary]:
         """Return surveys of a map, newest first."""
@@ -131,6 +140,16 @@ class Surveys:
         )
         created, key = Survey.created, Survey.survey_id
         return self._database.page(query, created, key, SurveySummary.of_row, after=after, limit=limit)
+
+    def take_apart(self, key: str, scan_id: str, parts: Mapping[str, Matrix | None]) -> None:
+        """Put the scans that one of the survey's was taken apart into in its place, with their poses.
+
+        `key` is the id of the survey. Raises NotFound.
+        """
+        with self._database.write() as session:
+            row = _row(session, key)
+            put_in_place(tables.SurveyScan, row.scans, scan_id, parts)
+            row.updated = now()
 
     def save_outcomes(
         self, survey_id: str, outcomes: Iterable[ScanOutcome], *, placement: Placement | None = None
@@ -155,6 +174,7 @@ class Surveys:
         threshold: float,
         objects: Iterable[ObjectRecord] | None = None,
         moving: int | None = None,
+        tileset: Tileset | None = None,
     ) -> None:
         """Record tiles and objects, replacing those of an earlier run; `jobs.succeed` makes the survey ready.
 
@@ -181,6 +201,7 @@ class Surveys:
             row.counts = {"tiles": len(tiles), **{state: by_state[state] for state in get_args(TileState)}}
             row.objects = {kind: by_kind[kind] for kind in get_args(ObjectKind)} if told else None
             row.moving = moving
+            row.tileset = None if tileset is None else tileset.model_dump()
             row.updated = now()
             if row.status == "ready":  # a step that was thought lost runs beside its second run, and is late
                 history.rewrite(session, row.map_id)
@@ -210,6 +231,14 @@ def _check_unused(session: Session, row: Survey) -> None:
             f"version {built.version} of map {row.map_id!r} is being built of survey {row.survey_id!r}; wait for job "
             f"{built.job_id}, or dismiss it"
         )
+
+
+def _check_ready(status: str, survey_id: str, job_id: str) -> None:
+    """Raise NotReady or Failed, with the job to look at, for a survey that is not done."""
+    if status == "running":
+        raise NotReady(f"survey {survey_id!r} is still running; follow job {job_id}")
+    if status == "failed":
+        raise Failed(f"survey {survey_id!r} has no result; job {job_id} says why")
 
 
 def _locked(session: Session, survey_id: str) -> Survey:
@@ -243,8 +272,17 @@ def _check_doubt(row: Survey, by_state: Mapping[TileState, int], *, told: bool) 
 
 
 def _replace_tiles(session: Session, survey_id: str, tiles: Iterable[TileRecord]) -> None:
+    """Write the tiles of a survey; one of which an earlier run said the same goes on to belong to its change."""
+    told = select(SurveyTile.__table__).where(
+        SurveyTile.survey_id == survey_id, SurveyTile.told_by.is_not(None)
+    )
+    before = {row["tile_id"]: dict(row) for row in session.execute(told).mappings()}
     session.execute(delete(SurveyTile).where(SurveyTile.survey_id == survey_id))
-    session.add_all(_tile_row(survey_id, tile) for tile in tiles)
+    for row in (_tile_row(survey_id, tile) for tile in tiles):
+        earlier = before.get(row.tile_id, {})
+        if earlier and all(getattr(row, name) == earlier[name] for name in earlier if name != "told_by"):
+            row.told_by = earlier["told_by"]
+        session.add(row)
 
 
 def _replace_objects(session: Session, survey_id: str, objects: Iterable[ObjectRecord]) -> None:

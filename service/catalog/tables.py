@@ -159,6 +159,7 @@ class MapVersion(Base):
     bounds: Mapped[dict[str, Any] | None]
     counts: Mapped[dict[str, int]]
     registration: Mapped[dict[str, Any] | None]
+    tileset: Mapped[dict[str, Any] | None]  #: None of what earlier releases built
     created: Mapped[datetime]
     updated: Mapped[datetime]
 
@@ -219,6 +220,7 @@ class Survey(Base):
     counts: Mapped[dict[str, int]]
     objects: Mapped[dict[str, int] | None]
     moving: Mapped[int | None]
+    tileset: Mapped[dict[str, Any] | None]
     job_id: Mapped[str]
     created: Mapped[datetime]
     updated: Mapped[datetime]
@@ -309,8 +311,15 @@ class TileChange(Base):
     published: Mapped[int] = mapped_column(
         BigInteger, server_default="0"
     )  #: number of the event that told it
+    updated: Mapped[int] = mapped_column(
+        BigInteger, server_default="0"
+    )  #: number of the event that told it last, where what is known of it changed since
 
-    __table_args__ = (Index(None, "survey_id", "tile_id"), Index(None, "map_id", "published"))
+    __table_args__ = (
+        Index(None, "survey_id", "tile_id"),
+        Index(None, "map_id", "published"),
+        Index(None, "map_id", "updated"),
+    )
 
 
 class SurveyObject(Base):
@@ -359,8 +368,15 @@ class MapObject(Base):
     published: Mapped[int] = mapped_column(
         BigInteger, server_default="0"
     )  #: number of the event that told it
+    updated: Mapped[int] = mapped_column(
+        BigInteger, server_default="0"
+    )  #: number of the event that told it last, where what became of it changed since
 
-    __table_args__ = (Index(None, "map_id", "first_seen", "id"), Index(None, "map_id", "published"))
+    __table_args__ = (
+        Index(None, "map_id", "first_seen", "id"),
+        Index(None, "map_id", "published"),
+        Index(None, "map_id", "updated"),
+    )
 
 
 class Acceptance(Base):

@@ -21,6 +21,7 @@ from service.catalog.records import (
     Page,
     Position,
     ScanOutcome,
+    Tileset,
     VersionRecord,
     VersionSummary,
 )
@@ -30,11 +31,12 @@ from service.catalog.scans import (
     known_outcomes,
     new_uses,
     outcome_columns,
+    put_in_place,
     scans_in_order,
     write_outcomes,
 )
 from service.catalog.tables import MapVersion, now
-from service.errors import BadRequest, Conflict, Gone, NotFound, NotReady
+from service.errors import BadRequest, Conflict, Failed, Gone, NotFound, NotReady
 
 ScanPosition = tuple[str, int]  #: in a list of scans: the job of their version, and how many came before
 
@@ -119,6 +121,17 @@ class Versions:
             following = (row.job_id, before + limit) if len(scans) > limit else None
             return ScanPage(version=row.version, items=scans[:limit], following=following)
 
+    def tileset(self, map_id: str, number: int) -> tuple[str, Tileset]:
+        """Return the job of a version that is built, and its tileset; of the scans nothing is read.
+
+        Viewers ask hundreds of times. Raises NotFound, also for a version without a tileset, and NotReady.
+        """
+        what = f"version {number} of map {map_id!r}"
+        with self._database.read() as session:
+            row = _row(session, map_id, number)
+            check_ready(row.status, what, row.job_id)
+            return row.job_id, tileset_of(row.tileset, what)
+
     def of_job(self, job_id: str) -> VersionRecord:
         """Return the version that a job builds. Raises NotFound, also where it was deleted since."""
         with self._database.read() as session:
@@ -131,6 +144,16 @@ class Versions:
         query = versions_in_short().where(MapVersion.map_id == map_id)
         created, key = MapVersion.created, MapVersion.job_id
         return self._database.page(query, created, key, VersionSummary.of_row, after=after, limit=limit)
+
+    def take_apart(self, key: str, scan_id: str, parts: Mapping[str, Matrix | None]) -> None:
+        """Put the scans that one of a version's was taken apart into in its place, with their poses.
+
+        `key` is the id of the job that builds the version. Raises NotFound, also where it was deleted since.
+        """
+        with self._database.write() as session:
+            row = _row_of_job(session, key)
+            put_in_place(tables.VersionScan, row.scans, scan_id, parts)
+            row.updated = now()
 
     def save_outcomes(self, job_id: str, outcomes: Iterable[ScanOutcome]) -> None:
         """Record what became of the scans, also when the version then fails. Raises NotFound."""
@@ -149,6 +172,7 @@ class Versions:
         bounds: Bounds,
         counts: Mapping[str, int],
         registration: Mapping[str, Any] | None = None,
+        tileset: Tileset | None = None,
     ) -> None:
         """Record what was built, replacing an earlier run's result; `jobs.succeed` makes it ready.
 
@@ -162,6 +186,7 @@ class Versions:
             row.bounds = bounds.model_dump(mode="json")
             row.counts = dict(counts)
             row.registration = None if registration is None else dict(registration)
+            row.tileset = None if tileset is None else tileset.model_dump()
             row.updated = now()
 
     def delete(self, map_id: str, number: int) -> None:
@@ -181,6 +206,15 @@ class Versions:
         """Delete a version whose job never reached the queue."""
         with self._database.write() as session:
             _delete(session, _row_of_job(session, job_id))
+
+
+def tileset_of(told: Tileset | dict[str, Any] | None, what: str) -> Tileset:
+    """Return the tileset that a row or a record tells of. Raises NotFound where there is none."""
+    if told is None:
+        raise NotFound(
+            f"{what} has no tileset: an earlier release built it, or its cloud is small; read cloud.ply"
+        )
+    return Tileset.model_validate(told)
 
 
 def map_row(session: Session, map_id: str, *, lock: bool = False) -> tables.Map:
@@ -290,11 +324,11 @@ def _listed(
 
 
 def check_ready(status: str, what: str, job_id: str) -> None:
-    """Raise NotReady with the job to look at, unless it is ready."""
+    """Raise NotReady, or Failed, with the job to look at, unless it is ready."""
     if status == "building":
         raise NotReady(f"{what} is still building; follow job {job_id}")
     if status == "failed":
-        raise NotReady(f"{what} could not be built; job {job_id} says why")
+        raise Failed(f"{what} could not be built; job {job_id} says why")
 
 
 def _row(session: Session, map_id: str, number: int) -> MapVersion:
@@ -349,7 +383,8 @@ def _survey_scans(session: Session, survey_id: str, base: MapVersion) -> list[Sc
     if survey is None or survey.map_id != base.map_id:
         raise NotFound(f"no survey {survey_id!r} of map {base.map_id!r}")
     if survey.status != "ready":
-        raise NotReady(f"survey {survey_id!r} is {survey.status}; look at job {survey.job_id}")
+        error = Failed if survey.status == "failed" else NotReady
+        raise error(f"survey {survey_id!r} is {survey.status}; look at job {survey.job_id}")
     _check_placed(survey)
     scans = _accepted(survey.scans)
     known = _shared(base, [scan.scan_id for scan in scans])

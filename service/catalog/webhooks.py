@@ -14,7 +14,7 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from service.catalog.database import Database
-from service.catalog.events import extent
+from service.catalog.events import extent, require_known
 from service.catalog.idempotency import ANY_TIMES, Once
 from service.catalog.records import DeliveryRecord, EventType, Page, Position, WebhookRecord
 from service.catalog.tables import Event, Webhook, WebhookDelivery, new_id, now
@@ -43,7 +43,7 @@ class Webhooks:
     ) -> tuple[WebhookRecord, str]:
         """Record a webhook for what is published from now on; returns it with its secret, which is not shown again.
 
-        Raises Conflict where there are as many as may be, and what `once` does.
+        Raises NotFound (the map), Conflict where there are as many as may be, and what `once` does.
         """
         secret, instant = new_secret(), now()
         row = Webhook(
@@ -60,6 +60,8 @@ class Webhooks:
         )
         with self._database.write() as session:
             once.claim(session)
+            if map_id is not None:
+                require_known(session, map_id)
             if len(session.scalars(select(Webhook.webhook_id)).all()) >= MOST:
                 raise Conflict(f"there are {MOST} webhooks, as many as may be; delete one that is not needed")
             row.position = extent(session)[1]

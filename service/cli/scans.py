@@ -17,7 +17,9 @@ from service.client import ClientError, Document
 
 def add(
     ctx: typer.Context,
-    files: Annotated[list[Path], typer.Argument(exists=True, dir_okay=False, help="PLY or PCD.")],
+    files: Annotated[
+        list[Path], typer.Argument(exists=True, dir_okay=False, help="PLY, PCD, E57, LAS or LAZ.")
+    ],
     device_id: Device = None,
     captured_at: Captured = None,
     pose: Annotated[

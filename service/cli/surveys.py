@@ -91,6 +91,9 @@ def download(
         Path | None,
         typer.Option(help="Folder; left out: one that is named like the survey.", file_okay=False),
     ] = None,
+    laz: Annotated[
+        bool, typer.Option("--laz", help="The cloud as LAZ, in a ninth to a quarter of the bytes.")
+    ] = False,
 ) -> None:
     """Fetch what a survey found: cloud, picture, tiles and objects. What was broken off is taken up, also by another run."""
     terminal: Terminal = ctx.obj
@@ -100,7 +103,7 @@ def download(
         refused = survey["status"] == "failed" and _placed(survey) == "refused"
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            names = ("picture.png",) if refused else ("cloud.ply", "picture.png")
+            names = ("picture.png",) if refused else ("cloud.laz" if laz else "cloud.ply", "picture.png")
             files = [
                 terminal.download(client, f"/surveys/{survey_id}/{name}", folder / name) for name in names
             ]
@@ -133,6 +136,7 @@ def _features(client: Client, survey: SurveyDocument, folder: Path) -> Iterator[
 def changes(
     ctx: typer.Context,
     map_id: MapId,
+    change: Annotated[str | None, typer.Option(help="This one alone.")] = None,
     survey: Annotated[str | None, typer.Option(help="Of this survey only.")] = None,
     state: Annotated[
         str | None, typer.Option(help="changed, unchanged, inconsistent or unobserved; left out: changed.")
@@ -153,6 +157,7 @@ def changes(
     most = CSV_PAGE if csv else 100
     frame = None if bbox is None else "map"  # else the Earth's, of a map that has an anchor
     filters = {
+        "change": change,
         "survey": survey,
         "state": state,
         "kind": kind,

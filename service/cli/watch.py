@@ -67,7 +67,7 @@ def watch(
 ) -> None:
     """Send every scan that appears in a folder, and go on for ever.
 
-    Write scans (.ply, .pcd) into FOLDER, or into a sub-folder for each visit. A file is sent once it has not changed
+    Write scans (.ply, .pcd, .e57, .las, .laz) into FOLDER, or into a sub-folder for each visit. A file is sent once it has not changed
     for --settle seconds; give it its name when it is whole (hall.ply.part renamed to hall.ply) and none is sent half.
     Names that begin with a dot or end in .part, .partial, .tmp or ~ are left alone, and so is all that is no scan.
 

@@ -53,39 +53,6 @@ class CarrierRequest(TypedDict):
     radius: float
 
 
-class CloudEvent(TypedDict):
-    """An event (CloudEvents 1.0)."""
-
-    data: dict[str, Any]
-    datacontenttype: Literal["application/json"]
-    id: str
-    sequence: str
-    source: str
-    specversion: Literal["1.0"]
-    subject: str
-    time: str
-    type: Literal[
-        "scan.uploaded",
-        "scan.deleted",
-        "job.ended",
-        "map.deleted",
-        "version.ready",
-        "version.failed",
-        "survey.ready",
-        "survey.failed",
-        "survey.deleted",
-        "model.ready",
-        "model.failed",
-        "change.told",
-        "change.withdrawn",
-        "object.told",
-        "object.gone_again",
-        "object.seen_again",
-        "object.accepted",
-        "object.withdrawn",
-    ]
-
-
 class Conformance(TypedDict):
     """The standards that the answers keep to, each by the name of its conformance class."""
 
@@ -137,7 +104,63 @@ class Live(TypedDict):
     status: Literal["ok"]
 
 
+class ManifestTile(TypedDict):
+    """One tile that is kept."""
+
+    dense_file: None
+    file: None
+    n_original_points: int
+    n_sampled_points: int | None
+    patch_id: str
+    tile_center: list[float]
+    tile_idx: list[int]
+
+
+class MapDeletedData(TypedDict):
+    """A map that was deleted, and all that was of it."""
+
+    links: list[Link]
+    map_id: str
+
+
+class MapDeletedEvent(TypedDict):
+    """A map was deleted, and all that is of it; its changes and objects are not withdrawn one by one."""
+
+    data: MapDeletedData
+    datacontenttype: Literal["application/json"]
+    id: str
+    sequence: str
+    source: str
+    specversion: Literal["1.0"]
+    subject: str
+    time: str
+    type: Literal["map.deleted"]
+
+
 ScanId: TypeAlias = str
+
+
+class ModelData(TypedDict):
+    """A model whose training ended."""
+
+    job_id: str
+    links: list[Link]
+    map_id: str
+    model: str
+
+
+class ModelEvent(TypedDict):
+    """A training ended."""
+
+    data: ModelData
+    datacontenttype: Literal["application/json"]
+    id: str
+    sequence: str
+    source: str
+    specversion: Literal["1.0"]
+    subject: str
+    time: str
+    type: Literal["model.ready", "model.failed"]
 
 
 class ModelList(TypedDict):
@@ -189,8 +212,10 @@ class NewWebhook(TypedDict):
                 "model.ready",
                 "model.failed",
                 "change.told",
+                "change.updated",
                 "change.withdrawn",
                 "object.told",
+                "object.updated",
                 "object.gone_again",
                 "object.seen_again",
                 "object.accepted",
@@ -202,6 +227,34 @@ class NewWebhook(TypedDict):
     updated: str
     url: str
     webhook_id: str
+
+
+class ObjectData(TypedDict):
+    """A changed thing, as its latest sighting has it."""
+
+    kind: Literal["appeared", "disappeared", "moved"]
+    links: list[Link]
+    map_id: str
+    object_id: str
+    probability: float
+    status: Literal["new", "still_there", "gone_again", "unknown", "accepted"]
+    survey_id: str
+
+
+class ObjectEvent(TypedDict):
+    """An object is seen for the first time, is gone or there again, was taken over by a version, or is known otherwise."""
+
+    data: ObjectData
+    datacontenttype: Literal["application/json"]
+    id: str
+    sequence: str
+    source: str
+    specversion: Literal["1.0"]
+    subject: str
+    time: str
+    type: Literal[
+        "object.told", "object.updated", "object.gone_again", "object.seen_again", "object.accepted"
+    ]
 
 
 class ObjectProperties(TypedDict):
@@ -240,10 +293,53 @@ class ObjectProperties(TypedDict):
     status: Literal["new", "still_there", "gone_again", "unknown", "accepted"]
     survey_id: str
     transient: bool
+    updated: NotRequired[bool]
     volume: float
     yaw_degrees: float
     z_max: float
     z_min: float
+
+
+class ObjectWithdrawnData(TypedDict):
+    """An object that no visit sees any more, or that turned out to be part of another."""
+
+    links: list[Link]
+    map_id: str
+    object_id: str
+
+
+class ObjectWithdrawnEvent(TypedDict):
+    """No visit sees an object any more, or it turned out to be part of another."""
+
+    data: ObjectWithdrawnData
+    datacontenttype: Literal["application/json"]
+    id: str
+    sequence: str
+    source: str
+    specversion: Literal["1.0"]
+    subject: str
+    time: str
+    type: Literal["object.withdrawn"]
+
+
+class PingData(TypedDict):
+    """A test that somebody asked for."""
+
+    links: list[Link]
+    webhook_id: str
+
+
+class PingEvent(TypedDict):
+    """A test of a webhook; it has no number, for it is in no list."""
+
+    data: PingData
+    datacontenttype: Literal["application/json"]
+    id: str
+    source: str
+    specversion: Literal["1.0"]
+    subject: str
+    time: str
+    type: Literal["webhook.ping"]
 
 
 class Placement(TypedDict):
@@ -277,12 +373,16 @@ class Prism(TypedDict):
 
 
 class ProblemDocument(TypedDict):
-    """RFC 9457, Section 3. `type` is stable; `errors` lists the values that do not match."""
+    """
+    A problem (RFC 9457, Section 3), of a request or of a job; what it does not have is left out.
+
+    `type` is stable, docs/problems.md has all of them; `detail` is for people and may change.
+    """
 
     detail: str
-    errors: NotRequired[list[InvalidValue] | None]
-    instance: NotRequired[str | None]
-    status: NotRequired[int | None]
+    errors: NotRequired[list[InvalidValue]]
+    instance: NotRequired[str]
+    status: NotRequired[int]
     title: str
     type: str
 
@@ -336,7 +436,29 @@ Results: TypeAlias = dict[str, Link]
 """What a job made, each output by a link (results)."""
 
 
+class ScanData(TypedDict):
+    """A scan, which is of no map yet."""
+
+    device_id: str | None
+    links: list[Link]
+    scan_id: str
+
+
 PoseItem: TypeAlias = list[float]
+
+
+class ScanEvent(TypedDict):
+    """A scan is kept, or was deleted."""
+
+    data: ScanData
+    datacontenttype: Literal["application/json"]
+    id: str
+    sequence: str
+    source: str
+    specversion: Literal["1.0"]
+    subject: str
+    time: str
+    type: Literal["scan.uploaded", "scan.deleted"]
 
 
 class ScanForm(TypedDict):
@@ -359,11 +481,11 @@ MapFromScanItem: TypeAlias = list[float]
 class ScanRequest(TypedDict):
     """What may be said of one scan."""
 
-    captured_at: NotRequired[str | None]
-    device_id: NotRequired[str | None]
-    filename: NotRequired[str | None]
-    frame: NotRequired[str | None]
-    pose: NotRequired[list[PoseItem] | list[float] | None]
+    captured_at: NotRequired[str]
+    device_id: NotRequired[str]
+    filename: NotRequired[str]
+    frame: NotRequired[str]
+    pose: NotRequired[list[PoseItem] | list[float]]
 
 
 class ScanUse(TypedDict):
@@ -396,6 +518,8 @@ class ScanWarning(TypedDict):
         "wrong_units",
         "far_from_origin",
         "far_points",
+        "offset_taken_off",
+        "no_sensor_place",
         "missing_returns",
         "odd_density",
         "odd_size",
@@ -439,6 +563,55 @@ class SightingProperties(TypedDict):
     z_min: float
 
 
+class SurveyData(TypedDict):
+    """A survey that has its result, or none."""
+
+    captured_at: str
+    counts: dict[str, int]
+    device_id: str | None
+    job_id: str
+    links: list[Link]
+    map_id: str
+    objects: dict[str, int] | None
+    survey_id: str
+
+
+class SurveyDeletedData(TypedDict):
+    """A survey that was deleted."""
+
+    links: list[Link]
+    map_id: str
+    survey_id: str
+
+
+class SurveyDeletedEvent(TypedDict):
+    """A survey was deleted."""
+
+    data: SurveyDeletedData
+    datacontenttype: Literal["application/json"]
+    id: str
+    sequence: str
+    source: str
+    specversion: Literal["1.0"]
+    subject: str
+    time: str
+    type: Literal["survey.deleted"]
+
+
+class SurveyEvent(TypedDict):
+    """A survey has its result, or none."""
+
+    data: SurveyData
+    datacontenttype: Literal["application/json"]
+    id: str
+    sequence: str
+    source: str
+    specversion: Literal["1.0"]
+    subject: str
+    time: str
+    type: Literal["survey.ready", "survey.failed"]
+
+
 class SurveyForm(TypedDict):
     """A visit to compare with a map, of scans that were uploaded before, or come with the request."""
 
@@ -459,32 +632,6 @@ class SurveyRequest(TypedDict):
     scan_ids: NotRequired[list[ScanId]]
     scans: NotRequired[list[ScanUse]]
     threshold: NotRequired[float | None]
-
-
-class SurveySummaryDocument(TypedDict):
-    """A survey in short; the survey itself tells what became of each scan."""
-
-    accepted_count: int
-    asked_threshold: float | None
-    captured_at: str
-    counts: dict[str, int]
-    created: str
-    device_id: str | None
-    job_id: str
-    links: list[Link]
-    map_id: str
-    map_version: int
-    model: str
-    moving: int | None
-    objects: dict[str, int] | None
-    placement: Placement | None
-    problem: ProblemDocument | None
-    scan_count: int
-    status: Literal["running", "ready", "failed"]
-    survey_id: str
-    threshold: float | None
-    updated: str
-    warnings: list[ScanWarning]
 
 
 class TileProperties(TypedDict):
@@ -517,8 +664,18 @@ class TileProperties(TypedDict):
     threshold: float | None
     tile_id: str
     tile_index: list[int]
+    updated: NotRequired[bool]
     z_max: float
     z_min: float
+
+
+class Tileset(TypedDict):
+    """How large the tileset of a cloud is (3D Tiles 1.1)."""
+
+    bytes: int
+    contents: int
+    n_points: int
+    sha256: str
 
 
 class Time(TypedDict):
@@ -541,7 +698,7 @@ class UploadDocument(TypedDict):
 
     created: str
     expires: str
-    format: Literal["ply", "pcd"] | None
+    format: Literal["ply", "pcd", "e57", "las", "laz"] | None
     length: int
     links: list[Link]
     metadata: dict[str, str]
@@ -549,6 +706,29 @@ class UploadDocument(TypedDict):
     problem: ProblemDocument | None
     scan_id: str | None
     upload_id: str
+
+
+class VersionData(TypedDict):
+    """A version of a map that was built, or could not be."""
+
+    job_id: str
+    links: list[Link]
+    map_id: str
+    version: int
+
+
+class VersionEvent(TypedDict):
+    """A version of a map was built, or could not be."""
+
+    data: VersionData
+    datacontenttype: Literal["application/json"]
+    id: str
+    sequence: str
+    source: str
+    specversion: Literal["1.0"]
+    subject: str
+    time: str
+    type: Literal["version.ready", "version.failed"]
 
 
 class VersionForm(TypedDict):
@@ -586,6 +766,7 @@ class VersionSummaryDocument(TypedDict):
     scan_count: int
     status: Literal["building", "ready", "failed"]
     survey_id: str | None
+    tileset: Tileset | None
     updated: str
     version: int
 
@@ -609,8 +790,10 @@ class WebhookChange(TypedDict):
                 "model.ready",
                 "model.failed",
                 "change.told",
+                "change.updated",
                 "change.withdrawn",
                 "object.told",
+                "object.updated",
                 "object.gone_again",
                 "object.seen_again",
                 "object.accepted",
@@ -649,8 +832,10 @@ class WebhookDocument(TypedDict):
                 "model.ready",
                 "model.failed",
                 "change.told",
+                "change.updated",
                 "change.withdrawn",
                 "object.told",
+                "object.updated",
                 "object.gone_again",
                 "object.seen_again",
                 "object.accepted",
@@ -690,8 +875,10 @@ class WebhookRequest(TypedDict):
                 "model.ready",
                 "model.failed",
                 "change.told",
+                "change.updated",
                 "change.withdrawn",
                 "object.told",
+                "object.updated",
                 "object.gone_again",
                 "object.seen_again",
                 "object.accepted",
@@ -706,6 +893,7 @@ class WebhookRequest(TypedDict):
 class WithdrawnDocument(TypedDict):
     """Something that is told no more: a survey was deleted, or a late visit joined two into one."""
 
+    filtered: bool
     id: str
     merged_into: str | None
 
@@ -751,6 +939,57 @@ class AcceptedVersion(TypedDict):
     version: int
 
 
+class ChangeData(TypedDict):
+    """A change of a tile, as it was when it was told."""
+
+    change_id: str
+    first_seen: str
+    last_seen: str
+    links: list[Link]
+    map_id: str
+    max_score: float
+    survey_id: str
+    tile_id: str
+
+
+class ChangeEvent(TypedDict):
+    """A change of a tile is seen for the first time, or what is known of it is another than was told."""
+
+    data: ChangeData
+    datacontenttype: Literal["application/json"]
+    id: str
+    sequence: str
+    source: str
+    specversion: Literal["1.0"]
+    subject: str
+    time: str
+    type: Literal["change.told", "change.updated"]
+
+
+class ChangeWithdrawnData(TypedDict):
+    """A change that no visit sees any more, or that turned out to be part of another."""
+
+    change_id: str
+    links: list[Link]
+    map_id: str
+    merged_into: str | None
+    tile_id: str
+
+
+class ChangeWithdrawnEvent(TypedDict):
+    """No visit sees a change any more, or a late visit joined it with an older one."""
+
+    data: ChangeWithdrawnData
+    datacontenttype: Literal["application/json"]
+    id: str
+    sequence: str
+    source: str
+    specversion: Literal["1.0"]
+    subject: str
+    time: str
+    type: Literal["change.withdrawn"]
+
+
 class DeliveryDocument(TypedDict):
     """A delivery."""
 
@@ -772,14 +1011,6 @@ class DeliveryList(TypedDict):
     """Deliveries of a webhook, newest first."""
 
     deliveries: list[DeliveryDocument]
-    links: list[Link]
-
-
-class EventList(TypedDict):
-    """Events in the order of publication."""
-
-    cursor: str
-    events: list[CloudEvent]
     links: list[Link]
 
 
@@ -841,6 +1072,33 @@ class JobDocument(TypedDict):
     waiting_s: float | None
 
 
+class JobEndedData(TypedDict):
+    """A job that has ended."""
+
+    job_id: str
+    kind: Literal["map", "survey", "model"]
+    links: list[Link]
+    map_id: str
+    model: str | None
+    problem: str | None
+    status: Literal["successful", "failed", "dismissed"]
+    survey_id: str | None
+
+
+class JobEndedEvent(TypedDict):
+    """A job was successful, failed or was dismissed, also where it is gone with what was deleted."""
+
+    data: JobEndedData
+    datacontenttype: Literal["application/json"]
+    id: str
+    sequence: str
+    source: str
+    specversion: Literal["1.0"]
+    subject: str
+    time: str
+    type: Literal["job.ended"]
+
+
 class JobList(TypedDict):
     """Jobs, newest first."""
 
@@ -854,6 +1112,23 @@ class LandingPage(TypedDict):
     description: str
     links: list[Link]
     title: str
+
+
+class Manifest(TypedDict):
+    """Tile size, bounds and the tiles of a map (paper, Table A1); metres, map frame."""
+
+    dense_voxel: float
+    map_bounds: Bounds
+    min_points: int
+    n_skipped_tiles: int
+    n_tiles_grid: list[int]
+    n_valid_patches: int
+    patch_size: int | None
+    patches: list[ManifestTile]
+    save_dense_tiles: bool
+    tile_lowest_idx: list[int]
+    tile_origin: list[float]
+    tile_size: list[float]
 
 
 class MapSettings(TypedDict):
@@ -881,6 +1156,7 @@ class MapSummaryDocument(TypedDict):
     problem: ProblemDocument | None
     scan_count: int
     status: Literal["building", "ready", "failed"]
+    tileset: Tileset | None
     updated: str
     version: int
 
@@ -908,7 +1184,7 @@ class ScanDocument(TypedDict):
     created: str
     device_id: str | None
     filename: str
-    format: Literal["ply", "pcd"]
+    format: Literal["ply", "pcd", "e57", "las", "laz"]
     frame: str | None
     pose: list[PoseItem] | None
     scan_id: str
@@ -959,6 +1235,8 @@ class ScanOutcome(TypedDict):
             "wrong_units",
             "far_from_origin",
             "far_points",
+            "offset_taken_off",
+            "no_sensor_place",
             "missing_returns",
             "odd_density",
             "odd_size",
@@ -1014,15 +1292,36 @@ class SurveyDocument(TypedDict):
     status: Literal["running", "ready", "failed"]
     survey_id: str
     threshold: float | None
+    tileset: Tileset | None
     updated: str
     warnings: list[ScanWarning]
 
 
-class SurveyList(TypedDict):
-    """Surveys, newest first."""
+class SurveySummaryDocument(TypedDict):
+    """A survey in short; the survey itself tells what became of each scan."""
 
+    accepted_count: int
+    asked_threshold: float | None
+    captured_at: str
+    counts: dict[str, int]
+    created: str
+    device_id: str | None
+    job_id: str
     links: list[Link]
-    surveys: list[SurveySummaryDocument]
+    map_id: str
+    map_version: int
+    model: str
+    moving: int | None
+    objects: dict[str, int] | None
+    placement: Placement | None
+    problem: ProblemDocument | None
+    scan_count: int
+    status: Literal["running", "ready", "failed"]
+    survey_id: str
+    threshold: float | None
+    tileset: Tileset | None
+    updated: str
+    warnings: list[ScanWarning]
 
 
 class TileFeature(TypedDict):
@@ -1052,6 +1351,7 @@ class VersionDocument(TypedDict):
     settings: dict[str, Any]
     status: Literal["building", "ready", "failed"]
     survey_id: str | None
+    tileset: Tileset | None
     updated: str
     version: int
 
@@ -1063,12 +1363,51 @@ class VersionList(TypedDict):
     versions: list[VersionSummaryDocument]
 
 
+WebhookEvent: TypeAlias = (
+    ScanEvent
+    | JobEndedEvent
+    | VersionEvent
+    | SurveyEvent
+    | SurveyDeletedEvent
+    | ModelEvent
+    | ChangeEvent
+    | ChangeWithdrawnEvent
+    | ObjectEvent
+    | ObjectWithdrawnEvent
+    | MapDeletedEvent
+    | PingEvent
+)
+
+
+CloudEvent: TypeAlias = (
+    ScanEvent
+    | JobEndedEvent
+    | VersionEvent
+    | SurveyEvent
+    | SurveyDeletedEvent
+    | ModelEvent
+    | ChangeEvent
+    | ChangeWithdrawnEvent
+    | ObjectEvent
+    | ObjectWithdrawnEvent
+    | MapDeletedEvent
+)
+
+
+class EventList(TypedDict):
+    """Events in the order of publication."""
+
+    cursor: str
+    events: list[CloudEvent]
+    links: list[Link]
+
+
 class FgObjectCollection(TypedDict):
     """The changed things of a map, in JSON-FG."""
 
     conformsTo: list[str]
     coordRefSys: str
-    cursor: NotRequired[str | None]
+    cursor: NotRequired[str]
     featureType: str
     features: list[FgObjectFeature]
     links: list[Link]
@@ -1076,7 +1415,7 @@ class FgObjectCollection(TypedDict):
     numberReturned: int
     timeStamp: str
     type: Literal["FeatureCollection"]
-    withdrawn: NotRequired[list[WithdrawnDocument] | None]
+    withdrawn: NotRequired[list[WithdrawnDocument]]
 
 
 class FgObjectHistory(TypedDict):
@@ -1111,7 +1450,7 @@ class FgTileCollection(TypedDict):
 
     conformsTo: list[str]
     coordRefSys: str
-    cursor: NotRequired[str | None]
+    cursor: NotRequired[str]
     featureType: str
     features: list[FgTileFeature]
     links: list[Link]
@@ -1119,7 +1458,7 @@ class FgTileCollection(TypedDict):
     numberReturned: int
     timeStamp: str
     type: Literal["FeatureCollection"]
-    withdrawn: NotRequired[list[WithdrawnDocument] | None]
+    withdrawn: NotRequired[list[WithdrawnDocument]]
 
 
 class MapDocument(TypedDict):
@@ -1141,6 +1480,7 @@ class MapDocument(TypedDict):
     scans: list[ScanOutcome]
     settings: dict[str, Any]
     status: Literal["building", "ready", "failed"]
+    tileset: Tileset | None
     updated: str
     version: int
 
@@ -1183,21 +1523,21 @@ class MapRequest(TypedDict):
 class ObjectCollection(TypedDict):
     """The changed things of a map."""
 
-    crs: NotRequired[NamedCrs | None]
-    cursor: NotRequired[str | None]
+    crs: NotRequired[NamedCrs]
+    cursor: NotRequired[str]
     features: list[ObjectFeature]
     links: list[Link]
     numberMatched: int
     numberReturned: int
     timeStamp: str
     type: Literal["FeatureCollection"]
-    withdrawn: NotRequired[list[WithdrawnDocument] | None]
+    withdrawn: NotRequired[list[WithdrawnDocument]]
 
 
 class ObjectHistory(TypedDict):
     """A thing over all surveys of a map, with each sighting of it."""
 
-    crs: NamedCrs | None
+    crs: NotRequired[NamedCrs]
     geometry: Footprint | None
     id: str
     links: list[Link]
@@ -1209,7 +1549,7 @@ class ObjectHistory(TypedDict):
 class SightingCollection(TypedDict):
     """The things that one survey found changed."""
 
-    crs: NotRequired[NamedCrs | None]
+    crs: NotRequired[NamedCrs]
     features: list[SightingFeature]
     links: list[Link]
     numberMatched: int
@@ -1218,15 +1558,22 @@ class SightingCollection(TypedDict):
     type: Literal["FeatureCollection"]
 
 
+class SurveyList(TypedDict):
+    """Surveys, newest first."""
+
+    links: list[Link]
+    surveys: list[SurveySummaryDocument]
+
+
 class TileCollection(TypedDict):
     """Tiles."""
 
-    crs: NotRequired[NamedCrs | None]
-    cursor: NotRequired[str | None]
+    crs: NotRequired[NamedCrs]
+    cursor: NotRequired[str]
     features: list[TileFeature]
     links: list[Link]
     numberMatched: int
     numberReturned: int
     timeStamp: str
     type: Literal["FeatureCollection"]
-    withdrawn: NotRequired[list[WithdrawnDocument] | None]
+    withdrawn: NotRequired[list[WithdrawnDocument]]

@@ -5,13 +5,11 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from typing import Any, Literal, NotRequired, TypedDict, cast
-from urllib.parse import parse_qs, urlsplit
 
 from httpx_sse import ServerSentEvent
 
 from service.client.documents import TileCollection, TileFeature
 from service.client.errors import ClientError, Document
-from service.client.requests import next_href
 
 FROM_THE_START = "0"  #: the cursor before everything that was ever published
 
@@ -20,8 +18,12 @@ FROM_THE_START = "0"  #: the cursor before everything that was ever published
 class ChangesPage:
     """Changes that were published since the page before it."""
 
-    features: list[TileFeature]  #: in the order of their publication, each once
-    withdrawn: list[Document]  #: what was told before and holds no more
+    features: list[
+        TileFeature
+    ]  #: each once as new, and again with the property `updated` where something changed
+    withdrawn: list[
+        Document
+    ]  #: what was told before and holds no more, or is not what the filters ask for any more
     after: str  #: behind the last of them: what `follow_changes` takes to go on from here
 
 
@@ -83,11 +85,11 @@ def event_of(told: ServerSentEvent) -> Event:
 
 
 def changes_page(page: TileCollection) -> ChangesPage:
-    """Return a page with the cursor behind it, from its link `next`. Raises ClientError where it has none."""
-    after = parse_qs(urlsplit(next_href(page) or "").query).get("after")
-    if after is None:
+    """Return a page with the cursor behind it. Raises ClientError where it has none."""
+    after = page.get("cursor")
+    if not after:
         raise ClientError(
             "the service does not tell changes in the order of their publication; is it 0.2 or later?"
         )
     withdrawn = cast(Document, page).get("withdrawn", [])
-    return ChangesPage(features=page["features"], withdrawn=withdrawn, after=after[0])
+    return ChangesPage(features=page["features"], withdrawn=withdrawn, after=after)

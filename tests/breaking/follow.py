@@ -4,7 +4,8 @@ Each robot uploads a scan through a link of its own that is slow and resets ever
 hands in a survey, whose visits come in out of order. Five dashboards follow the map meanwhile, through such links too:
 two by Server-Sent Events, two by the cursor of /maps/{id}/changes, one by a webhook whose receiver fails now and then.
 Exit status 1 where an upload arrived with another digest, a survey is there twice or did not end, or a dashboard has
-missed a change that was told, or was told one twice (a webhook: another event of the same change).
+missed a change that was told, was told one twice as new (a webhook: another event of the same change), or was told of
+one that something of it changed before it was told the change.
 """
 
 from __future__ import annotations
@@ -127,7 +128,10 @@ class Scenario:
                     continue
                 follower.connections += 1
                 for feature in page["features"]:
-                    follower.told[feature["properties"]["change_id"]] += 1
+                    if not feature["properties"]["updated"]:
+                        follower.told[feature["id"]] += 1
+                    elif not follower.told[feature["id"]]:
+                        self.findings.add("updated", f"{follower.name}: {feature['id']} before it was told")
                 cursor = page["cursor"]
 
     @contextmanager

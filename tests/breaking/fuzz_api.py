@@ -284,6 +284,7 @@ def things(catalog: Catalog) -> dict[str, list[str]]:
         "job_id": [record.job_id for record in catalog.jobs.page().items] + ["none"],
         "object_id": [*objects, "none"],
         "number": ["1", "2", "3", "99"],
+        "content": ["5f0c91b64f2e7a08-0-64.glb", "none"],
         "name": ["spicd-net/1", "no-such/1"],
         "model": ["spicd-net/1", "no-such/1"],
         "process_id": ["map", "survey", "none"],

@@ -1,8 +1,10 @@
-"""Reads mutated PLY and PCD files: `python -m tests.breaking.fuzz_readers`.
+"""Reads mutated PLY and PCD files, with `--packed` E57, LAS and LAZ: `python -m tests.breaking.fuzz_readers`.
 
 A file may be refused (ScanError) or read; read, it has as many points as it declares, all finite. Files go to a forked
 process in batches, under a limit of memory; one that dies or hangs costs its batch's rest no more than a new process.
 Exit status 1 for a crash, another exception, over 2 s or over 1 GB for a file, or a wrong count. `--only` runs one case.
+The decoders of packed files are other people's, and run in a process of their own, which they may crash: that alone is
+an outcome and no finding.
 """
 
 from __future__ import annotations
@@ -15,10 +17,11 @@ import random
 import re
 import resource
 import signal
+import struct
 import sys
 import time
 import traceback
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,7 +29,9 @@ from typing import BinaryIO
 
 import numpy as np
 
+from tests.breaking.packed_mutations import PackedSample, packed_samples
 from tests.breaking.scan_mutations import Sample, mutated, samples
+from tests.support.clouds import without_checksums
 from tests.support.findings import Deadline, Findings, add_common, show
 from worker.cloud.formats.scan import Scan, read_scan
 from worker.errors import ScanError
@@ -45,19 +50,20 @@ class Hang(BaseException):
 class Fuzz:
     """The cases of a run: case `i` is the same whatever was run before it."""
 
-    samples: list[Sample]
+    samples: Sequence[Sample | PackedSample]
     seed: int
 
     def content(self, i: int) -> bytes:
         """Return the file of a case."""
         rng = random.Random((self.seed << 40) + i)
-        return mutated(rng.choice(self.samples), rng)
+        sample = rng.choice(self.samples)
+        return sample.mutated(rng) if isinstance(sample, PackedSample) else mutated(sample, rng)
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Run as told; returns the exit status."""
     options = _parse(arguments)
-    fuzz = Fuzz(samples(), options.seed)
+    fuzz = Fuzz(packed_samples() if options.packed else samples(), options.seed)
     if options.only is not None:
         return _run_one(fuzz, options.only)
     deadline, found = Deadline(options.minutes), Findings()
@@ -106,7 +112,10 @@ def _forked(fuzz: Fuzz, start: int, stop: int) -> tuple[Findings, int]:
         return pickle.loads(answer), stop  # noqa: S301 - from our own fork, by a pipe
     case = int.from_bytes(at[:], "little")
     lost = Findings(cases=case + 1 - start)  # what it counted before went with it
-    lost.add("hang" if stuck else "crash", f"case {case}: wait status {status}")
+    if not stuck and is_packed(fuzz.content(case)) and os.WIFSIGNALED(status):
+        lost.outcomes[f"decoder ended by signal {os.WTERMSIG(status)}"] += 1
+    else:
+        lost.add("hang" if stuck else "crash", f"case {case}: wait status {status}")
     return lost, case + 1
 
 
@@ -169,12 +178,16 @@ def _outcome(content: bytes) -> str:
     """Read a file; return what became of it. Raises Finding."""
     try:
         with memory_file(content) as path:
-            scan = read_scan(path, name="scan")
+            scan = read_scan(path, name="scan", apart=False)
     except ScanError as error:
         if "do not fit in memory" in str(error):
             raise Finding("memory", f"{len(content)} bytes asked for over {MEMORY}") from None
         return f"refused: {error.code}"
-    except Exception as error:
+    except BaseException as error:
+        if type(error).__name__ == "PanicException":  # of Rust
+            return "decoder panicked"
+        if not isinstance(error, Exception):
+            raise
         raise Finding("exception", f"{type(error).__name__}: {str(error)[:200]}") from error
     wrong = what_is_wrong(scan, content)
     if wrong:
@@ -185,6 +198,8 @@ def _outcome(content: bytes) -> str:
 def what_is_wrong(scan: Scan, content: bytes) -> str | None:
     """Hold a scan against what its file declares, by another way than the reader's."""
     declared = declared_points(content)
+    if declared is None and content.startswith(b"ASTM-E57"):
+        declared = len(scan.points) + scan.n_dropped + scan.n_far  # its XML does not say it plainly
     if len(scan.points) + scan.n_dropped + scan.n_far != declared:
         left_out = scan.n_dropped + scan.n_far
         return f"{len(scan.points)} points and {left_out} dropped of {declared} declared"
@@ -197,6 +212,12 @@ def what_is_wrong(scan: Scan, content: bytes) -> str | None:
 
 def declared_points(content: bytes) -> int | None:
     """Return the points that a header declares; None where that is not plain."""
+    if content.startswith(b"LASF"):
+        wide = content[25] == 4
+        return int(struct.unpack_from("<Q" if wide else "<I", content, 247 if wide else 107)[0])
+    if content.startswith(b"ASTM-E57"):
+        counts = re.findall(rb'recordCount="(\d+)"', without_checksums(content))
+        return int(counts[0]) if len(counts) == 1 else None
     if content.startswith(b"ply"):
         head = re.split(rb"(?m)^[ \t]*end_header", content)[0]
         counts = re.findall(rb"(?m)^\s*element\s+vertex\s+(\d+)", head)
@@ -209,6 +230,11 @@ def declared_points(content: bytes) -> int | None:
     if b"POINTS" in values:
         return values[b"POINTS"]
     return values[b"WIDTH"] * values.get(b"HEIGHT", 1) if b"WIDTH" in values else None
+
+
+def is_packed(content: bytes) -> bool:
+    """Tell whether a file is decoded by other people's code."""
+    return content.startswith((b"LASF", b"ASTM-E57"))
 
 
 @contextmanager
@@ -253,6 +279,7 @@ def _parse(arguments: list[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="python -m tests.breaking.fuzz_readers", description=__doc__)
     parser.add_argument("--files", type=int, default=1_000_000, help="mutated files")
     parser.add_argument("--only", type=int, metavar="CASE", help="run one case, and show it")
+    parser.add_argument("--packed", action="store_true", help="E57, LAS and LAZ instead of PLY and PCD")
     add_common(parser, minutes=15)
     return parser.parse_args(arguments)
 

@@ -11,18 +11,23 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from service.catalog import blob_keys
+from service.catalog.blobs import Blobs
 from service.catalog.jobs import Jobs, Run
-from service.catalog.records import JobRecord, Placement, Problem, ScanRecord
+from service.catalog.records import JobRecord, Placement, Problem, ScanRecord, Tileset
 from service.catalog.steps import STEPS, JobKind
 from service.errors import DatabaseUnavailable
 from service.settings import Settings
 from tests.support.house import MAP, MODEL, OTHER_CUT, SAME_CUT, SEEN_TO, House, Material, run
+from tests.support.tilesets import content_in, tiles_of
 from worker import jobs
 from worker.cloud.formats.pcd import write_pcd
 from worker.cloud.formats.scan import read_scan
 from worker.cloud.poses import difference
+from worker.cloud.tilesets.glb import LINEAR_BYTES
+from worker.cloud.types import Points
 from worker.detectors.store import open_card
 from worker.errors import DetectorUnavailable, MapFailed, NoSpaceLeft, ScanError
 from worker.jobs.surveys import scoring
@@ -78,6 +83,8 @@ def test_a_map_is_ready_with_its_counts_scans_and_files(house: House) -> None:
         )
     with house.catalog.blobs.local(blob_keys.map_cloud(house.catalog.maps.get(MAP).job_id)) as path:
         assert len(read_scan(path).points) == found.counts["points"]
+    with house.catalog.blobs.local(blob_keys.map_laz(house.catalog.maps.get(MAP).job_id)) as path:
+        assert len(read_scan(path).points) == found.counts["points"]
     listing = json.loads(
         house.catalog.blobs.get_bytes(blob_keys.map_manifest(house.catalog.maps.get(MAP).job_id))
     )
@@ -85,6 +92,46 @@ def test_a_map_is_ready_with_its_counts_scans_and_files(house: House) -> None:
     assert found.bounds is not None
     assert found.bounds.max == pytest.approx(listing["map_bounds"]["max"])
     assert house.catalog.blobs.exists(embedding_key(house, MODEL))
+
+
+def test_a_map_has_a_tileset_of_its_cloud(house: House) -> None:
+    found, blobs = house.catalog.maps.ready(MAP), house.catalog.blobs
+    document = json.loads(blobs.get_bytes(blob_keys.map_tileset(found.job_id)))
+    contents = blobs.get_bytes(blob_keys.map_tileset_contents(found.job_id))
+    with blobs.local(blob_keys.map_cloud(found.job_id)) as path:
+        points = read_scan(path).points
+    assert_tileset(found.tileset, document, contents, points)
+
+
+def assert_tileset(told: Tileset | None, document: Any, contents: bytes, points: Points) -> None:
+    """A tileset holds the points, and the record says how many."""
+    read = content_in(contents)
+    parts = [read(tile.uri) for tile in tiles_of(document) if tile.uri is not None]
+    decoded = np.concatenate([part.points for part in parts])
+    distance, rows = cKDTree(points).query(decoded)
+    assert len(np.unique(rows)) == len(rows) == len(points)
+    assert distance.max() < max(part.step for part in parts)
+    assert told is not None
+    assert (told.n_points, told.contents, told.bytes) == (len(points), len(parts), len(contents))
+    assert all(tile.uri is None or told.sha256[:16] in tile.uri for tile in tiles_of(document))
+
+
+def test_a_large_survey_has_a_tileset_of_its_coloured_cloud(
+    house: House, visited: JobRecord, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert house.survey(house.done[0]).tileset is None  # small enough to be read whole
+    monkeypatch.setattr("worker.jobs.surveys.READ_WHOLE", 100)
+    run(visited)
+    survey, blobs = house.survey(visited), house.catalog.blobs
+    document = json.loads(blobs.get_bytes(blob_keys.survey_tileset(survey.survey_id)))
+    contents = blobs.get_bytes(blob_keys.survey_tileset_contents(survey.survey_id))
+    with blobs.local(blob_keys.survey_cloud(survey.survey_id)) as path:
+        cloud = read_scan(path)
+    assert_tileset(survey.tileset, document, contents, cloud.points)
+    part = content_in(contents)(str(document["root"]["content"]["uri"]))
+    _, rows = cKDTree(cloud.points).query(part.points)
+    assert cloud.colors is not None
+    assert np.array_equal(part.attributes["COLOR_0"][:, :3], LINEAR_BYTES[cloud.colors[rows]])
 
 
 def test_a_survey_is_ready_with_a_state_for_every_tile_of_the_map(house: House) -> None:
@@ -110,8 +157,13 @@ def test_a_survey_leaves_a_cloud_a_picture_and_its_scan(house: House) -> None:
     assert blobs.get_bytes(blob_keys.survey_picture(survey.survey_id)).startswith(b"\x89PNG")
     with blobs.local(blob_keys.survey_cloud(survey.survey_id)) as path:
         cloud = read_scan(path)
-    assert cloud.points[:, 0].max() < SEEN_TO + 0.1
+    with blobs.local(blob_keys.survey_laz(survey.survey_id)) as path:
+        packed = read_scan(path)
+    assert np.abs(packed.points - cloud.points).max() < 6e-4
+    assert packed.colors is not None
     assert cloud.colors is not None
+    assert np.array_equal(packed.colors, cloud.colors)
+    assert cloud.points[:, 0].max() < SEEN_TO + 0.1
     assert blobs.exists(blob_keys.survey_scan(survey.survey_id, survey.scans[0].scan_id))
 
 
@@ -180,6 +232,30 @@ def test_each_step_of_a_map_may_run_twice(house: House) -> None:
         for folder in (blob_keys.map_folder(house.catalog.maps.get(name).job_id) for name in ("again", MAP))
     )
     assert made == first != {}  # the same scans give the same map, to the byte
+
+
+def test_a_build_that_is_killed_between_the_files_of_its_tileset_makes_the_same_again(house: House) -> None:
+    first, blobs = house.catalog.maps.get(MAP), house.catalog.blobs
+    scans = (house.catalog.scans.get(outcome.scan_id) for outcome in first.scans)
+    job = house.map_of(*scans, map_id="again")
+    put = Blobs.put_file
+
+    def killed(self: Blobs, key: str, path: Path, *, move: bool = False) -> None:
+        if key == blob_keys.map_tileset(job.job_id):
+            raise KeyboardInterrupt
+        put(self, key, path, move=move)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Blobs, "put_file", killed)
+        with pytest.raises(KeyboardInterrupt):
+            run(job, "register")
+    assert blobs.exists(blob_keys.map_tileset_contents(job.job_id))
+    assert not blobs.exists(blob_keys.map_tileset(job.job_id))
+    assert house.catalog.maps.get("again").tileset is None  # so nobody is led to it
+    run(job, "register")
+    assert house.catalog.maps.get("again").tileset == first.tileset
+    for key in (blob_keys.map_tileset, blob_keys.map_tileset_contents):
+        assert blobs.get_bytes(key(job.job_id)) == blobs.get_bytes(key(first.job_id))
 
 
 def test_a_finished_job_is_left_alone(house: House) -> None:

@@ -434,3 +434,13 @@ def test_the_command_goes_on_after_a_kill_and_ends_cleanly_when_told(tmp_path: P
         assert second.returncode == 0
     assert len(api.uploads()) == 1
     api.kill()
+
+
+def test_files_of_every_format_are_sent(service: Client, client: TestClient, folder: Path) -> None:
+    put(folder / "tower.E57", b"ASTM-E57" + bytes(100))
+    put(folder / "hall.copc.laz", b"LASF" + bytes(100) + b"\x87")
+    put(folder / "hall.las", b"LASF" + bytes(100) + b"\x07")
+    with Watcher(service, folder, WatchOptions(settle_s=0, every_s=0)) as watcher:
+        watcher.run_once()
+    formats = {scan["filename"]: scan["format"] for scan in client.get("/scans").json()["scans"]}
+    assert formats == {"tower.E57": "e57", "hall.copc.laz": "laz", "hall.las": "las"}

@@ -20,7 +20,7 @@ CLOUD = bytes(range(256)) * 4096  #: 1 MiB, a result to be downloaded
 FEATURES = [
     {
         "id": f"change-{number}",
-        "properties": {"tile_id": "tile_007_003_002", "center": [0, 0, 1], "score": 0.9},
+        "properties": {"tile_id": "tile_007_003_002", "center": [0, 0, 1], "score": 0.9, "updated": False},
     }
     for number in range(25)
 ]
@@ -91,8 +91,7 @@ class Flaky:
             case ["maps", _, "changes"]:
                 start = int(query.get("after", ["0"])[0])
                 page = FEATURES[start : start + 4]
-                following = f"/maps/lobby/changes?after={start + len(page)}"
-                return document(200, {"features": page, "links": [{"rel": "next", "href": following}]})
+                return document(200, {"features": page, "links": [], "cursor": str(start + len(page))})
             case ["maps"]:
                 return document(200, {"maps": [{"map_id": "lobby", "name": None}], "links": []})
             case ["jobs", job_id]:

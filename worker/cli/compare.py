@@ -16,12 +16,11 @@ from worker.pipeline import (
     BuiltMap,
     LocatedSurvey,
     PipelineSettings,
-    ScanFile,
     build_map,
     detect,
     locate_survey,
 )
-from worker.pipeline.registration.results import ScanResult
+from worker.pipeline.registration.results import ScanResult, files_of
 from worker.pipeline.results.changes import ChangeSet
 from worker.pipeline.results.export import tile_results, write_coloured_cloud
 from worker.pipeline.results.picture import draw_picture
@@ -48,9 +47,7 @@ def compare(
 ) -> TwoVisits:
     """Return the whole method on files. Raises PipelineError, and OSError for a file that is not there."""
     settings = PipelineSettings.model_validate({}).for_model(detector.card.preprocessing)
-    earlier, later = (
-        [ScanFile(name=str(path), path=path) for path in paths] for paths in (references, currents)
-    )
+    earlier, later = ([file for path in paths for file in files_of(path)] for paths in (references, currents))
     on_map, on_survey = _titled("map", progress), _titled("survey", progress)
     built = build_map(earlier, settings=settings, progress=on_map)
     located = locate_survey(

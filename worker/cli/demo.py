@@ -17,6 +17,12 @@ def demo(
     model: Annotated[
         str | None, typer.Option(help="Model, name/version; left out: the service's own choice.")
     ] = None,
+    look: Annotated[
+        bool,
+        typer.Option(
+            "--look", help="On a terminal, keep the service with its viewer on the result until Ctrl-C."
+        ),
+    ] = False,
     seed: Annotated[int, typer.Option(help="Of the noise and of the robot's way.")] = 1,
 ) -> None:
     """Simulate two visits to a small building, run the whole service on them, and show what it found."""
@@ -29,4 +35,5 @@ def demo(
         DemoSettings(seed=seed, model=model),
         out_console=terminal.output(),
         err_console=terminal.messages(),
+        look=look and terminal.is_attended(),
     )

@@ -21,8 +21,10 @@ MOST_ROWS = 20  #: objects, or changed tiles, in the table; the file has all
 
 
 def detect(
-    reference: Annotated[Path, typer.Argument(help="PLY or PCD of the earlier visit; it sets the frame.")],
-    current: Annotated[list[Path], typer.Argument(help="PLY or PCD files of the later visit.")],
+    reference: Annotated[
+        Path, typer.Argument(help="PLY, PCD, E57, LAS or LAZ of the earlier visit; it sets the frame.")
+    ],
+    current: Annotated[list[Path], typer.Argument(help="Files of the later visit.")],
     more: Annotated[
         list[Path] | None, typer.Option("--reference", help="One more file of the earlier visit; repeatable.")
     ] = None,

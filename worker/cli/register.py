@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 
 
 def register(
-    reference: Annotated[Path, typer.Argument(help="PLY or PCD that sets the frame.")],
-    current: Annotated[Path, typer.Argument(help="PLY or PCD to be placed in it.")],
+    reference: Annotated[Path, typer.Argument(help="PLY, PCD, E57, LAS or LAZ that sets the frame.")],
+    current: Annotated[Path, typer.Argument(help="File to be placed in it.")],
     start: Annotated[
         Path | None, typer.Option(help="4x4 text file, reference from current: where to begin.")
     ] = None,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -25,6 +26,11 @@ def output() -> Console:
 def messages() -> Console:
     """Return the console for everything else."""
     return Console(stderr=True)
+
+
+def is_attended() -> bool:
+    """Tell whether a person sits before it, who can press Ctrl-C: a terminal both ways, and no continuous integration."""
+    return sys.stdin.isatty() and sys.stdout.isatty() and not os.environ.get("CI")
 
 
 def show(

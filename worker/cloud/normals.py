@@ -14,6 +14,7 @@ from worker.threads import query_threads
 
 SPARSE = 8  #: neighbours below which a wider look is taken
 WIDER = 3.0  #: times the radius
+AT_ONCE = 1_000_000  #: points that are looked at together
 
 
 def estimate_normals(points: NDArray[Any], *, radius: float, max_neighbors: int) -> Normals:
@@ -21,8 +22,24 @@ def estimate_normals(points: NDArray[Any], *, radius: float, max_neighbors: int)
 
     Where fewer than `SPARSE` lie so near, the radius is three times as wide: five metres away a standing
     scanner leaves 15 cm between its points, and three of them make no plane but noise, which drags ICP metres
-    away. The sign is arbitrary.
+    away. The sign is arbitrary. A large cloud is looked at in slabs across x, with what lies around each: trees and
+    neighbours of all its points at once would take ten times its memory.
     """
+    if len(points) <= AT_ONCE:
+        return _of_slab(points, radius, max_neighbors)
+    normals = np.empty((len(points), 3), np.float32)
+    order = np.argsort(points[:, 0], kind="stable")
+    along = points[order, 0]
+    for start in range(0, len(points), AT_ONCE):
+        own = slice(start, min(start + AT_ONCE, len(points)))
+        reach = (along[own][0] - WIDER * radius, along[own][-1] + WIDER * radius)
+        first, last = np.searchsorted(along, reach[0]), np.searchsorted(along, reach[1], side="right")
+        found = _of_slab(points[order[first:last]], radius, max_neighbors)
+        normals[order[own]] = found[own.start - first : own.stop - first]
+    return normals
+
+
+def _of_slab(points: NDArray[Any], radius: float, max_neighbors: int) -> Normals:
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points.astype(np.float64)))
     normals = _estimated(cloud, radius, max_neighbors)
     if len(points) <= SPARSE:

@@ -33,6 +33,13 @@ def inverse(target_from_source: Matrix4) -> Matrix4:
     return result
 
 
+def translation(offset: Floats) -> Matrix4:
+    """Return the transform that moves points by `offset` (3,) metres."""
+    result = np.eye(4)
+    result[:3, 3] = offset
+    return result
+
+
 def exponential(twist: Floats) -> Matrix4:
     """Rotate by `twist[:3]` (axis times radians, Rodrigues' formula), then move by `twist[3:]` metres."""
     result = np.eye(4)

@@ -15,6 +15,8 @@ from worker.errors import MapFailed
 
 _MOST_TILES = 10_000_000  # of a grid's box; a wider one means stray points, not a building
 
+_AT_ONCE = 1_000_000  # points that are located together
+
 
 #: `dense`: tiles of the map with enough points to compare patches; `touched`: all that either visit has a point in
 TileChoice = Literal["dense", "touched"]
@@ -59,7 +61,11 @@ class TileGrid:
 
         A cell is the flat number of a tile within `shape`, so that cells sort as tiles do.
         """
-        return self.cells(np.floor((points - self.origin) / self.size).astype(np.int64))
+        cells = np.empty(len(points), np.int64)
+        for start in range(0, len(points), _AT_ONCE):
+            at = slice(start, start + _AT_ONCE)
+            cells[at] = self.cells(np.floor((points[at] - self.origin) / self.size).astype(np.int64))
+        return cells
 
     def cells(self, indices: NDArray[np.integer[Any]]) -> NDArray[np.int64]:
         """Return (T,) the cell of each tile (T, 3); -1 outside the grid."""

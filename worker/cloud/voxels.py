@@ -6,15 +6,16 @@ one frame are sampled by the same cells.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from worker.cloud.types import Colors, Points
-from worker.cloud.voxel_keys import BITS, packed
+from worker.cloud.voxel_keys import BITS, packed, rows_of
 from worker.errors import MapFailed
 
 _AT_ONCE = 2_000_000  # points that are sorted together; a scan may have 50 million
@@ -67,31 +68,59 @@ class Voxels:
         return packed(cells)
 
     def merged(self, other: Voxels) -> Voxels:
-        """Add both; colours are kept only where both have them."""
+        """Add both; colours are kept only where both have them. Takes no more memory than both and their sum."""
         width = min(self.sums.shape[1], other.sums.shape[1])
-        return _summed(
-            self.size,
-            np.concatenate([self.keys, other.keys]),
-            np.concatenate([self.counts, other.counts]),
-            np.concatenate([self.sums[:, :width], other.sums[:, :width]]),
-        )
+        sizes = [
+            len(one.keys) + len(more.keys) - _shared(one.keys, more.keys) for one, more in _runs(self, other)
+        ]
+        keys, counts = np.empty(sum(sizes), np.int64), np.empty(sum(sizes), np.int64)
+        sums = np.empty((sum(sizes), width))
+        end = 0
+        for (one, more), size in zip(_runs(self, other), sizes, strict=True):
+            here = slice(end, end := end + size)
+            run = _summed(
+                self.size,
+                np.concatenate([one.keys, more.keys]),
+                np.concatenate([one.counts, more.counts]),
+                np.concatenate([one.sums[:, :width], more.sums[:, :width]]),
+            )
+            keys[here], counts[here], sums[here] = run.keys, run.counts, run.sums
+        return Voxels(size=self.size, keys=keys, counts=counts, sums=sums)
 
     @property
     def points(self) -> Points:
         """(M, 3) float32, metres: the mean of each cell's points."""
-        return (self.sums[:, :3] / self.counts[:, None]).astype(np.float32)
+        return self._means(slice(0, 3), np.dtype(np.float32))
 
     @property
     def views(self) -> NDArray[np.float64]:
         """(M, 3) mean direction to the sensors that saw the cell; 0 where no origin was given."""
-        return self.sums[:, 3:6] / self.counts[:, None]
+        return self._means(slice(3, 6), np.dtype(np.float64))
 
     @property
     def colors(self) -> Colors | None:
         """(M, 3) uint8, or None where no colours were given."""
         if self.sums.shape[1] == 6:
             return None
-        return np.rint(self.sums[:, 6:] / self.counts[:, None]).astype(np.uint8)
+        return self._means(slice(6, 9), np.dtype(np.uint8))
+
+    def run(self, first: int, last: int) -> Voxels:
+        """Return the cells in these rows, without a copy."""
+        return Voxels(
+            size=self.size,
+            keys=self.keys[first:last],
+            counts=self.counts[first:last],
+            sums=self.sums[first:last],
+        )
+
+    def _means(self, columns: slice, kind: np.dtype[Any]) -> NDArray[Any]:
+        """Return (M, 3) the means of three columns, rounded where they become whole numbers; some at a time."""
+        means = np.empty((len(self.keys), 3), kind)
+        for start in range(0, len(self.keys), _AT_ONCE):
+            at = slice(start, start + _AT_ONCE)
+            exact = self.sums[at, columns] / self.counts[at, None]
+            means[at] = np.rint(exact) if kind.kind == "u" else exact
+        return means
 
 
 def _directions(points: NDArray[Any], origin: NDArray[Any] | None) -> NDArray[Any]:
@@ -116,6 +145,22 @@ def _summed(
         counts=np.add.reduceat(counts[order], starts),
         sums=np.add.reduceat(values[order], starts, axis=0),
     )
+
+
+def _runs(one: Voxels, other: Voxels) -> Iterator[tuple[Voxels, Voxels]]:
+    """Yield both, cut at the same keys into runs of about `_AT_ONCE` cells."""
+    longer = one.keys if len(one.keys) >= len(other.keys) else other.keys
+    cuts = longer[_AT_ONCE::_AT_ONCE]
+    of_one, of_other = (
+        pairwise([0, *np.searchsorted(part.keys, cuts).tolist(), len(part.keys)]) for part in (one, other)
+    )
+    for (first, last), (begin, end) in zip(of_one, of_other, strict=True):
+        yield one.run(first, last), other.run(begin, end)
+
+
+def _shared(keys: NDArray[np.int64], others: NDArray[np.int64]) -> int:
+    """Count the keys that are in both, each ascending and once."""
+    return int((rows_of(others, keys) >= 0).sum())
 
 
 def fused(parts: Iterable[Voxels]) -> Voxels | None:

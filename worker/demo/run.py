@@ -50,10 +50,13 @@ class DemoResult:
     files: dict[str, Path] = field(default_factory=dict)
 
 
-def run(out: Path, settings: DemoSettings, *, out_console: Console, err_console: Console) -> DemoResult:
+def run(
+    out: Path, settings: DemoSettings, *, out_console: Console, err_console: Console, look: bool = False
+) -> DemoResult:
     """Run the demo in the folder `out`. Raises DemoFailed where the service does not do its job.
 
-    A change that the detector does not find is a result, not a failure.
+    A change that the detector does not find is a result, not a failure. To `look` is to keep the service with its
+    viewer until Ctrl-C; otherwise it says how to start it again on the demo's data, and ends.
     """
     began = time.monotonic()
     # names that nothing else has: what is there is removed, and `out` may be any folder
@@ -62,27 +65,41 @@ def run(out: Path, settings: DemoSettings, *, out_console: Console, err_console:
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
     try:
-        with (
-            _progress(err_console) as progress,
-            ServiceChild(fresh[0], out / "service.log", model=settings.model) as child,
-        ):
-            result, story = _through_the_service(child, out, settings, progress)
+        with ServiceChild(fresh[0], out / "service.log", model=settings.model) as child:
+            with _progress(err_console) as progress:
+                result, story = _through_the_service(child, out, settings, progress)
+            _show(result, story, out_console)
+            out_console.print(f"all in {time.monotonic() - began:.0f} s", highlight=False)
+            view = f"/#map={MAP_ID}&survey={result.survey['survey_id']}"
+            if look:
+                _say(out_console, "look", f"{child.await_ready()['url']}{view} (Ctrl-C ends it)")
+                child.await_end()
     except ClientError as error:
         raise DemoFailed(str(error)) from error
+    if not look:
+        _say(out_console, "look", f"spicd up --data-dir {fresh[0]}, then http://127.0.0.1:8000{view}")
+    return result
+
+
+def _show(result: DemoResult, story: Story, console: Console) -> None:
+    """Print what was found beside what is true, how well scans were placed, and the files."""
     if result.things is None:
-        show_judgement(out_console, result.judgement)
+        show_judgement(console, result.judgement)
     else:
-        show_things(out_console, result.things, moving=result.survey["moving"] or 0)
-        out_console.print(counts_line(result.judgement), highlight=False)
+        show_things(console, result.things, moving=result.survey["moving"] or 0)
+        console.print(counts_line(result.judgement), highlight=False)
     for visit, outcomes, scans in (
         ("map", result.map["scans"], story.first),
         ("survey", result.survey["scans"], story.second),
     ):
-        out_console.print(placement_line(visit, outcomes, scans), highlight=False)
+        console.print(placement_line(visit, outcomes, scans), highlight=False)
     for what, path in result.files.items():
-        out_console.print(Text.assemble((f"{what:<10}", "bold"), str(path)))
-    out_console.print(f"all in {time.monotonic() - began:.0f} s", highlight=False)
-    return result
+        _say(console, what, str(path))
+
+
+def _say(console: Console, what: str, text: str) -> None:
+    """Print a line that is headed by a word; a terminal wraps it by itself, so that it is copied whole."""
+    console.print(Text.assemble((f"{what:<10}", "bold"), text), soft_wrap=True)
 
 
 class _Step:

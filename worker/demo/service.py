@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import subprocess
@@ -73,6 +74,12 @@ class ServiceChild:
             time.sleep(0.05)
         ready: dict[str, Any] = json.loads(self._ready.read_text())
         return ready
+
+    def await_end(self) -> None:
+        """Return on Ctrl-C. Raises DemoFailed where the service ends by itself."""
+        with contextlib.suppress(KeyboardInterrupt):
+            self._started.wait()
+            raise DemoFailed(f"the service ended: {self._last_words()}")
 
     def __exit__(self, *_: object) -> None:
         self._started.terminate()

@@ -34,7 +34,8 @@ MAP_STAGES = {
     "fusing": (0.75, 0.85),
     "tiling": (0.85, 0.88),
     "saving": (0.88, 0.9),
-    "encoding": (0.9, 0.95),
+    "exporting": (0.9, 0.92),
+    "encoding": (0.92, 0.95),
     "calibrating": (0.95, 1.0),
 }
 SURVEY_STAGES = {

@@ -16,9 +16,11 @@ from service.catalog.records import (
     Placement,
     SurveyRecord,
     TileRecord,
+    Tileset,
     VersionRecord,
 )
 from worker.cloud import npz
+from worker.cloud.tilesets.writer import pieces_of
 from worker.detectors.card import Card
 from worker.detectors.comparison import Comparison
 from worker.detectors.detector import Detection
@@ -34,14 +36,16 @@ from worker.jobs.scans import (
     seen_by,
     unread,
 )
+from worker.jobs.stations import take_stations_apart
 from worker.jobs.step import Context, load, put, step
+from worker.jobs.tilesets import put_tileset
 from worker.jobs.versions import kept_alarms, kept_reference, kept_seen
 from worker.pipeline.alarms import AlarmCalibration
 from worker.pipeline.flow import NoScanAccepted, compare, concluded, locate_survey
 from worker.pipeline.mapping.fusion import CurrentMap, ReferenceMap
 from worker.pipeline.registration.results import ScanResult
 from worker.pipeline.results.changes import ChangeSet
-from worker.pipeline.results.export import TileResult, tile_results, write_coloured_cloud
+from worker.pipeline.results.export import ColouredCloud, TileResult, tile_results
 from worker.pipeline.results.objects import ChangeObject
 from worker.pipeline.results.picture import draw_picture
 from worker.pipeline.results.refusal import draw_refusal
@@ -49,10 +53,14 @@ from worker.pipeline.results.sheet import LeftOut
 from worker.pipeline.settings import PipelineSettings
 from worker.progress import Progress
 
+READ_WHOLE = 1_000_000  #: points of a survey's cloud that viewers read as one PLY; a larger one has a tileset
+
 
 @step
 def register_survey(context: Context) -> None:
     """Fuse the scans to one cloud in the map's frame; a survey with no accepted scan fails here."""
+    given, surveys = _asked(context)[0], context.catalog.surveys
+    take_stations_apart(context, given.survey_id, given.scans, surveys.take_apart, stage="registering")
     survey, version, settings = _asked(context)
     reference = kept_reference(context, version)
     seen = None
@@ -121,7 +129,7 @@ def export_survey(context: Context) -> None:
         by_objects=asked is None,
     )
     context.report("exporting", 0.3)
-    _put_cloud_and_picture(context, survey, comparison, changes)
+    tileset = _put_cloud_and_picture(context, survey, comparison, changes)
     context.report("exporting", 0.9)
     context.catalog.surveys.save_result(
         survey_id,
@@ -129,6 +137,7 @@ def export_survey(context: Context) -> None:
         threshold=threshold,
         objects=None if changes.objects is None else map(_object_record, changes.objects.objects),
         moving=None if changes.objects is None else changes.objects.moving,
+        tileset=tileset,
     )
     context.catalog.jobs.succeed(context.job.job_id, run=context.run)
 
@@ -179,19 +188,33 @@ def _least_score(context: Context, version: VersionRecord, card: Card, model: st
 
 def _put_cloud_and_picture(
     context: Context, survey: SurveyRecord, comparison: Comparison, changes: ChangeSet
-) -> None:
+) -> Tileset | None:
+    """Keep the cloud and the picture; return how large the cloud's tileset is, where it has one."""
     reference, current = comparison.reference.points, comparison.current.points
     left_out = _left_out(context, survey)
-    put(
-        context,
-        blob_keys.survey_cloud(survey.survey_id),
-        lambda path: write_coloured_cloud(path, reference, current, changes),
-    )
+    cloud = ColouredCloud.of(reference, current, changes)
+    put(context, blob_keys.survey_cloud(survey.survey_id), cloud.write_ply)
+    tileset = _put_tileset(context, survey.survey_id, cloud)
+    put(context, blob_keys.survey_laz(survey.survey_id), cloud.write_laz)
     context.report("exporting", 0.6)
     put(
         context,
         blob_keys.survey_picture(survey.survey_id),
         lambda path: draw_picture(path, reference, current, changes, title=_title(survey), left_out=left_out),
+    )
+    return tileset
+
+
+def _put_tileset(context: Context, survey_id: str, cloud: ColouredCloud) -> Tileset | None:
+    """Write the tileset of a cloud that is too large to be read whole; a smaller one has none."""
+    if len(cloud.points) <= READ_WHOLE:
+        return None
+    return put_tileset(
+        context,
+        lambda: pieces_of(cloud.points, colors=cloud.colors),
+        document=blob_keys.survey_tileset(survey_id),
+        contents=blob_keys.survey_tileset_contents(survey_id),
+        progress=lambda share: context.report("exporting", 0.4 + 0.2 * share),
     )
 
 

@@ -271,9 +271,10 @@ def tiled_map(
 ) -> tuple[ReferenceMap, Tiles]:
     """Return the map with its normals, cut along a grid of its own or along one that there was."""
     progress("tiling", 0.0)
+    points = fused.points
     if grid is None:
-        grid = grid_over(fused.points, tile_size=settings.tiling.tile_size, voxel_size=fused.size)
-    grid = grown(grid, fused.points)
+        grid = grid_over(points, tile_size=settings.tiling.tile_size, voxel_size=fused.size)
+    grid = grown(grid, points)
     reference = reference_map(fused, grid=grid, settings=settings.registration)
     tiles = reference.tiles(min_points=settings.tiling.min_points)
     if not tiles.points:

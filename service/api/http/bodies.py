@@ -54,6 +54,7 @@ INCOMING = (
 JSON = "application/json"
 FORM = "multipart/form-data"
 RAW = "application/octet-stream"
+LAZ = "application/vnd.laszip"
 _BINARY = {"type": "string", "format": "binary"}
 _REFERENCE = "#/components/schemas/{model}"
 

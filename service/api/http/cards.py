@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from service.catalog.models import Models
-from service.errors import BadRequest, NotFound, NotReady
+from service.errors import BadRequest, Failed, NotFound, NotReady
 
 log = logging.getLogger(__name__)
 
@@ -50,8 +50,9 @@ class Cards:
             raise NotFound(f"no model {wanted!r}; GET /models lists those there are")
         if model.status == "ready" and model.card is not None:
             return model.card
-        state = "is still in training" if model.status == "training" else "was not made"
-        raise NotReady(f"model {model.model!r} {state}; look at job {model.job_id}")
+        if model.status == "training":
+            raise NotReady(f"model {model.model!r} is still in training; follow job {model.job_id}")
+        raise Failed(f"model {model.model!r} was not made; job {model.job_id} says why")
 
     def check(self, model: str, maps: Collection[str] | None = None) -> str:
         """Return `model` (`name/version`) if it can be used. Raises NotReady, and BadRequest naming those there are."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from typing import Any
 
@@ -10,6 +11,19 @@ from fastapi.routing import APIRoute
 Schema = dict[str, Any]  #: JSON Schema (draft 2020-12), as OpenAPI 3.1 has it
 
 _SCHEMAS = "#/components/schemas/"
+
+#: Of ids, by the names that parameters and fields have.
+_EXAMPLES = {
+    "scan_id": "scan-2b1f",
+    "survey_id": "survey-91c4",
+    "survey": "survey-91c4",
+    "change": "change-5c02",
+    "change_id": "change-5c02",
+    "object_id": "object-77aa",
+    "job_id": "job-5f0c",
+    "webhook_id": "webhook-2d7e",
+    "delivery_id": "delivery-88a0",
+}
 
 
 def operation_id(route: APIRoute) -> str:
@@ -22,11 +36,20 @@ def mended(document: dict[str, Any]) -> dict[str, Any]:
     for operation in operations(document):
         for parameter in operation.get("parameters", ()):
             parameter["schema"] = not_null(parameter["schema"])
+            _say_bounds(parameter)
+            _give_example(parameter["name"], parameter["schema"])
         for answer in operation["responses"].values():
             _mend_answer(answer)
-    for schema in _only_sent(document):
+    sent = _only_sent(document)
+    for schema in sent:
         _leave_out_defaults(schema)
     _name_forms(document)
+    for schema in document["components"]["schemas"].values():
+        if not any(schema is one for one in sent):
+            _leave_out_nulls(schema)
+        for name, field in schema.get("properties", {}).items():
+            for option in (field, *field.get("anyOf", ())):
+                _give_example(name, option)
     _join_equal_items(document)
     return document
 
@@ -68,6 +91,40 @@ def _mend_answer(answer: dict[str, Any]) -> None:
     for content in answer.get("content", {}).values():
         if "$ref" in content.get("schema", {}):
             content["schema"].pop("type", None)
+
+
+def _give_example(name: str, schema: Schema) -> None:
+    """Give an id that is none of a map an example of its own sort."""
+    example = _EXAMPLES.get(name)
+    if example is not None and "examples" in schema:
+        schema["examples"] = [example]
+
+
+def _say_bounds(parameter: dict[str, Any]) -> None:
+    """Say in words between which numbers a parameter lies and what it is where it is left out.
+
+    Generators of TypeScript show the description of a parameter, and nothing of the numbers in its schema.
+    """
+    schema = parameter["schema"]
+    least, most, default = (schema.get(name) for name in ("minimum", "maximum", "default"))
+    said = [parameter["description"]] if "description" in parameter else []
+    if least is not None and most is not None:
+        said.append(f"{least:g} to {most:g}")
+    elif least is not None:
+        said.append(f"at least {least:g}")
+    if isinstance(default, bool | int | float | str) and "left out" not in " ".join(said):
+        said.append(f"left out: {json.dumps(default) if isinstance(default, bool) else default}")
+    if said:
+        parameter["description"] = "; ".join(said)
+
+
+def _leave_out_nulls(schema: Schema) -> None:
+    """Describe what an answer leaves out where it has none as that, and not as null; no null is a default."""
+    for name, field in schema.get("properties", {}).items():
+        if "default" in field and field["default"] is None:
+            del field["default"]
+            if name not in schema.get("required", ()):
+                schema["properties"][name] = not_null(field)
 
 
 def _only_sent(document: dict[str, Any]) -> list[Schema]:

@@ -7,6 +7,7 @@ from typing import Any, TypeVar
 from fastapi import Request as HttpRequest
 from fastapi.exceptions import RequestValidationError
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic_core import ErrorDetails
 
 R = TypeVar("R", bound=BaseModel)
 
@@ -42,7 +43,16 @@ def checked(kind: type[R], fields: dict[str, Any], *, place: str = "body") -> R:
         return kind.model_validate(fields)
     except ValidationError as error:
         errors = [
-            {**entry, "loc": (place, *entry["loc"])}
+            {**entry, "loc": (place, *entry["loc"]), "msg": _sentence(kind, entry)}
             for entry in error.errors(include_url=False, include_context=False)
         ]
         raise RequestValidationError(errors) from error
+
+
+def _sentence(kind: type[BaseModel], error: ErrorDetails) -> str:
+    """Say what is wrong; where the name of a field is not known, those that are."""
+    if error["type"] != "extra_forbidden":
+        return error["msg"]
+    if len(error["loc"]) > 1:
+        return "there is no such field"
+    return f"there is no such field; there are {', '.join(sorted(kind.model_fields))}"

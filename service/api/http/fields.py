@@ -111,7 +111,9 @@ _POSE_SCHEMA = {
     "example": [[1, 0, 0, 2.5], [0, 1, 0, 0], [0, 0, 1, 0.35], [0, 0, 0, 1]],
 }
 
-Id = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{1,64}$", examples=["lobby"])]
+ID = r"^[A-Za-z0-9_-]{1,64}$"
+Id = Annotated[str, Field(pattern=ID, examples=["lobby"])]
+ScanId = Annotated[str, Field(pattern=ID, examples=["scan-2b1f"])]
 Instant = Annotated[
     datetime,
     BeforeValidator(instant),

@@ -19,10 +19,14 @@ from service.api.http.digests import field_of, wanted
 from service.api.http.methods import is_head
 from service.api.http.representations import etag_of, is_known, not_modified
 from service.catalog.blobs import Blobs
+from service.catalog.tilesets import ContentName, read_content
 from service.errors import NotFound
 
 #: Of what never changes under its address: a browser does not ask again, and no cache that people share keeps it.
 IMMUTABLE = "private, max-age=31536000, immutable"
+
+#: Of what may be another, or gone, the next time: kept, and used again only where the service says so (304).
+REVALIDATED = "private, no-cache"
 
 _DIGESTED_BYTES = 1 << 24  #: of a file whose digest is told unasked
 
@@ -30,16 +34,26 @@ _DIGESTED_BYTES = 1 << 24  #: of a file whose digest is told unasked
 _RANGE = re.compile(
     r"bytes=\s*(\d{1,18}-\d{0,18}|-\d{1,18})(\s*,\s*(\d{1,18}-\d{0,18}|-\d{1,18}))*\s*", re.IGNORECASE
 )
+_ONE_RANGE = re.compile(r"bytes=\s*(?=[0-9]|-[0-9])([0-9]{0,18})-([0-9]{0,18})\s*", re.IGNORECASE)
 
 
 async def blob_response(
-    blobs: Blobs, key: str, *, media_type: str, filename: str | None = None, immutable: bool = False
+    blobs: Blobs,
+    key: str,
+    *,
+    media_type: str,
+    filename: str | None = None,
+    immutable: bool = False,
+    asked_again: bool = False,
 ) -> Response:
     """Answer with the blob under `key`, as a download when it has a `filename`.
 
-    `immutable` is said of what will never be another under its address. Raises NotFound, BlobsUnavailable.
+    `immutable` is said of what will never be another under its address, `asked_again` of what a cache has to ask for
+    each time, because it names others that may be gone. Raises NotFound, BlobsUnavailable.
     """
     headers = {"Cache-Control": IMMUTABLE} if immutable else {}
+    if asked_again:
+        headers["Cache-Control"] = REVALIDATED
     try:
         path = await run_in_threadpool(blobs.path, key) if blobs.is_local else None
         if path is not None:
@@ -56,6 +70,16 @@ async def blob_response(
     if filename is not None:
         headers["Content-Disposition"] = f'attachment; filename="{filename}"'
     return _Stream(_continued(first, pieces), media_type=media_type, headers=headers)
+
+
+async def content_response(blobs: Blobs, key: str, name: ContentName, *, media_type: str) -> Response:
+    """Answer with one content of a tileset, which is small and never changes. Raises NotFound, BlobsUnavailable."""
+    try:
+        content = await run_in_threadpool(read_content, blobs, key, name)
+    except FileNotFoundError as error:
+        raise NotFound(str(error)) from error
+    etag = etag_of(f"{key} {name.offset} {name.length}".encode())
+    return _Held(content, media_type=media_type, headers={"Cache-Control": IMMUTABLE, "ETag": etag})
 
 
 def documented(media_type: str, what: str) -> dict[int | str, dict[str, Any]]:
@@ -103,6 +127,39 @@ class _Stream(StreamingResponse):
             await _not_modified(self)(scope, receive, send)
         else:
             await super().__call__(scope, receive, send)
+
+
+class _Held(Response):
+    """Bytes that are in memory, or one range of them; an answer to several is the whole (RFC 9110, Section 14.2)."""
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer (ASGI) with the bytes, a part of them, 304 or 416."""
+        asked = Headers(scope=scope)
+        self.headers["Accept-Ranges"] = "bytes"
+        if is_known(asked, self.headers):
+            await _not_modified(self)(scope, receive, send)
+            return
+        match = _ONE_RANGE.fullmatch(asked.get("range", ""))
+        if match is None or asked.get("if-range", self.headers["etag"]) != self.headers["etag"]:
+            await super().__call__(scope, receive, send)
+            return
+        await self._part(match[1], match[2])(scope, receive, send)
+
+    def _part(self, first: str, last: str) -> Response:
+        """Return the answer with the bytes from `first` to `last`; without `first` it is how many of the last ones."""
+        size = len(self.body)
+        begin = int(first) if first else max(size - int(last), 0)
+        end = min(int(last) + 1, size) if first and last else size
+        if begin >= size or (first and last and int(last) < int(first)):
+            detail = f"the content has {size} bytes, and none in {first}-{last}"
+            return problems.response(
+                "range_not_satisfiable", detail, headers={"Content-Range": f"bytes */{size}"}
+            )
+        part = Response(self.body[begin:end], status_code=206, media_type=self.media_type)
+        for name in ("Cache-Control", "ETag", "Accept-Ranges"):
+            part.headers[name] = self.headers[name]
+        part.headers["Content-Range"] = f"bytes {begin}-{end - 1}/{size}"
+        return part
 
 
 def _not_modified(answer: Response) -> Response:

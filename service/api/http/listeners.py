@@ -68,6 +68,10 @@ class Listeners:
         if self._task is not None:
             self._task.cancel()
 
+    async def check_map(self, map_id: str) -> None:
+        """Raise NotFound for a map of which there is nothing to tell."""
+        await to_thread.run_sync(self._events.check_map, map_id, limiter=self._readers)
+
     async def last(self) -> int:
         """Return the number of the latest event."""
         return await to_thread.run_sync(self._events.last, limiter=self._readers)

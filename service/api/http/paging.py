@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import hashlib
 import json
 import math
 from collections.abc import Callable, Sequence
@@ -20,7 +21,13 @@ from service.catalog.records import Page, Position, rfc3339
 from service.errors import BadRequest
 
 Limit = Annotated[int, Field(ge=1, le=1000, description="most items in one answer")]
-Cursor = Annotated[str | None, Field(max_length=1000, description="from a `next` link; opaque")]
+Cursor = Annotated[
+    str | None,
+    Field(
+        max_length=1000,
+        description="from a `next` link; opaque, and refused with other filters than that has",
+    ),
+]
 
 
 class PageRequest(Request):
@@ -33,16 +40,23 @@ class PageRequest(Request):
         """Return where to go on. Raises BadRequest."""
         if self.cursor is None:
             return None
-        created, key = decoded(self.cursor, instant, str)
+        created, key, of = decoded(self.cursor, instant, str, str)
+        _check(of, self.filters())
         return created, key
 
+    def filters(self) -> str:
+        """Return which list it is a part of, in short."""
+        return digest(self.model_dump(exclude={"limit", "cursor"}))
 
-def list_links(request: HttpRequest, page: Page[Any], position: Callable[[Any], Position]) -> list[Link]:
+
+def list_links(
+    request: HttpRequest, asked: PageRequest, page: Page[Any], position: Callable[[Any], Position]
+) -> list[Link]:
     """Return the links `self`, and `next` while there is more."""
     links = [Link(href=here(request), rel="self")]
     if page.more:
         created, key = position(page.items[-1])
-        links.append(next_link(request, encoded(rfc3339(created), key)))
+        links.append(next_link(request, encoded(rfc3339(created), key, asked.filters())))
     return links
 
 
@@ -66,23 +80,47 @@ def decoded(cursor: str, *readers: Callable[[str], Any]) -> Sequence[Any]:
         raise BadRequest(f"cursor {cursor[:40]!r} is none of ours; follow a `next` link") from error
 
 
-def encoded_values(sort: str, values: Values | None) -> str | None:
-    """Return the cursor behind the row with these values of a list in the order `sort`; None where there is no more."""
+def digest(filters: object) -> str:
+    """Return a few letters that differ where the filters of two lists do, whose `repr` says all of them."""
+    return hashlib.sha256(repr(filters).encode()).hexdigest()[:12]
+
+
+def _check(of: str, filters: str) -> None:
+    """Raise BadRequest for a cursor of a list with other filters."""
+    if of != filters:
+        raise BadRequest(
+            "the cursor is of a list with other filters; give it with the same parameters as before, or follow a `next` "
+            "link, which has them"
+        )
+
+
+def encoded_values(sort: str, values: Values | None, filters: object) -> str | None:
+    """Return the cursor behind the row with these values of a list in the order `sort`; None where there is no more.
+
+    `filters` are those of the list, as a value whose `repr` says all of them.
+    """
     if values is None:
         return None
-    return encoded(sort, *(_written(value) for value in values))
+    return encoded(sort, digest(filters), *(_written(value) for value in values))
 
 
 def decoded_values(
-    cursor: str | None, sort: str, types: Sequence[type[datetime] | type[float] | type[int] | type[str]]
+    cursor: str | None,
+    sort: str,
+    types: Sequence[type[datetime] | type[float] | type[int] | type[str]],
+    filters: object,
 ) -> Values | None:
-    """Return the values behind which a list in the order `sort` goes on. Raises BadRequest, also for another order's."""
+    """Return the values behind which a list in the order `sort` goes on.
+
+    Raises BadRequest, also for the cursor of another order, or of other filters.
+    """
     if cursor is None:
         return None
     readers: list[Callable[[str], Any]] = [_READERS[kind] for kind in types]
-    of, *values = decoded(cursor, str, *readers)
+    of, taken, *values = decoded(cursor, str, str, *readers)
     if of != sort:
         raise BadRequest(f"the cursor is of a list in another order than sortby={sort}; follow a `next` link")
+    _check(taken, digest(filters))
     return tuple(values)
 
 

@@ -16,7 +16,7 @@ from starlette.requests import ClientDisconnect
 
 from service.api.http.codings import ACCEPTED
 from service.api.http.methods import allowed, is_head
-from service.catalog.records import Problem
+from service.catalog.records import Problem, problem_urn
 from service.errors import ServiceError, Unavailable, is_disk_full
 
 log = logging.getLogger(__name__)
@@ -31,6 +31,7 @@ PROBLEMS: dict[str, tuple[int | None, str]] = {
     "no_such_job": (404, "There is no such job"),
     "result_not_ready": (404, "The job has not ended"),
     "not_ready": (409, "It is not ready yet"),
+    "failed": (409, "It failed, and does not become ready by waiting"),
     "conflict": (409, "It is in the way of something else"),
     "bad_request": (422, "A value cannot be used"),
     "invalid_request": (422, "The request does not match the API"),
@@ -99,19 +100,39 @@ class InvalidValue(BaseModel):
     detail: str = Field(examples=["Input should be greater than or equal to 1"])
 
 
+def _is_none(value: object) -> bool:
+    return value is None
+
+
 class ProblemDocument(BaseModel):
-    """RFC 9457, Section 3. `type` is stable; `errors` lists the values that do not match."""
+    """A problem (RFC 9457, Section 3), of a request or of a job; what it does not have is left out.
+
+    `type` is stable, docs/problems.md has all of them; `detail` is for people and may change.
+    """
 
     type: str = Field(examples=["urn:spicd:problem:not_found"])
     title: str = Field(examples=["There is no such thing"])
-    status: int | None = Field(default=None, examples=[404])
+    status: int | None = Field(
+        default=None,
+        exclude_if=_is_none,
+        description="of the answer; the problem of a job may have none",
+        examples=[404],
+    )
     detail: str = Field(examples=["no map 'lobby'; GET /maps lists those there are"])
-    instance: str | None = None
-    errors: list[InvalidValue] | None = None
+    instance: str | None = Field(
+        default=None,
+        exclude_if=_is_none,
+        description="with `internal` alone: what to look for in the service's log",
+    )
+    errors: list[InvalidValue] | None = Field(
+        default=None,
+        exclude_if=_is_none,
+        description="with `invalid_request` alone: the values that do not match",
+    )
 
 
 def _type(code: str) -> str:
-    return _TYPES.get(code, f"urn:spicd:problem:{code}")
+    return _TYPES.get(code, problem_urn(code))
 
 
 def problem_of(problem: Problem | None) -> ProblemDocument | None:
@@ -164,6 +185,12 @@ def job_failed(problem: Problem) -> JSONResponse:
 _RETRY_AFTER = {"description": "seconds, where it helps to wait", "schema": {"type": "integer"}}
 
 
+def located(example: str, what: str) -> dict[str, Any]:
+    """Return the `headers` of a described answer that says where a thing is which was made."""
+    schema = {"type": "string", "examples": [example]}
+    return {"Location": {"description": f"path of the {what}", "required": True, "schema": schema}}
+
+
 def documented(*codes: str) -> dict[int | str, dict[str, Any]]:
     """Return the `responses` of a route that may end in these codes, for the generated API description."""
     answers: dict[int | str, dict[str, Any]] = {}
@@ -188,7 +215,7 @@ OUTAGES = documented("database_unavailable", "blobs_unavailable", "unavailable")
 #: The answers of a route that names one thing, of one that lists, and of one that gives what a job makes.
 NAMED = documented("not_found", "invalid_request")
 LISTED = documented("invalid_request", "bad_request")
-MADE = documented("not_found", "not_ready", "invalid_request")
+MADE = documented("not_found", "not_ready", "failed", "invalid_request")
 
 
 def add_handlers(app: FastAPI) -> None:

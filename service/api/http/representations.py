@@ -28,8 +28,19 @@ T = TypeVar("T")
 SMALLEST = 1000  #: bytes of a document that are worth gzip
 _AT_ONCE = 1 << 16  #: bytes that are hashed or packed without a thread
 _WRITTEN = re.compile(rb'"timeStamp":\s?"[^"]{0,40}"')  #: of a collection, OGC API - Features
+#: RFC 9110, Section 15.4.5; and the policy of a page, for what a 304 says takes its place in a browser's cache.
 _IN_304 = frozenset(
-    {"etag", "cache-control", "vary", "last-modified", "expires", "content-location", "date", "link"}
+    {
+        "etag",
+        "cache-control",
+        "content-security-policy",
+        "vary",
+        "last-modified",
+        "expires",
+        "content-location",
+        "date",
+        "link",
+    }
 )
 
 

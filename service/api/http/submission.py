@@ -8,7 +8,7 @@ import logging
 import threading
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
-from typing import Annotated, ParamSpec, Self
+from typing import Annotated, Any, ParamSpec, Self
 
 from fastapi import Request as HttpRequest
 from pydantic import BaseModel, BeforeValidator, Field
@@ -17,7 +17,7 @@ from service import tracing
 from service.api.http.bodies import Body
 from service.api.http.dependencies import Services
 from service.api.http.documents import Link, Request, link
-from service.api.http.fields import MAX_LISTED, DeviceId, Id, Instant, Pose, names_from_text
+from service.api.http.fields import MAX_LISTED, DeviceId, Instant, Pose, ScanId, names_from_text
 from service.api.http.idempotency import answered
 from service.api.http.lanes import Lane
 from service.catalog.catalog import Catalog
@@ -37,7 +37,7 @@ LOOK_AGAIN_S = 2  #: seconds after which it makes sense to ask how far a job is
 class ScanUse(Request):
     """A scan that was uploaded before, with what counts in this map or survey alone."""
 
-    scan_id: Id
+    scan_id: ScanId
     pose: Annotated[
         Pose | None,
         Field(description="4x4 row-major, map_from_sensor, in place of the upload's; left out: the upload's"),
@@ -47,7 +47,9 @@ class ScanUse(Request):
 class ScansRequest(Request):
     """Scans that were uploaded before; others may come with the request."""
 
-    scan_ids: Annotated[tuple[Id, ...], Field(max_length=MAX_LISTED), BeforeValidator(names_from_text)] = ()
+    scan_ids: Annotated[
+        tuple[ScanId, ...], Field(max_length=MAX_LISTED), BeforeValidator(names_from_text)
+    ] = ()
     scans: Annotated[
         tuple[ScanUse, ...],
         Field(max_length=MAX_LISTED, description="further scans, each with a pose that counts here alone"),
@@ -88,6 +90,26 @@ def kept_scans(catalog: Catalog, body: Body, wanted: ScansRequest) -> Iterator[t
 def monitor(request: HttpRequest, job: JobRecord) -> Link:
     """Return the link to a job that was submitted."""
     return link(request, f"/jobs/{job.job_id}", "monitor")
+
+
+#: For `responses` of a route that submits a job.
+SUBMITTED: dict[int | str, dict[str, Any]] = {
+    202: {
+        "description": "A job does it; `GET /jobs/{job_id}` with `wait` tells when it has ended",
+        "headers": {
+            "Location": {
+                "description": "path of the job",
+                "required": True,
+                "schema": {"type": "string", "examples": ["/jobs/job-5f0c"]},
+            },
+            "Retry-After": {
+                "description": "seconds after which it makes sense to ask for the job",
+                "required": True,
+                "schema": {"type": "integer", "examples": [LOOK_AGAIN_S]},
+            },
+        },
+    }
+}
 
 
 def job_headers(request: HttpRequest, job: JobRecord) -> dict[str, str]:

@@ -1,6 +1,6 @@
 """Files on their way in: written to disk in pieces, hashed on the way, and never parsed.
 
-Only the first bytes are looked at: they tell PLY from PCD.
+Only the first bytes are looked at: they tell PLY, PCD, E57, LAS and LAZ apart.
 """
 
 from __future__ import annotations
@@ -22,6 +22,9 @@ _written_here: set[Path] = set()  #: files of requests that this process is at, 
 HEAD_BYTES = 256  #: bytes that are enough to tell the format
 _PLY = re.compile(rb"ply[ \t]*\r?\n")
 _PCD = re.compile(rb"\s*(#[^\n]*\.PCD|(VERSION|FIELDS|COLUMNS)\s)")
+_E57, _LAS = b"ASTM-E57", b"LASF"
+_LAS_FORMAT_AT = 104  #: byte of the header of a LAS; its highest two bits say that the points are packed
+FORMATS = "PLY, PCD, E57, LAS or LAZ"
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -57,7 +60,7 @@ class Incoming:
         self._size += len(data)
 
     def finish(self) -> Upload:
-        """Return the whole file. Raises ScanUnreadable when it is neither PLY nor PCD."""
+        """Return the whole file. Raises ScanUnreadable when it is of no format that is read."""
         self._file.close()
         return Upload(
             path=self._path,
@@ -93,15 +96,20 @@ def sweep(folder: Path, *, upload_timeout_s: float) -> None:
 
 
 def format_of(head: bytes, filename: str) -> ScanFormat:
-    """Return the format that the first bytes of a file tell. Raises ScanUnreadable where it is neither PLY nor PCD."""
+    """Return the format that the first bytes of a file tell. Raises ScanUnreadable where it is none of those read."""
     if not head:
-        raise ScanUnreadable(f"{filename}: the file is empty; send a PLY or PCD")
+        raise ScanUnreadable(f"{filename}: the file is empty; send a {FORMATS}")
     if _PLY.match(head):
         return "ply"
     if _PCD.match(head):
         return "pcd"
+    if head.startswith(_E57):
+        return "e57"
+    if head.startswith(_LAS):
+        packed = len(head) > _LAS_FORMAT_AT and bool(head[_LAS_FORMAT_AT] & 0xC0)
+        return "laz" if packed else "las"
     raise ScanUnreadable(
-        f"{filename}: neither PLY nor PCD, it starts with {head[:12]!r}; send the scan as one of the two"
+        f"{filename}: it starts with {head[:12]!r} and is none of {FORMATS}; send the scan as one of these"
     )
 
 

@@ -58,7 +58,7 @@ class Client(Feeds):
         frame: str | None = None,
         on_sent: OnSent | None = None,
     ) -> ScanDocument:
-        """Send one PLY or PCD, streamed from disk; `captured_at` is RFC 3339, `pose` map_from_sensor in metres.
+        """Send one PLY, PCD, E57, LAS or LAZ, streamed from disk; `captured_at` is RFC 3339, `pose` map_from_sensor in metres.
 
         `frame` is the name of the frame that the pose leads to, such as `map` or `odom`.
 
@@ -85,7 +85,7 @@ class Client(Feeds):
         on_wait: OnWait | None = None,
         **said: Any,
     ) -> ScanDocument:
-        """Send one PLY or PCD in as many pieces as it takes, and go on where an earlier attempt ended.
+        """Send one PLY, PCD, E57, LAS or LAZ in as many pieces as it takes, and go on where an earlier attempt ended.
 
         `said` are `filename device_id captured_at pose frame`. Raises `RequestRefused`, and `Unreachable` where nothing
         goes on for longer than `persistence` says.

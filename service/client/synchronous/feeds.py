@@ -35,7 +35,7 @@ class Feeds(Connection):
         """Yield the changes of a map as they are published, page by page, and wait for more without end.
 
         Whoever keeps `after` of each page once it is dealt with, and gives it back later, misses no change and sees
-        none twice. Left out: all changes from the first on. Filters are those of the API.
+        none twice as new: with the property `updated` one comes again where something of it changed. Left out: all changes from the first on. Filters are those of the API.
         """
         path = f"/maps/{quoted(map_id)}/changes"
         cursor = FROM_THE_START if after is None else after

@@ -6,13 +6,14 @@ from collections.abc import Iterator
 from datetime import timedelta
 from typing import Any
 
+import httpx
 import pytest
 from fastapi.testclient import TestClient
 
 from service.api.http.paging import encoded
 from service.api.tiles import TileCollection
 from service.catalog.catalog import Catalog
-from service.catalog.records import TileState
+from service.catalog.records import Problem, TileState
 from tests.support.samples import (
     NOON,
     RememberingQueue,
@@ -20,8 +21,10 @@ from tests.support.samples import (
     add_scan,
     add_survey,
     catalog_of,
+    place,
     running,
     settings_in,
+    thing,
     tile,
 )
 
@@ -268,6 +271,51 @@ def test_only_a_survey_that_is_done_and_of_this_map_can_be_named(
 def test_a_map_that_is_not_ready_has_no_changes_to_tell(client: TestClient, catalog: Catalog) -> None:
     add_map(catalog, ready=False)
     assert client.get("/maps/lobby/changes").status_code == 409
+
+
+def test_what_failed_is_told_apart_from_what_is_not_ready_yet(client: TestClient, catalog: Catalog) -> None:
+    """Who waits for a survey asks again while it runs, and need not for ever."""
+    add_map(catalog)
+    survey_id, job_id = add_survey(catalog, ready=False)
+    building = add_map(catalog, "hall", ready=False)
+    paths = (
+        f"/surveys/{survey_id}/tiles",
+        f"/surveys/{survey_id}/objects",
+        f"/maps/lobby/changes?survey={survey_id}",
+        "/maps/hall/changes",
+    )
+    for problem in ("not_ready", "failed"):
+        for path in paths:
+            answer = client.get(path)
+            assert (answer.status_code, answer.json()["type"]) == (409, f"urn:spicd:problem:{problem}"), path
+            assert "Retry-After" not in answer.headers
+        for job in (job_id, building):
+            catalog.jobs.fail(job, Problem(code="registration_failed", detail="no scan"))
+
+
+def test_a_cursor_goes_on_with_the_filters_that_it_came_with_and_no_others(
+    client: TestClient, catalog: Catalog
+) -> None:
+    add_map(catalog)
+    objects = [thing(1, now=place(1, 1)), thing(2, now=place(4, 1))]
+    tiles = [tile(i, 0, score=0.9) for i in range(3)]
+    survey_id, _ = add_survey(catalog, tiles, captured_at=MARCH, objects=objects, moving=0)
+    for path, asked in (
+        ("/maps/lobby/changes", {"min_score": "0.5"}),
+        ("/maps/lobby/changes", {"repeats": "true"}),
+        ("/maps/lobby/objects", {"kind": "appeared"}),
+        (f"/surveys/{survey_id}/objects", {"min_probability": "0.1"}),
+        (f"/surveys/{survey_id}/tiles", {"state": "changed"}),
+        ("/jobs", {"map_id": "lobby"}),
+    ):
+        body = client.get(path, params={**asked, "limit": "1"}).json()
+        (onwards,) = [link["href"] for link in body["links"] if link["rel"] == "next"]
+        assert client.get(onwards).status_code == 200
+        cursor = httpx.URL(onwards).params["cursor"]
+        answer = client.get(path, params={"cursor": cursor, "limit": "1"})
+        assert (answer.status_code, answer.json()["type"]) == (422, "urn:spicd:problem:bad_request"), path
+        assert "the same parameters as before" in answer.json()["detail"]
+        assert client.get(path, params={**asked, "cursor": cursor, "limit": "7"}).status_code == 200
 
 
 def test_lists_go_on_page_by_page(client: TestClient, catalog: Catalog) -> None:

@@ -164,6 +164,7 @@ def test_the_service_ends_within_its_grace_while_others_listen(settings: Setting
         ended.append("whole")  # an answer that is cut raises
 
     with live(settings.model_copy(update={"shutdown_grace_s": 20})) as served:
+        add_map(served.services.catalog)
         ways = [(SSE, {}), (SSE, {"map": "lobby"}), ({}, {"wait": "60"})]
         threads = [threading.Thread(target=listen, args=(served.url, *way)) for way in ways]
         for thread in threads:
@@ -194,6 +195,7 @@ def test_a_stream_outlasts_the_database_for_a_while(service: Live, monkeypatch: 
     with service.http.stream("GET", "/events", headers=SSE) as answer:
         entries = stream(answer.iter_lines())
         next(entries)
+        until(lambda: service.services.listeners._head is not None)  # till then the stream reads by itself
         with monkeypatch.context() as patch:
             looks: list[int] = []
 
@@ -236,6 +238,30 @@ def test_lists_hold_every_event_once(client: TestClient, catalog: Catalog) -> No
         seen += [int(event["sequence"]) for event in document["events"]]
         url = next(link["href"] for link in document["links"] if link["rel"] == "next")
     assert seen == list(range(1, catalog.events.last() + 1))
+
+
+@pytest.mark.parametrize("headers", [SSE, {}])
+def test_a_map_that_is_not_there_is_not_listened_to_in_silence(
+    client: TestClient, catalog: Catalog, headers: dict[str, str]
+) -> None:
+    add_map(catalog)
+    answer = client.get("/events", params={"map": "loby"}, headers=headers)
+    assert (answer.status_code, answer.json()["type"]) == (404, "urn:spicd:problem:not_found")
+    refused = client.post("/webhooks", json={"url": "https://example.org/hook", "map": "loby"})
+    assert (refused.status_code, client.get("/webhooks").json()["webhooks"]) == (404, [])
+
+
+def test_a_map_that_was_deleted_can_be_asked_for_as_long_as_its_events_are_kept(
+    client: TestClient, catalog: Catalog
+) -> None:
+    add_map(catalog)
+    catalog.maps.delete("lobby")
+    events = client.get("/events", params={"map": "lobby", "after": "0"}).json()["events"]
+    assert events[-1]["type"] == "map.deleted"
+    asked = {"url": "https://example.org/hook", "map": "lobby"}
+    assert client.post("/webhooks", json=asked).status_code == 201
+    catalog.events.sweep(now() + timedelta(seconds=1))
+    assert client.get("/events", params={"map": "lobby"}).status_code == 404
 
 
 def test_filters_are_by_map_and_type(client: TestClient, catalog: Catalog) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from contextlib import closing
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from service.catalog.catalog import Catalog, open_catalog
 from service.catalog.records import Problem
 from service.queue import Claim, QueueState
 from service.settings import Settings
+from tests.support.live import live
 from tests.support.processes import until
 from tests.support.samples import RememberingQueue, add_map, add_scan, add_survey, catalog_of, running
 
@@ -189,3 +191,63 @@ def test_a_failed_job_is_run_again_on_request(
     assert client.get(f"/surveys/{survey_id}").json()["status"] == "running"
     catalog.jobs.dismiss(job_id)
     assert client.post(f"/jobs/{job_id}/retry").status_code == 409
+
+
+def test_who_waits_for_a_job_is_answered_when_it_has_ended(settings: Settings) -> None:
+    """Its answer comes long before the time is over, also where other jobs of the map end meanwhile."""
+    with live(settings) as service:
+        catalog = service.services.catalog
+        add_map(catalog)
+        _, job_id = add_survey(catalog, ready=False)
+
+        def end() -> None:
+            until(lambda: service.listeners() == 1)
+            add_survey(catalog)
+            catalog.jobs.succeed(job_id)
+
+        ender = threading.Thread(target=end)
+        ender.start()
+        answer = service.http.get(f"/jobs/{job_id}", params={"wait": "60"}, timeout=50)
+        ender.join()
+        assert answer.json()["status"] == "successful"
+        assert "Retry-After" not in answer.headers
+        until(lambda: service.listeners() == 0)
+
+
+def test_a_wait_for_a_job_ends_when_its_time_is_over(settings: Settings) -> None:
+    with live(settings) as service:
+        job_id = add_map(service.services.catalog, ready=False)
+        answer = service.http.get(f"/jobs/{job_id}", params={"wait": "0.1"})
+        assert answer.json()["status"] == "accepted"
+        assert answer.headers["Retry-After"] == "2"
+
+
+def test_who_waits_for_a_job_that_is_deleted_is_told(settings: Settings) -> None:
+    with live(settings) as service:
+        catalog = service.services.catalog
+        add_map(catalog)
+        survey_id, job_id = add_survey(catalog, ready=False)
+
+        def delete() -> None:
+            until(lambda: service.listeners() == 1)
+            service.http.delete(f"/surveys/{survey_id}")
+
+        deleter = threading.Thread(target=delete)
+        deleter.start()
+        answer = service.http.get(f"/jobs/{job_id}", params={"wait": "60"}, timeout=50)
+        deleter.join()
+    # dismissed first, and then gone: which of the two is seen is a matter of time
+    assert answer.status_code == 404 or answer.json()["status"] == "dismissed"
+
+
+def test_a_wait_is_at_most_a_minute(client: TestClient, catalog: Catalog) -> None:
+    job_id = add_map(catalog, ready=False)
+    assert client.get(f"/jobs/{job_id}", params={"wait": "61"}).status_code == 422
+    assert client.get(f"/jobs/{job_id}").headers["Retry-After"] == "2"
+
+
+def test_the_problem_of_a_job_has_the_members_of_any_problem(client: TestClient, catalog: Catalog) -> None:
+    """What it does not have is left out, and not null."""
+    job_id = add_map(catalog, ready=False)
+    catalog.jobs.fail(job_id, Problem(code="map_failed", detail="the scans do not meet"))
+    assert set(client.get(f"/jobs/{job_id}").json()["problem"]) == {"type", "title", "detail"}

@@ -174,6 +174,8 @@ def test_a_ready_map_shows_what_it_is_and_its_files(client: TestClient, catalog:
     assert found["scans"][0]["map_from_scan"][3] == [0, 0, 0, 1]
     hrefs = {link["rel"]: link["href"] for link in found["links"]}
     assert client.get(hrefs["manifest"]).json() == {"n_valid_patches": 4}
+    catalog.blobs.put_bytes(blob_keys.map_laz(job_id), b"LASF")
+    assert client.get(hrefs["cloud-laz"]).content == b"LASF"
     cloud = client.get(hrefs["cloud"])
     assert cloud.content == b"ply\n0123456789"
     part = client.get(hrefs["cloud"], headers={"Range": "bytes=4-6"})

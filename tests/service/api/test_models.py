@@ -132,13 +132,15 @@ def test_a_trained_model_stands_among_the_models_and_may_be_named_by_surveys_and
     assert post(client, base="lobby-net/1").json()["model"] == "lobby-net/2"
 
 
-def test_a_model_in_training_or_one_that_failed_is_not_ready(client: TestClient, catalog: Catalog) -> None:
+def test_a_model_in_training_is_not_ready_and_one_that_failed_is_told_apart(
+    client: TestClient, catalog: Catalog
+) -> None:
     add_map(catalog)
     job_id = add_model(catalog, ready=False)
     survey = {"scan_ids": [add_scan(catalog, "tuesday").scan_id], "model": "lobby-net/1"}
-    for word in ("still in training", "was not made"):
+    for word, problem in (("still in training", "not_ready"), ("was not made", "failed")):
         for answer in (client.get("/models/lobby-net"), client.post("/maps/lobby/surveys", json=survey)):
-            assert (answer.status_code, code(answer)) == (409, "not_ready")
+            assert (answer.status_code, code(answer)) == (409, problem)
             assert word in answer.json()["detail"]
             assert job_id in answer.json()["detail"]
         catalog.jobs.fail(job_id, Problem(code="training_failed", detail="the map has 2 tiles"))

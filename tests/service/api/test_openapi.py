@@ -4,14 +4,21 @@ from __future__ import annotations
 
 import json
 import re
+import threading
+import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import pytest
+from fastapi.openapi.utils import get_openapi
 
 from service.api import openapi
+from service.api.app import create_app
 from service.api.http.description import not_null, operations, schemas_under
+from service.catalog.deliveries import SCHEDULE
+from service.settings import Settings
 
 PROJECT = Path(__file__).resolve().parents[3]
 WRITTEN = PROJECT / openapi.FILE
@@ -83,6 +90,8 @@ def test_every_call_of_the_public_api_is_described(document: dict[str, Any]) -> 
         "GET /maps/{map_id}/scans",
         "GET /maps/{map_id}/manifest",
         "GET /maps/{map_id}/cloud.ply",
+        "GET /maps/{map_id}/tileset.json",
+        "GET /maps/{map_id}/cloud.laz",
         "PUT /maps/{map_id}/anchor",
         "DELETE /maps/{map_id}/anchor",
         "POST /maps/{map_id}/versions",
@@ -92,6 +101,9 @@ def test_every_call_of_the_public_api_is_described(document: dict[str, Any]) -> 
         "GET /maps/{map_id}/versions/{number}/scans",
         "GET /maps/{map_id}/versions/{number}/manifest",
         "GET /maps/{map_id}/versions/{number}/cloud.ply",
+        "GET /maps/{map_id}/versions/{number}/tileset.json",
+        "GET /maps/{map_id}/versions/{number}/tileset/{content}",
+        "GET /maps/{map_id}/versions/{number}/cloud.laz",
         "POST /maps/{map_id}/models",
         "POST /maps/{map_id}/surveys",
         "GET /maps/{map_id}/surveys",
@@ -103,7 +115,10 @@ def test_every_call_of_the_public_api_is_described(document: dict[str, Any]) -> 
         "DELETE /surveys/{survey_id}",
         "GET /surveys/{survey_id}/tiles",
         "GET /surveys/{survey_id}/cloud.ply",
+        "GET /surveys/{survey_id}/cloud.laz",
         "GET /surveys/{survey_id}/picture.png",
+        "GET /surveys/{survey_id}/tileset.json",
+        "GET /surveys/{survey_id}/tileset/{content}",
         "GET /",
         "GET /conformance",
         "GET /processes",
@@ -218,7 +233,108 @@ def test_forms_admit_their_own_files_and_no_other_field(document: dict[str, Any]
         assert "allOf" not in schema
 
 
+def test_bounds_and_defaults_of_parameters_stand_in_words(document: dict[str, Any]) -> None:
+    """Generators of TypeScript show descriptions, and no numbers of schemas."""
+
+    def said(path: str, name: str) -> str:
+        parameters = document["paths"][path]["get"]["parameters"]
+        return str(next(one["description"] for one in parameters if one["name"] == name))
+
+    assert said("/maps", "limit") == "most items in one answer; 1 to 1000; left out: 100"
+    assert said("/surveys/{survey_id}/tiles", "limit").endswith("left out: all there are; 1 to 10000")
+    assert said("/maps/{map_id}/changes", "min_score").endswith("; 0 to 1")
+    assert "; 0 to 60; left out: 0" in said("/events", "wait")
+    assert "left out: false" in said("/maps/{map_id}/changes", "repeats")
+    assert "min x, min y, min z, max x, max y, max z" in said("/maps/{map_id}/changes", "bbox")
+    for operation in operations(document):
+        for parameter in operation.get("parameters", ()):
+            if parameter["in"] == "query" and "maximum" in parameter["schema"]:
+                assert f"to {parameter['schema']['maximum']}" in parameter["description"], parameter["name"]
+
+
+def test_what_an_answer_leaves_out_is_not_null(document: dict[str, Any]) -> None:
+    schemas = document["components"]["schemas"]
+    for name, members in (
+        ("ProblemDocument", ("status", "instance", "errors")),
+        ("TileCollection", ("crs", "cursor", "withdrawn")),
+        ("ObjectHistory", ("crs",)),
+    ):
+        for member in members:
+            assert member not in schemas[name]["required"]
+            described = schemas[name]["properties"][member]
+            assert not_null(described) == described
+    for place, part in parts(schemas):
+        assert "default" not in part or part["default"] is not None, place
+
+
+def test_who_makes_something_is_told_where_it_is(document: dict[str, Any]) -> None:
+    for path, methods in document["paths"].items():
+        for method, call in methods.items():
+            headers = {
+                name
+                for status in ("201", "202")
+                for name in call["responses"].get(status, {}).get("headers", ())
+            }
+            if "201" in call["responses"]:
+                assert headers == {"Location"}, (method, path)
+            elif "202" in call["responses"] and not path.startswith("/webhooks"):
+                assert headers == {"Location", "Retry-After"}, (method, path)
+    assert "Retry-After" in document["paths"]["/jobs/{job_id}"]["get"]["responses"]["200"]["headers"]
+
+
+def test_an_id_that_is_none_of_a_map_has_an_example_of_its_own(document: dict[str, Any]) -> None:
+    for operation in operations(document):
+        for parameter in operation.get("parameters", ()):
+            if parameter["schema"].get("examples") == ["lobby"]:
+                assert parameter["name"] in ("map_id", "map")
+    schemas = document["components"]["schemas"]
+    assert schemas["VersionForm"]["properties"]["survey_id"]["examples"] == ["survey-91c4"]
+    assert schemas["ScanUse"]["properties"]["scan_id"]["examples"] == ["scan-2b1f"]
+
+
+def test_a_receiver_of_webhooks_is_told_what_it_gets(document: dict[str, Any]) -> None:
+    call = document["webhooks"]["event"]["post"]
+    assert [one["name"] for one in call["parameters"]] == [
+        "webhook-id",
+        "webhook-timestamp",
+        "webhook-signature",
+    ]
+    assert list(call["requestBody"]["content"]) == ["application/cloudevents+json"]
+    units = ((3600, "h"), (60, "min"), (1, "s"))
+    waits = [
+        next((wait.seconds // size, unit) for size, unit in units if wait.seconds >= size)
+        for wait in SCHEDULE
+    ]
+    words = [f"{count} {unit}" for count, unit in waits]
+    assert f"after {', '.join(words[:-1])} and {words[-1]}" in call["description"]
+    sent = schemas_under(call, document)
+    assert {"WebhookEvent", "PingEvent", "ChangeEvent", "ChangeData"} <= sent.keys()
+
+
+def test_a_stream_is_described_with_its_framing(document: dict[str, Any]) -> None:
+    content = document["paths"]["/events"]["get"]["responses"]["200"]["content"]
+    said = content["text/event-stream"]["schema"]["description"]
+    assert all(word in said for word in ("retry: 2000", "`sequence`", "15 s", "onmessage"))
+
+
 @pytest.mark.slow
+def test_first_requests_that_come_together_have_it_made_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    app, made, real = create_app(Settings(data_dir=tmp_path)), [], get_openapi
+
+    def slowly(**given: Any) -> dict[str, Any]:
+        made.append(threading.current_thread().name)
+        time.sleep(0.05)
+        return real(**given)
+
+    monkeypatch.setattr("service.api.app.get_openapi", slowly)
+    with ThreadPoolExecutor(4) as pool:
+        documents = list(pool.map(lambda _: app.openapi(), range(4)))
+    assert len(made) == 1
+    assert all(document is documents[0] for document in documents)
+
+
 def test_importing_the_api_brings_neither_torch_nor_the_worker() -> None:
     import subprocess
     import sys

@@ -71,13 +71,17 @@ def test_the_same_bytes_twice_are_one_scan_and_from_two_devices_two(client: Test
         (b"# .PCD v0.7 - Point Cloud Data file format\n", "pcd"),
         (b"VERSION 0.7\nFIELDS x y z\n", "pcd"),
         (b"#.PCD\n", "pcd"),
+        (b"ASTM-E57" + bytes(40), "e57"),
+        (b"LASF" + bytes(100) + b"\x03" + bytes(122), "las"),
+        (b"LASF" + bytes(100) + b"\x83" + bytes(122), "laz"),
+        (b"LASF", "las"),
     ],
 )
 def test_the_first_bytes_tell_the_format(client: TestClient, head: bytes, known: str) -> None:
     assert client.post("/scans", content=head, headers=RAW).json()["format"] == known
 
 
-@pytest.mark.parametrize("body", [b"", b"plywood", b"\x89PNG\r\n", b"\x00" * 100])
+@pytest.mark.parametrize("body", [b"", b"plywood", b"\x89PNG\r\n", b"\x00" * 100, b"LAS", b"ASTM-E5"])
 def test_another_file_is_refused_by_name_and_leaves_nothing(
     client: TestClient, catalog: Catalog, settings: Settings, body: Any
 ) -> None:

@@ -155,7 +155,7 @@ def test_the_tiles_are_features_in_the_frame_of_the_map(client: TestClient, cata
     assert unobserved["properties"]["score"] is None
 
 
-@pytest.mark.parametrize("what", ["tiles", "cloud.ply", "picture.png"])
+@pytest.mark.parametrize("what", ["tiles", "cloud.ply", "cloud.laz", "picture.png"])
 @pytest.mark.parametrize("ended", [False, True])
 def test_a_survey_without_a_result_says_so(
     client: TestClient, catalog: Catalog, what: str, ended: Any
@@ -176,7 +176,10 @@ def test_the_files_of_a_survey_come_as_they_are(client: TestClient, catalog: Cat
     assert missing.status_code == 404
     catalog.blobs.put_bytes(blob_keys.survey_cloud(survey_id), b"ply\n")
     catalog.blobs.put_bytes(blob_keys.survey_picture(survey_id), b"\x89PNG")
-    cloud, picture = (client.get(f"/surveys/{survey_id}/{name}") for name in ("cloud.ply", "picture.png"))
+    catalog.blobs.put_bytes(blob_keys.survey_laz(survey_id), b"LASF")
+    names = ("cloud.ply", "cloud.laz", "picture.png")
+    cloud, packed, picture = (client.get(f"/surveys/{survey_id}/{name}") for name in names)
+    assert (packed.content, packed.headers["content-type"]) == (b"LASF", "application/vnd.laszip")
     assert (cloud.content, cloud.headers["content-type"]) == (b"ply\n", "application/octet-stream")
     assert (picture.content, picture.headers["content-type"]) == (b"\x89PNG", "image/png")
 

@@ -108,6 +108,7 @@ def test_a_map_stays_in_use_while_a_version_builds_and_shows_it_when_it_is_ready
     assert shown(client) == (1, "ready", {"tiles": 4})
     for job_id, content in ((first, b"ply one"), (second, b"ply two")):
         catalog.blobs.put_bytes(blob_keys.map_cloud(job_id), content)
+        catalog.blobs.put_bytes(blob_keys.map_laz(job_id), b"laz" + content[3:])
         catalog.blobs.put_bytes(blob_keys.map_manifest(job_id), b'"%s"' % content)
     assert client.get("/maps/lobby/cloud.ply").content == b"ply one"
     assert client.get("/maps/lobby/versions/2/cloud.ply").status_code == 409
@@ -115,6 +116,7 @@ def test_a_map_stays_in_use_while_a_version_builds_and_shows_it_when_it_is_ready
     assert shown(client)[:2] == (2, "ready")
     for path, content in (("", b"two"), ("/versions/1", b"one"), ("/versions/2", b"two")):
         assert client.get(f"/maps/lobby{path}/cloud.ply").content == b"ply " + content
+        assert client.get(f"/maps/lobby{path}/cloud.laz").content == b"laz " + content
         assert client.get(f"/maps/lobby{path}/manifest").json() == f"ply {content.decode()}"
 
 
@@ -160,7 +162,7 @@ def test_a_map_that_has_no_version_to_go_on_from_is_not_ready(
         catalog.jobs.fail(job_id, PROBLEM)
     answer = client.post("/maps/lobby/versions", files={"scans": ("a.ply", ply())})
     assert answer.status_code == 409
-    assert answer.json()["type"] == "urn:spicd:problem:not_ready"
+    assert answer.json()["type"] == f"urn:spicd:problem:{'failed' if ended else 'not_ready'}"
     assert job_id in answer.json()["detail"]
 
 
@@ -183,7 +185,7 @@ def test_a_survey_without_a_result_cannot_be_taken_over(
         catalog.jobs.fail(job_id, PROBLEM)
     answer = post(client, survey_id=survey_id)
     assert answer.status_code == 409
-    assert answer.json()["type"] == "urn:spicd:problem:not_ready"
+    assert answer.json()["type"] == f"urn:spicd:problem:{'failed' if ended else 'not_ready'}"
     assert job_id in answer.json()["detail"]
 
 

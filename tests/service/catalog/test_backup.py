@@ -14,11 +14,12 @@ from service.catalog import blob_keys, tables
 from service.catalog.backup import BackupFailed, backup, restore
 from service.catalog.catalog import Catalog, open_catalog
 from service.catalog.keys import open_keys
+from service.catalog.records import Tileset
 from service.catalog.tables import Base
 from service.cli import main
 from service.settings import Settings
 from tests.support.processes import until
-from tests.support.samples import NOON, add_map, add_scan, add_survey, place, thing, tile
+from tests.support.samples import BOUNDS, NOON, add_map, add_scan, add_survey, place, thing, tile
 from tests.support.servers import shared_parts
 
 
@@ -162,6 +163,27 @@ def test_files_that_are_nowhere_are_named(catalog: Catalog, settings: Settings, 
     catalog.blobs.delete_prefix("surveys/")
     (missing,) = backup(settings, tmp_path / "copy").missing
     assert missing.endswith("/cloud.ply")
+
+
+def test_a_tileset_that_is_nowhere_is_named_too(catalog: Catalog, settings: Settings, tmp_path: Path) -> None:
+    fill(catalog)
+    record = catalog.maps.get("lobby")
+    told = Tileset(n_points=3, contents=1, bytes=64, sha256="0" * 64)
+    catalog.versions.save_result(
+        record.job_id, outcomes=[], bounds=BOUNDS, counts=record.counts, tileset=told
+    )
+    missing = backup(settings, tmp_path / "before").missing
+    assert [key.rpartition("/")[2] for key in missing] == ["tileset.bin", "tileset.json"]
+    for key in (blob_keys.map_tileset(record.job_id), blob_keys.map_tileset_contents(record.job_id)):
+        catalog.blobs.put_bytes(key, b"{}")
+    assert backup(settings, tmp_path / "after").missing == ()
+    restore(Settings(data_dir=tmp_path / "other"), tmp_path / "after")
+    restored = open_catalog(Settings(data_dir=tmp_path / "other"))
+    assert restored.maps.get("lobby").tileset == told
+    assert restored.blobs.get_bytes(blob_keys.map_tileset_contents(record.job_id)) == b"{}"
+    restored.maps.delete("lobby")
+    assert restored.blobs.under(blob_keys.map_folder(record.job_id)) == []
+    restored.close()
 
 
 def test_the_commands_copy_and_restore(

@@ -40,6 +40,16 @@ def test_bytes_come_back_by_key(either: Blobs) -> None:
         assert path.read_bytes() == b"ply"
 
 
+def test_a_part_of_a_blob_is_read_and_no_more_than_there_is(either: Blobs) -> None:
+    either.put_bytes("maps/lobby/tileset.bin", bytes(range(100)))
+    assert either.get_range("maps/lobby/tileset.bin", 10, 5) == bytes(range(10, 15))
+    assert either.get_range("maps/lobby/tileset.bin", 95, 50) == bytes(range(95, 100))
+    assert either.get_range("maps/lobby/tileset.bin", 100, 1) == b""
+    assert either.get_range("maps/lobby/tileset.bin", 10**15, 1) == b""
+    with pytest.raises(FileNotFoundError):
+        either.get_range("maps/none/tileset.bin", 0, 1)
+
+
 def test_what_was_put_last_stands(either: Blobs) -> None:
     either.put_bytes("a/b", b"first, longer")
     either.put_bytes("a/b", b"second")

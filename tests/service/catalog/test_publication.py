@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import random
 import threading
 from collections.abc import Iterator
+from dataclasses import dataclass, field
 from datetime import timedelta
 from pathlib import Path
 
@@ -14,7 +16,7 @@ from service.catalog.catalog import Catalog, open_catalog
 from service.catalog.changes import ChangeFilter
 from service.catalog.events import EventFilter, FeedCursor
 from service.catalog.publication import tell
-from service.catalog.records import EventRecord, EventType, ObjectRecord, Problem
+from service.catalog.records import ChangeRecord, EventRecord, EventType, ObjectRecord, Problem, TileState
 from service.catalog.tables import Event, TileChange, now
 from service.errors import Gone
 from service.settings import Settings
@@ -178,7 +180,7 @@ def test_nothing_is_lost_doubled_or_out_of_order_while_surveys_end_at_once(share
             cursor = page.cursor
             for map_id in maps:
                 found = own.changes.published(ChangeFilter(map_id=map_id), after=cursors[map_id], limit=1000)
-                followed[map_id] += [change.change_id for change in found.items]
+                followed[map_id] += [change.change_id for change in found.items[found.updated :]]
                 cursors[map_id] = found.cursor
             if last_look and not page.items:
                 break
@@ -214,10 +216,12 @@ def test_a_change_that_stays_over_six_surveys_is_published_once(catalog: Catalog
     for day in range(6):
         add_survey(catalog, [tile(0, 0)], captured_at=NOON + timedelta(days=day))
         page = catalog.changes.published(LOBBY, after=cursor)
-        seen += [change.change_id for change in page.items]
+        seen += [(change.change_id, number < page.updated) for number, change in enumerate(page.items)]
+        assert [change.last_seen for change in page.items] == [NOON + timedelta(days=day)]
         cursor = page.cursor
-    assert len(seen) == 1
-    assert types(catalog).count("change.told") == 1
+    assert len({change_id for change_id, _ in seen}) == 1
+    assert [updated for _, updated in seen] == [False, *[True] * 5]
+    assert (types(catalog).count("change.told"), types(catalog).count("change.updated")) == (1, 5)
 
 
 def test_a_visit_that_is_uploaded_late_is_published_after_the_later_one(catalog: Catalog) -> None:
@@ -226,7 +230,9 @@ def test_a_visit_that_is_uploaded_late_is_published_after_the_later_one(catalog:
     first = catalog.changes.published(LOBBY, after=BEGINNING)
     add_survey(catalog, [tile(0, 0), tile(1, 0)], captured_at=NOON + timedelta(days=4))
     second = catalog.changes.published(LOBBY, after=first.cursor)
-    assert [change.tile.tile_id for change in second.items] == ["tile_001_000_000"]
+    assert second.updated == 1
+    assert [change.tile.tile_id for change in second.items] == ["tile_000_000_000", "tile_001_000_000"]
+    assert second.items[0].first_seen == NOON + timedelta(days=4)
     third = catalog.changes.published(LOBBY, after=second.cursor)
     assert (third.items, third.withdrawn, third.cursor) == ((), (), second.cursor)
 
@@ -239,7 +245,7 @@ def test_a_change_keeps_its_id_when_the_survey_that_told_it_is_deleted(catalog: 
     seen = catalog.events.last()
     catalog.surveys.delete(first)
     assert changes(catalog) == before
-    assert types(catalog, seen) == ["survey.deleted"]
+    assert types(catalog, seen) == ["survey.deleted", "change.updated"]  # first seen on the day after by now
 
 
 def test_a_change_that_no_survey_sees_any_more_is_withdrawn(catalog: Catalog) -> None:
@@ -262,7 +268,9 @@ def test_of_two_changes_that_turn_out_to_be_one_the_older_goes_on(catalog: Catal
     older, newer = (change.change_id for change in page.items)
     catalog.surveys.delete(between)
     after = catalog.changes.published(LOBBY, after=page.cursor)
-    assert (after.items, [tuple(one) for one in after.withdrawn]) == ((), [(newer, older)])
+    assert [(one.subject, one.merged_into) for one in after.withdrawn] == [(newer, older)]
+    assert ([change.change_id for change in after.items], after.updated) == ([older], 1)
+    assert after.items[0].last_seen == NOON + timedelta(days=2)
     assert changes(catalog) == [("000", older)]
 
 
@@ -273,7 +281,8 @@ def test_a_late_visit_that_parts_a_change_tells_its_other_half_as_new(catalog: C
     page = catalog.changes.published(LOBBY, after=BEGINNING)
     (one,) = page.items
     add_survey(catalog, [tile(0, 0, "unchanged", 0.1)], captured_at=NOON + timedelta(days=1))
-    (half,) = catalog.changes.published(LOBBY, after=page.cursor).items
+    rest, half = catalog.changes.published(LOBBY, after=page.cursor).items
+    assert (rest.change_id, rest.last_seen) == (one.change_id, NOON)
     assert half.change_id != one.change_id
     assert half.first_seen == NOON + timedelta(days=2)
     assert changes(catalog)[0] == ("000", one.change_id)
@@ -305,6 +314,62 @@ def test_pages_from_the_beginning_go_on_though_the_events_were_swept(catalog: Ca
         catalog.changes.published(LOBBY, after=FeedCursor(1, 1))
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_a_list_that_is_followed_is_the_list_that_is_asked_for(catalog: Catalog, seed: int) -> None:
+    """Surveys come in any order and go again; readers with small pages, with filters and without, come between."""
+    rng = random.Random(seed)
+    add_map(catalog)
+    wanted = [LOBBY, ChangeFilter(map_id="lobby", min_score=0.8), ChangeFilter(map_id="lobby", until=NOON)]
+    readers = [Reader(catalog, one, limit) for one, limit in zip(wanted, (2, 1, 3), strict=True)]
+    surveys: list[str] = []
+    for _ in range(14):
+        if surveys and rng.random() < 0.25:
+            catalog.surveys.delete(surveys.pop(rng.randrange(len(surveys))))
+        else:
+            seen: list[TileState] = ["changed", "changed", "unchanged"]
+            states = {i: rng.choice(seen) for i in rng.sample(range(5), 3)}
+            tiles = [tile(i, 0, state, score=rng.random()) for i, state in states.items()]
+            when = NOON + timedelta(days=rng.randrange(-9, 10))
+            surveys.append(add_survey(catalog, tiles, captured_at=when)[0])
+        for reader in readers:
+            for _ in range(rng.randrange(3)):
+                reader.look()
+    for reader in readers:
+        while reader.look():
+            pass
+        listed = catalog.changes.page(reader.wanted, limit=100).items
+        assert reader.kept == {change.change_id: change for change in listed}
+
+
+@dataclass
+class Reader:
+    """Who follows the changes of a map, and keeps a list of them."""
+
+    catalog: Catalog
+    wanted: ChangeFilter
+    limit: int
+    cursor: FeedCursor = BEGINNING
+    kept: dict[str | None, ChangeRecord] = field(default_factory=dict)
+    new: set[str | None] = field(default_factory=set)  #: told as new so far
+
+    def look(self) -> bool:
+        """Take in one page; returns whether there is more."""
+        page = self.catalog.changes.published(self.wanted, after=self.cursor, limit=self.limit)
+        assert max(len(page.items), len(page.withdrawn)) <= self.limit
+        for number, change in enumerate(page.items):
+            if number >= page.updated:
+                assert change.change_id not in self.new  # as new it is told once
+                self.new.add(change.change_id)
+            elif self.wanted == LOBBY:
+                assert change.change_id in self.new
+            self.kept[change.change_id] = change
+        for gone in page.withdrawn:
+            self.kept.pop(gone.subject, None)
+        assert page.more or page.cursor.told == page.cursor.since
+        self.cursor = FeedCursor.read(str(page.cursor))
+        return page.more
+
+
 # objects
 
 
@@ -323,7 +388,7 @@ def test_what_becomes_of_an_object_is_told(catalog: Catalog) -> None:
     last = visit(4, box)
     add_version(catalog, survey_id=last)
     about = [event for event in told(catalog) if event.type.startswith("object.")]
-    assert [event.type[7:] for event in about] == ["told", "gone_again", "seen_again", "accepted"]
+    assert [event.type[7:] for event in about] == ["told", "updated", "gone_again", "seen_again", "accepted"]
     assert len({event.subject for event in about}) == 1
 
 

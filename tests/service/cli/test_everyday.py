@@ -120,6 +120,7 @@ def results(objects: Any) -> Answers:
     return {
         "GET /surveys/survey-1": {**SURVEY, "objects": objects},
         "GET /surveys/survey-1/cloud.ply": httpx.Response(200, content=CLOUD),
+        "GET /surveys/survey-1/cloud.laz": httpx.Response(200, content=b"LASF"),
         "GET /surveys/survey-1/picture.png": httpx.Response(200, content=b"png"),
         "GET /surveys/survey-1/tiles": {"features": [{"id": "tile"}], "links": []},
         "GET /surveys/survey-1/objects": pages,
@@ -137,6 +138,16 @@ def test_a_survey_is_downloaded_into_a_folder_with_every_page_of_its_objects(
     assert Path(files["cloud.ply"]).read_bytes() == CLOUD
     written = json.loads(Path(files["objects.geojson"]).read_text())
     assert [feature["id"] for feature in written["features"]] == ["a", "b"]
+
+
+def test_a_survey_is_downloaded_with_its_cloud_as_laz_where_that_is_asked_for(
+    service: Service, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    service.answers = results(None)
+    assert spicd("surveys", "download", "survey-1", "--to", str(tmp_path), "--laz", "--json") == 0
+    files = json.loads(capsys.readouterr().out)["files"]
+    assert sorted(files) == ["cloud.laz", "picture.png", "tiles.geojson"]
+    assert Path(files["cloud.laz"]).read_bytes() == b"LASF"
 
 
 def test_of_a_survey_without_objects_the_rest_is_downloaded_and_of_a_refused_one_its_picture(

@@ -43,7 +43,10 @@ class Losing(httpx.BaseTransport):
 
 
 @pytest.fixture
-def parts(tmp_path: Path) -> Iterator[tuple[Client, Catalog, Losing]]:
+def parts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Client, Catalog, Losing]]:
+    monkeypatch.setattr(
+        "service.client.retries.FIRST_CONTACT_S", 60.0
+    )  # the first answer is lost, however slow
     with running(settings_in(tmp_path), RememberingQueue()) as service:
         losing = Losing(service._transport)
         with Client("http://localhost", transport=losing, retries=QUICK) as client:

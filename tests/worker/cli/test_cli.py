@@ -174,7 +174,7 @@ def test_more_reference_files_are_part_of_the_map(
     ("spoilt", "sentence"),
     [
         ("missing.pcd", "missing.pcd: No such file"),
-        ("text.pcd", "neither PLY nor PCD"),
+        ("text.pcd", "neither PLY, PCD, E57 nor LAS"),
     ],
 )
 def test_a_bad_file_ends_in_one_sentence_that_names_it(

@@ -3,6 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from worker.cloud import normals as module
 from worker.cloud.normals import estimate_normals
 
 
@@ -22,3 +23,16 @@ def test_normals_of_a_wall_point_across_it_also_where_points_are_sparse(spacing:
 def test_a_handful_of_points_gets_normals_of_unit_length() -> None:
     normals = estimate_normals(np.eye(3), radius=0.1, max_neighbors=30)
     assert np.linalg.norm(normals, axis=1) == pytest.approx(np.ones(3))
+
+
+def test_normals_of_a_large_cloud_are_those_that_it_has_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(2)
+    cloud = np.concatenate([_wall(0.05), _wall(0.14)[:, [1, 0, 2]], rng.uniform(0, 3, (500, 3))])
+    cloud = rng.permutation(cloud)
+    whole = estimate_normals(cloud, radius=0.1, max_neighbors=30)
+    monkeypatch.setattr(module, "AT_ONCE", 700)
+    slabs = estimate_normals(cloud, radius=0.1, max_neighbors=30)
+    alike = np.abs(np.einsum("ij,ij->i", whole, slabs))
+    assert (
+        alike > 1 - 1e-5
+    ).mean() > 0.995  # the rest have neighbours at the same distance, or a sphere of them

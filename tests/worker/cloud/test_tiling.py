@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from tests.support.tilings import ORIGIN, SIZE, grid_of, in_tile
+from worker.cloud import tiling as module
 from worker.cloud.tiling import (
     TileGrid,
     TilePairs,
@@ -219,3 +220,13 @@ def test_chosen_pairs_keep_their_two_sides_together() -> None:
     assert [len(points) for points in chosen.current] == [90, 0]
     assert chosen.reference.indices[:, 0].tolist() == [2, 1]
     assert chosen.observed.tolist() == [True, False]
+
+
+def test_points_of_a_large_cloud_are_located_some_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    points = np.random.default_rng(0).uniform(-1, 9, (500, 3)).astype(np.float32) + np.array(
+        ORIGIN, np.float32
+    )
+    grid = grid_of(4, 4, 4)
+    whole = grid.locate(points)
+    monkeypatch.setattr(module, "_AT_ONCE", 64)
+    assert np.array_equal(grid.locate(points), whole)

@@ -1,8 +1,11 @@
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
 
+from worker.cloud import voxels as module
 from worker.cloud.voxels import Voxels
 from worker.errors import MapFailed
 
@@ -67,3 +70,43 @@ def test_a_cloud_gives_the_same_voxels_whatever_is_sorted_at_once(monkeypatch) -
     np.testing.assert_array_equal(pieces.keys, whole.keys)
     np.testing.assert_array_equal(pieces.counts, whole.counts)
     np.testing.assert_allclose(pieces.sums, whole.sums)
+
+
+def test_merging_in_runs_gives_what_merging_at_once_gives_bit_for_bit(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    rng = np.random.default_rng(4)
+    clouds = [rng.uniform(-1, 1 + extra, (n, 3)).astype(np.float32) for n, extra in ((4000, 0.0), (900, 2.0))]
+    colors = [rng.integers(0, 256, cloud.shape, dtype=np.uint8) for cloud in clouds]
+    parts = [
+        Voxels.of(cloud, size=0.1, origin=np.array([3.0, 0, 0]), colors=color)
+        for cloud, color in zip(clouds, colors, strict=True)
+    ]
+    nothing = Voxels.of(clouds[0][:0], size=0.1, colors=colors[0][:0])
+    for one, other in (parts, parts[::-1], (parts[0], nothing), (nothing, parts[1])):
+        whole = one.merged(other)
+        means = whole.points, whole.views, whole.colors
+        with monkeypatch.context() as patch:
+            patch.setattr(module, "_AT_ONCE", 97)
+            runs = one.merged(other)
+            assert np.array_equal(runs.keys, whole.keys)
+            assert np.array_equal(runs.counts, whole.counts)
+            assert np.array_equal(runs.sums, whole.sums)
+            for found, expected in zip((runs.points, runs.views, runs.colors), means, strict=True):
+                assert found is not None and expected is not None
+                assert np.array_equal(found, expected)
+
+
+def test_merging_takes_no_more_memory_than_both_and_their_sum(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Counted by what NumPy allocates; both are there before."""
+    rng = np.random.default_rng(4)
+    one, other = (Voxels.of(rng.uniform(-3, 3, (60_000, 3)).astype(np.float32), size=0.05) for _ in range(2))
+    monkeypatch.setattr(module, "_AT_ONCE", 2000)
+    tracemalloc.start()
+    try:
+        merged = one.merged(other)
+        assert tracemalloc.get_traced_memory()[1] < 1.2 * (
+            merged.sums.nbytes + merged.counts.nbytes + merged.keys.nbytes
+        )
+    finally:
+        tracemalloc.stop()

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import io
 import json
+import re
+import sys
 from pathlib import Path
 from typing import Any
 
+import httpx
 import numpy as np
 import pytest
 from rich.console import Console
 
 from tests.support.models import make_untrained
+from worker.cli import terminal
 from worker.cloud.tiling import TileGrid
 from worker.demo.judgement import Verdict, grid_of, judge, placement_line, show_judgement
 from worker.demo.run import run
@@ -253,23 +257,66 @@ def test_a_short_demo_leaves_its_results_and_no_process(
     for what, start in (("changes", b'{"type":"Feature'), ("cloud", b"ply\n"), ("picture", b"\x89PNG")):
         assert result.files[what].read_bytes().startswith(start)
         assert str(result.files[what]) in page.getvalue()
+    last = page.getvalue().splitlines()[-1]
+    assert last.startswith(
+        f"look      spicd up --data-dir {tmp_path / 'demo-data'}, then http://127.0.0.1:8000/"
+    )
+    assert last.endswith(f"/#map=office&survey={result.survey['survey_id']}")
     assert (tmp_path / "mine.txt").exists()
     assert _started_for(tmp_path) == []
 
 
-def test_a_demo_with_voxels_tells_objects(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_demo_with_voxels_tells_objects_and_shows_them_until_the_viewer_was_looked_at(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("SPICD_MODEL_STORE", str(MODEL_STORE))
-    page = io.StringIO()
+    page, shown = io.StringIO(), []
+
+    def looked_at(_: ServiceChild) -> None:
+        (address,) = re.findall(r"look +(http://\S+)", page.getvalue())
+        shown.append((address, httpx.get(address, headers={"Accept": "text/html"})))
+
+    monkeypatch.setattr(ServiceChild, "await_end", looked_at)
     settings = DemoSettings(stops=(2, 2), prior_error=(0.02, 0.5), model="voxel-rule/1")
-    result = run(
-        tmp_path, settings, out_console=Console(file=page, width=160), err_console=Console(file=io.StringIO())
-    )
+    out, err = Console(file=page, width=160), Console(file=io.StringIO())
+    result = run(tmp_path, settings, out_console=out, err_console=err, look=True)
+    ((address, answer),) = shown
+    assert address.endswith(f"/#map=office&survey={result.survey['survey_id']}")
+    assert answer.headers["Content-Type"].startswith("text/html")
+    assert _started_for(tmp_path) == []
     assert result.survey["model"] == "voxel-rule/1"
     assert result.things is not None
     assert len(result.things.things) == 6
     told = sum(result.survey["objects"].values())
     assert told == len(json.loads(result.files["objects"].read_text())["features"])
     assert "of 6 changes found" in page.getvalue()
+
+
+def test_ctrl_c_ends_the_looking_and_a_service_that_ends_by_itself_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted() -> int:
+        raise KeyboardInterrupt
+
+    with ServiceChild(tmp_path / "data", tmp_path / "log") as child:
+        child.await_ready()
+        with monkeypatch.context() as patch:
+            patch.setattr(child._started, "wait", interrupted)
+            child.await_end()
+        assert child._started.poll() is None
+        child._started.terminate()
+        with pytest.raises(DemoFailed, match="the service ended"):
+            child.await_end()
+
+
+def test_nobody_looks_where_there_is_no_terminal_or_a_machine_at_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("CI", raising=False)
+    assert not terminal.is_attended()
+    for stream in (sys.stdin, sys.stdout):
+        monkeypatch.setattr(stream, "isatty", lambda: True, raising=False)
+    assert terminal.is_attended()
+    monkeypatch.setenv("CI", "true")
+    assert not terminal.is_attended()
 
 
 def _started_for(folder: Path) -> list[str]:

@@ -102,7 +102,7 @@ def test_of_files_that_cannot_be_read_each_has_its_own_sentence(tmp_path: Path) 
     (tmp_path / "a").write_text("hello")
     (tmp_path / "b").write_bytes(b"ply\nformat ascii 1.0\nend_header\n")
     files = [ScanFile(name=f"{name}.ply", path=tmp_path / name) for name in ("a", "b")]
-    results = unread(files, ScanError("a.ply: neither PLY nor PCD"), max_points=100)
+    results = unread(files, ScanError("a.ply: neither PLY, PCD, E57 nor LAS"), max_points=100)
     assert [str(result.reason).partition(":")[0] for result in results] == ["a.ply", "b.ply"]
     assert {result.diagnosis.reason for result in results if result.diagnosis} == {"unreadable"}
 

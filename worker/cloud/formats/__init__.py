@@ -1,1 +1,1 @@
-"""Readers and writers of PLY and PCD."""
+"""Readers of PLY, PCD, E57 and LAS, and writers of PLY, PCD and LAZ."""

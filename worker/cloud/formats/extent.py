@@ -6,7 +6,7 @@ left out and counted. What is wrong with most points of a file is refused: anoth
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Self
 
 import numpy as np
@@ -20,6 +20,8 @@ LONGEST_SITE = 500.0  #: metres along one axis; an indoor scan that is longer is
 SHORTEST_ROOM = 3.0  #: metres; what another unit would make of the extent has to be a room
 FAR = 250.0  #: metres outside the middle 90% of the points, on an axis; no sensor for rooms sees that far
 MOST_FAR = 0.02  #: share of the points that may lie there
+ROUND = 100.0  #: metres; what an offset is a multiple of
+ON_EARTH = 1e8  #: metres from the origin, that no coordinate of a place exceeds
 SAMPLE = 100_000  #: points that the extent is measured on
 _ALL, _CORE = (1, 99), (5, 95)  # percentiles: without strays, and with as many as may be dropped
 
@@ -34,10 +36,13 @@ class Extent:
     high: Floats  #: (3,) metres
     n_far: int = 0  #: points outside
     farthest: float = 0.0  #: metres from the middle of the box to the farthest of them
+    offset: Floats = field(
+        default_factory=lambda: np.zeros(3)
+    )  #: (3,) metres, to be taken off before float32
 
     @classmethod
-    def of(cls, sample: Positions) -> Self:
-        """Measure a sample (K, 3) of the finite points of a file.
+    def of(cls, sample: Positions, *, anywhere: bool = False) -> Self:
+        """Measure a sample (K, 3) of the finite points of a file; `anywhere`: they may lie far from the origin.
 
         Raises ScanUnits where it is longer than any site, ScanError where too many of its points lie far from the
         others, and ScanFarAway where all of them lie far from the origin.
@@ -56,8 +61,7 @@ class Extent:
                 f"{MOST_FAR:.0%} are left out; filter them, and write missing returns as NaN"
             )
         _check_units(halves[near])
-        extent._check_place()
-        return cls(low=low, high=high)
+        return cls(low=low, high=high, offset=extent._offset(anywhere=anywhere))
 
     def near(self, positions: Positions) -> Bools:
         """Tell (N,) which points (N, 3) lie near the others; counts the rest."""
@@ -71,14 +75,20 @@ class Extent:
             self.farthest = max(self.farthest, float(away.max()))
         return near
 
-    def _check_place(self) -> None:
-        """Raise ScanFarAway where the points lie too far from the origin for float32 to keep their millimetres."""
+    def _offset(self, *, anywhere: bool) -> Floats:
+        """Return what is taken off so that float32 keeps millimetres: nothing near the origin.
+
+        Raises ScanFarAway where the points lie too far away, and must not.
+        """
         low, high = self.low + FAR, self.high - FAR
         if float(np.abs(np.stack([low, high])).max()) <= FARTHEST:
-            return
+            return np.zeros(3)
         middle = (low + high) / 2
+        rounded: Floats = np.round(middle / ROUND) * ROUND
+        if anywhere and float(np.abs(middle).max()) < ON_EARTH:
+            return rounded
         away = float(np.linalg.norm(middle))
-        offset = ", ".join(f"{value:.0f}" for value in np.round(middle / 100) * 100)
+        offset = ", ".join(f"{value:.0f}" for value in rounded)
         raise ScanFarAway(
             f"its points lie {_length(away)} from the origin of its frame, around "
             f"({', '.join(f'{value:.1f}' for value in middle)}), over {FARTHEST / 1000:g} km, as coordinates of a country's "

@@ -57,6 +57,11 @@ class RawCloud:
 
     columns: Columns  #: x, y, z (N,) float32 or float64, and the colour fields, each in the type of the file
     sensor_pose: Matrix4  #: (4, 4) float64, scan_from_sensor
+    prior: Matrix4 | None = (
+        None  #: (4, 4) float64, from the sensor to a frame of the file's own, where it tells one
+    )
+    tells_sensor: bool = True  #: whether the format can say where the sensor stood
+    may_lie_anywhere: bool = False  #: positions are of float64, so that an offset can be taken off
 
 
 def stride(fields: Sequence[Field]) -> int:

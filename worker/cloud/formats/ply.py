@@ -5,6 +5,7 @@ Format: Greg Turk, "The PLY Polygon File Format", 1994.
 
 from __future__ import annotations
 
+import itertools
 import mmap
 import re
 import struct
@@ -31,7 +32,7 @@ from worker.cloud.formats.fields import (
 )
 from worker.cloud.types import Colors, Points
 from worker.errors import ScanError
-from worker.files import write_bytes
+from worker.files import write_parts
 
 _SHORT_NAMES = {
     "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4",
@@ -44,6 +45,7 @@ _LONG_NAMES = {
 _TYPES = _SHORT_NAMES | _LONG_NAMES
 _ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 SCALAR = "scalar_"  #: what the names of scalar fields begin with (CloudCompare, PlyFilter)
+_AT_ONCE = 1_000_000  # rows that are written together
 _LISTS_LIMIT = 5_000_000  #: lists of an element that are walked one by one in Python, about 0.5 us each
 
 
@@ -275,10 +277,18 @@ def write_ply(
     header = ["ply", "format binary_little_endian 1.0", *(f"comment {comment}" for comment in comments)]
     header.append(f"element vertex {len(points)}")
     header += [f"property {words[column.dtype.str[1:]]} {name}" for name, column in columns.items()]
-    rows = np.empty(len(points), np.dtype([(name, column.dtype) for name, column in columns.items()]))
-    for name, column in columns.items():
-        rows[name] = column
-    write_bytes(path, "\n".join([*header, "end_header", ""]).encode("ascii"), rows.tobytes())
+    head = "\n".join([*header, "end_header", ""]).encode("ascii")
+    write_parts(path, itertools.chain([head], _rows(columns, len(points))))
+
+
+def _rows(columns: Mapping[str, NDArray[Any]], count: int) -> Iterator[bytes]:
+    """Yield the rows of these columns, some at a time."""
+    kind = np.dtype([(name, column.dtype) for name, column in columns.items()])
+    for start in range(0, count, _AT_ONCE):
+        rows = np.empty(min(_AT_ONCE, count - start), kind)
+        for name, column in columns.items():
+            rows[name] = column[start : start + _AT_ONCE]
+        yield rows.tobytes()
 
 
 def _scalar(name: str, values: NDArray[Any]) -> NDArray[Any]:

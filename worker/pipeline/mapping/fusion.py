@@ -11,7 +11,7 @@ from worker.cloud.voxels import Voxels, fused
 from worker.errors import MapFailed
 from worker.pipeline.registration.results import RegisteredScan
 from worker.pipeline.registration.settings import RegistrationSettings
-from worker.pipeline.registration.surface import Surface, surface_of
+from worker.pipeline.registration.surface import Surface, oriented_normals
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -56,11 +56,12 @@ def fuse(scans: Iterable[RegisteredScan], *, voxel_size: float) -> Voxels:
 
 def reference_map(voxels: Voxels, *, grid: TileGrid, settings: RegistrationSettings) -> ReferenceMap:
     """Return the fused cloud with the normals that surveys will need, computed once."""
-    surface = surface_of(voxels, settings)
+    points = voxels.points
+    normals, oriented = oriented_normals(voxels, points, settings)
     return ReferenceMap(
-        points=voxels.points,
-        normals=surface.normals.astype("float32"),
-        oriented=surface.oriented,
+        points=points,
+        normals=normals,
+        oriented=oriented,
         colors=voxels.colors,
         voxel_size=voxels.size,
         grid=grid,

@@ -117,7 +117,7 @@ def read_and_prepare(task: PrepareTask) -> tuple[int, ValidScan | ScanError | Sc
     except (ScanError, ScanRejected) as error:
         return task.index, error
     prepared.save(task.folder.path(task.index))
-    prior = task.file.prior(scan.sensor_pose)
+    prior = task.file.prior(scan.sensor_pose, own=scan.prior, offset=scan.offset)
     voxel_size = task.settings.registration.voxel_size
     return task.index, ValidScan(
         points=downsample(prepared.surface.points),

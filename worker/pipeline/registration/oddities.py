@@ -84,7 +84,7 @@ def oddities(
 ) -> tuple[Diagnosis, ...]:
     """Return what is odd about a scan that was prepared at `voxel_size`, metres; empty of a good one."""
     figures = Figures.of(scan, prepared, prior=prior, voxel_size=voxel_size)
-    checks = (_left_out, _density, _size, _coverage, _up_axis)
+    checks = (_left_out, _place, _density, _size, _coverage, _up_axis)
     return tuple(
         Diagnosis(reason=reason, detail=f"scan {scan.name}: {detail}", numbers=numbers)
         for check in checks
@@ -109,6 +109,23 @@ def _left_out(scan: Scan, figures: Figures) -> Found:
             f"{figures.missing:.0%} of its points ({scan.n_dropped}) are missing returns (NaN or inf); check that nothing "
             "covers the sensor",
             {"points": float(scan.n_dropped), "share": figures.missing},
+        )
+
+
+def _place(scan: Scan, figures: Figures) -> Found:
+    if scan.offset.any():
+        offset = ", ".join(f"{value:.0f}" for value in scan.offset)
+        yield (
+            "offset_taken_off",
+            f"its coordinates lie far from their origin, as those of a country's grid do; ({offset}) m was taken off them",
+            dict(zip(("x", "y", "z"), map(float, scan.offset), strict=True)),
+        )
+    if figures.turn is None and (scan.offset.any() or not scan.tells_sensor):
+        yield (
+            "no_sensor_place",
+            "nothing tells where its sensor stood, so what it saw through is not known; send one scan for each place of "
+            "the sensor, in the sensor's frame",
+            {},
         )
 
 

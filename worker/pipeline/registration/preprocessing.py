@@ -81,7 +81,8 @@ def prepare(scan: Scan, settings: RegistrationSettings, *, with_sights: bool = F
     Raises ScanRejected where it cannot be registered to anything.
     """
     origin: Floats = scan.sensor_pose[:3, 3]
-    trusted = share_in_front(scan.points, origin) >= ENOUGH
+    # where an offset was taken off, the file's origin is far away, and its own frame's is no sensor's place
+    trusted = not scan.offset.any() and share_in_front(scan.points, origin) >= ENOUGH
     voxels = Voxels.of(scan.points, size=settings.voxel_size, origin=origin if trusted else None)
     points = voxels.points
     if len(points) < settings.min_points:

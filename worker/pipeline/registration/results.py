@@ -14,8 +14,11 @@ from typing import Self
 import numpy as np
 
 from worker.cloud.carrier import Carrier, CarrierSettings
+from worker.cloud.formats.apart import stations_of
+from worker.cloud.formats.e57 import looks_like_e57
+from worker.cloud.formats.fields import FARTHEST
 from worker.cloud.formats.scan import Scan, read_scan
-from worker.cloud.poses import inverse, transformed
+from worker.cloud.poses import inverse, transformed, translation
 from worker.cloud.types import Colors, Floats, Matrix4, Points
 from worker.cloud.voxels import Voxels
 from worker.errors import RegistrationFailed, ScanError, ScanFarAway, ScanUnits
@@ -33,11 +36,12 @@ class ScanFile:
     name: str  #: what messages call it
     path: Path
     pose: Matrix4 | None = None  #: (4, 4) map_from_sensor as the client believes it, e.g. by odometry
+    station: int | None = None  #: of the scans of an E57, from 0 on; None: the only one
     carrier: Carrier | None = None  #: whose returns are cut; None: nobody looked for one
 
     def read(self, *, max_points: int) -> Scan:
         """Read the file, less the carrier's returns; raises ScanError, whose message names it."""
-        scan = read_scan(self.path, name=self.name, max_points=max_points)
+        scan = read_scan(self.path, name=self.name, max_points=max_points, station=self.station)
         if self.carrier is None:
             return scan
         cut = self.carrier.hits(transformed(scan.points, inverse(scan.sensor_pose)))
@@ -47,12 +51,37 @@ class ScanFile:
             colors=None if scan.colors is None else scan.colors[~cut],
         )
 
-    def prior(self, sensor_pose: Matrix4) -> Matrix4 | None:
-        """Return map_from_scan by the client's pose, which is the sensor's; the file may know where that stood."""
-        if self.pose is None:
+    def prior(
+        self, sensor_pose: Matrix4, *, own: Matrix4 | None = None, offset: Floats | None = None
+    ) -> Matrix4 | None:
+        """Return map_from_scan by the client's pose, which is the sensor's; the file may know where that stood.
+
+        Where the client gave none it is `own`, the file's own pose of the sensor, as an E57 has one; that says nothing
+        where it is the identity, as of a station that nobody registered, or puts the points kilometres away, as in a
+        country's grid. `offset` (3,) metres was taken off the points.
+        """
+        map_from_sensor = self.pose if self.pose is not None else own
+        if map_from_sensor is None:
             return None
-        map_from_scan: Matrix4 = self.pose @ inverse(sensor_pose)
+        shift = translation(np.zeros(3) if offset is None else offset)
+        map_from_scan: Matrix4 = map_from_sensor @ inverse(sensor_pose) @ shift
+        far = float(np.linalg.norm(map_from_scan[:3, 3])) > FARTHEST
+        if self.pose is None and (far or np.allclose(map_from_sensor, np.eye(4))):
+            return None
         return map_from_scan
+
+
+def files_of(path: Path) -> list[ScanFile]:
+    """Return the scans of a file: one, or for an E57 one for each station that holds points. Raises OSError."""
+    with path.open("rb") as file:
+        is_e57 = looks_like_e57(file.read(8))
+    count = 1
+    if is_e57:
+        with suppress(ScanError):  # told when it is read
+            count = len(stations_of(path))
+    if count == 1:
+        return [ScanFile(name=str(path), path=path)]
+    return [ScanFile(name=f"{path}#{n + 1}", path=path, station=n) for n in range(count)]
 
 
 def with_carrier(
@@ -76,7 +105,7 @@ def with_carrier(
 
 def _returns(file: ScanFile, *, max_points: int) -> Floats:
     """Return the points (N, 3) of a file, metres, sensor frame; nothing else of it is held. Raises ScanError."""
-    scan = read_scan(file.path, name=file.name, max_points=max_points)
+    scan = read_scan(file.path, name=file.name, max_points=max_points, station=file.station)
     return transformed(scan.points, inverse(scan.sensor_pose))
 
 

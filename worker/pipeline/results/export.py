@@ -6,11 +6,12 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from worker.cloud.formats.laz import write_laz
 from worker.cloud.formats.ply import SCALAR, write_ply
 from worker.cloud.tiling import tile_id
 from worker.cloud.types import Bools, Colors, Points
@@ -107,32 +108,70 @@ def _rounded(corner: NDArray[np.float64]) -> tuple[float, float, float]:
     return x, y, z
 
 
-def write_coloured_cloud(path: Path, reference: Points, current: Points, changes: ChangeSet) -> None:
-    """Write the survey's fused cloud (N, 3), map frame, as coloured PLY; with objects also what the map (M, 3) lost.
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ColouredCloud:
+    """The survey's fused cloud with what was found of each point; with objects also what the map lost. Map frame."""
 
-    Scalar fields, each with `scalar_` before its name in the file and told of in its header: `change_score` (float; NaN
-    where not scored; as `quality` too, for MeshLab) and `tile_state` (uchar; TileState, or 255 outside every tile). A detector of tiles alone colours each point by its tile's state. Where there are objects the score
-    is the point's own, each point is coloured by its `kind` (uchar; PointKind), and `object_id` (int) is the number
-    of its object, 0 where it is of none.
-    """
-    if changes.voxels is None or changes.objects is None:
-        state, score = _of_tiles(current, changes)
-        colors = _colors(STATE_COLORS)[state]
-        scalars: dict[str, NDArray[Any]] = {"change_score": score, "tile_state": state}
-        write_ply(path, current, colors=colors, scalars=scalars, quality=score, comments=_legend(scalars))
-        return
-    told = [
-        _survey_points(current, changes.voxels, changes.objects),
-        _lost_points(reference, changes.voxels, changes.objects),
-    ]
-    points = np.concatenate([points for points, _, _, _ in told])
-    kind = np.concatenate([kind for _, kind, _, _ in told])
-    score = np.concatenate([score for _, _, score, _ in told])
-    number = np.concatenate([number for _, _, _, number in told])
-    state, _ = _of_tiles(points, changes)
-    scalars = {"change_score": score, "tile_state": state, "kind": kind, "object_id": number}
-    colors = _colors(KIND_COLORS)[kind]
-    write_ply(path, points, colors=colors, scalars=scalars, quality=score, comments=_legend(scalars))
+    points: Points  #: (N, 3) float32, metres
+    colors: Colors  #: (N, 3) uint8
+    scalars: Mapping[str, NDArray[Any]]  #: (N,) each, by name
+
+    @classmethod
+    def of(cls, reference: Points, current: Points, changes: ChangeSet) -> Self:
+        """Colour the survey's cloud (N, 3) and, where there are objects, the points of the map (M, 3) that are lost.
+
+        Scalars: `change_score` (float; NaN where not scored) and `tile_state` (uint8; TileState, or 255 outside every
+        tile). A detector of tiles alone colours each point by its tile's state. Where there are objects the score is
+        the point's own, each point is coloured by its `kind` (uint8; PointKind), and `object_id` (int) is the number of
+        its object, 0 where it is of none.
+        """
+        if changes.voxels is None or changes.objects is None:
+            state, score = _of_tiles(current, changes)
+            scalars: dict[str, NDArray[Any]] = {"change_score": score, "tile_state": state}
+            return cls(points=current, colors=_colors(STATE_COLORS)[state], scalars=scalars)
+        told = [
+            _survey_points(current, changes.voxels, changes.objects),
+            _lost_points(reference, changes.voxels, changes.objects),
+        ]
+        points = np.concatenate([points for points, _, _, _ in told])
+        kind = np.concatenate([kind for _, kind, _, _ in told])
+        score = np.concatenate([score for _, _, score, _ in told])
+        number = np.concatenate([number for _, _, _, number in told])
+        state, _ = _of_tiles(points, changes)
+        scalars = {"change_score": score, "tile_state": state, "kind": kind, "object_id": number}
+        return cls(points=points, colors=_colors(KIND_COLORS)[kind], scalars=scalars)
+
+    def write_ply(self, path: Path) -> None:
+        """Write it as PLY: each scalar with `scalar_` before its name, told of in the header.
+
+        `change_score` is there as `quality` too, for MeshLab.
+        """
+        write_ply(
+            path,
+            self.points,
+            colors=self.colors,
+            scalars=self.scalars,
+            quality=self.scalars["change_score"],
+            comments=_legend(self.scalars),
+        )
+
+    def write_laz(self, path: Path) -> None:
+        """Write it as LAZ: each scalar as extra bytes, colours of 16 bits."""
+        write_laz(path, self.points, colors=self.colors, scalars=self.scalars, meanings=_IN_SHORT)
+
+
+def write_coloured_cloud(path: Path, reference: Points, current: Points, changes: ChangeSet) -> None:
+    """Write the survey's fused cloud (N, 3), map frame, as coloured PLY; with objects also what the map (M, 3) lost."""
+    ColouredCloud.of(reference, current, changes).write_ply(path)
+
+
+#: What a scalar is, in the 31 letters that a LAS has for it; architecture.md has the numbers.
+_IN_SHORT = {
+    "change_score": "probability, NaN: not scored",
+    "tile_state": "0 same 1 changed 2 odd 3 unseen",
+    "kind": "0 same 1 new 2 gone 3 ? 4 moved",
+    "object_id": "number of the object, 0: none",
+}
 
 
 def _legend(names: Collection[str]) -> list[str]:

@@ -26,6 +26,7 @@ WIDEST, HIGHEST, NARROWEST = 11.0, 9.0, 6.5  #: inches of the map's part of the 
 
 _PIXEL = 0.05  # metres, or more where the picture would have too many
 _MOST_PIXELS = 4000  # along a side
+_AT_ONCE = 1_000_000  # points that are counted together
 _DARKEST_WALL = 0.5  # grey of the map, so that ink on it is seen at once
 
 
@@ -105,12 +106,15 @@ def draw_walls(axes: Axes, reference: Points, current: Points, extent: Extent, *
 
 def standing(points: Points, floor: float, extent: Extent) -> NDArray[np.float64]:
     """Return (rows, columns) voxels from 15 cm to 2 m above the floor in each pixel."""
-    body = points[(points[:, 2] > floor + 0.15) & (points[:, 2] < floor + 2.0)]
     left, right, bottom, top = extent
     pixel = max(_PIXEL, (top - bottom) / _MOST_PIXELS, (right - left) / _MOST_PIXELS)
     bins = [round((top - bottom) / pixel), round((right - left) / pixel)]
-    counts, _, _ = np.histogram2d(body[:, 1], body[:, 0], bins=bins, range=[[bottom, top], [left, right]])
-    return np.asarray(counts, np.float64)
+    counts = np.zeros(bins)
+    for start in range(0, len(points), _AT_ONCE):
+        some = points[start : start + _AT_ONCE]
+        body = some[(some[:, 2] > floor + 0.15) & (some[:, 2] < floor + 2.0)]
+        counts += np.histogram2d(body[:, 1], body[:, 0], bins=bins, range=[[bottom, top], [left, right]])[0]
+    return counts
 
 
 def _near(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:

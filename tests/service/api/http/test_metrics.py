@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from datetime import timedelta
 
 import pytest
@@ -12,7 +13,7 @@ from sqlalchemy import text, update
 from service.api.http.problems import PROBLEMS
 from service.catalog import tables, tallies
 from service.catalog.catalog import Catalog
-from service.queue import QueueState, Snapshot
+from service.queue import QueueState, Snapshot, step_id
 from tests.support.samples import RememberingQueue, add_map, add_survey, services_of
 
 
@@ -33,7 +34,7 @@ def set_job(catalog: Catalog, job_id: str, **values: object) -> None:
 
 
 def test_the_queue_has_a_depth_and_a_wait_since_the_step_was_due(
-    client: TestClient, catalog: Catalog
+    client: TestClient, catalog: Catalog, queue: RememberingQueue
 ) -> None:
     add_map(catalog)
     now = tables.now()
@@ -41,6 +42,9 @@ def test_the_queue_has_a_depth_and_a_wait_since_the_step_was_due(
     set_job(catalog, waits, step="register", due=now - timedelta(seconds=90), begun=None)
     _, runs = add_survey(catalog, ready=False, captured_at=now)
     since = now - timedelta(seconds=30)
+    queue.state = replace(
+        queue.state, taken=(step_id(runs, "score"),)
+    )  # else the service finds its worker gone
     set_job(catalog, runs, step="score", status="running", due=now - timedelta(seconds=200), begun=since)
     found = scraped(client)
     assert found["spicd_queue_depth", "survey", "geometry"] == 1

@@ -287,3 +287,13 @@ def test_an_address_with_a_slash_too_many_is_none_and_leads_nowhere(client: Test
     answer = client.request(method, "/maps/", headers={"Host": "127.0.0.1"}, follow_redirects=False)
     assert (answer.status_code, answer.json()["type"]) == (404, "urn:spicd:problem:not_found")
     assert "location" not in answer.headers
+
+
+def test_a_field_that_is_not_known_is_answered_with_those_that_are(client: TestClient) -> None:
+    asked = {"uri": "https://example.org/", "url": "https://example.org/"}
+    answer = problem(client.post("/webhooks", json=asked), 422, "invalid_request")
+    assert answer["errors"][0]["place"] == "body.uri"
+    assert answer["errors"][0]["detail"] == "there is no such field; there are map, types, url"
+    use = {"scan_ids": [], "scans": [{"scan_id": "scan-1", "poze": []}]}
+    answer = problem(client.post("/maps", json=use), 422, "invalid_request")
+    assert answer["errors"][0]["detail"] == "there is no such field"

@@ -39,7 +39,8 @@ def lobby(client: TestClient, catalog: Catalog) -> str:
     """A map with its files, and a survey with a cloud; the id of the survey."""
     job_id = add_map(catalog)
     survey_id, _ = add_survey(catalog, [tile(i, 0) for i in range(20)])
-    for key in (blob_keys.map_cloud(job_id), blob_keys.survey_cloud(survey_id)):
+    files = (blob_keys.map_cloud(job_id), blob_keys.map_laz(job_id))
+    for key in (*files, blob_keys.survey_cloud(survey_id), blob_keys.survey_laz(survey_id)):
         catalog.blobs.put_bytes(key, CLOUD)
     catalog.blobs.put_bytes(blob_keys.survey_picture(survey_id), b"\x89PNG" + bytes(5000))
     catalog.blobs.put_bytes(blob_keys.map_manifest(job_id), MANIFEST)
@@ -57,8 +58,10 @@ PATHS = (
     "/surveys/{}",
     "/surveys/{}/tiles",
     "/surveys/{}/cloud.ply",
+    "/surveys/{}/cloud.laz",
     "/surveys/{}/picture.png",
     "/maps/lobby/cloud.ply",
+    "/maps/lobby/cloud.laz",
     "/maps/lobby/manifest",
     "/models",
     "/openapi.json",

@@ -52,6 +52,18 @@ def test_a_file_may_be_asked_for_again_by_its_etag(client: TestClient, catalog: 
     assert answer.headers["Cache-Control"] == "private, no-cache"
 
 
+@pytest.mark.parametrize("path", ["/", "/docs", "/redoc"])
+def test_a_page_that_is_asked_for_again_keeps_the_policy_that_it_came_with(
+    client: TestClient, path: str
+) -> None:
+    """What a 304 says takes the place of what a browser has kept (RFC 9111, Section 4.3.4)."""
+    asked = {"Accept": "text/html"}
+    page = client.get(path, headers=asked)
+    again = client.get(path, headers={**asked, "If-None-Match": page.headers["ETag"]})
+    assert again.status_code == 304
+    assert again.headers["Content-Security-Policy"] == page.headers["Content-Security-Policy"]
+
+
 @pytest.mark.parametrize("path", ["/docs", "/redoc"])
 def test_the_pages_run_the_scripts_that_they_hold_and_no_other(client: TestClient, path: str) -> None:
     page = client.get(path)

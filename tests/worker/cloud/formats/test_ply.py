@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
+from worker.cloud.formats import ply as module
 from worker.cloud.formats.ply import write_ply
 from worker.cloud.formats.scan import read_scan
 from worker.errors import ScanError, ScanTooLarge
@@ -225,3 +226,12 @@ def test_write_ply_refuses_a_comment_that_would_make_a_broken_header(tmp_path, c
     with pytest.raises(ValueError, match="one line of ASCII"):
         write_ply(tmp_path / "made.ply", CORNERS, comments=[comment])
     assert list(tmp_path.iterdir()) == []
+
+
+def test_write_ply_in_pieces_gives_the_same_file(tmp_path, monkeypatch):
+    points = np.random.default_rng(0).normal(size=(100, 3)).astype(np.float32)
+    colors, scalars = np.arange(300).reshape(100, 3).astype(np.uint8), {"n": np.arange(100)}
+    write_ply(tmp_path / "whole.ply", points, colors=colors, scalars=scalars)
+    monkeypatch.setattr(module, "_AT_ONCE", 7)
+    write_ply(tmp_path / "pieces.ply", points, colors=colors, scalars=scalars)
+    assert (tmp_path / "pieces.ply").read_bytes() == (tmp_path / "whole.ply").read_bytes()

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from tests.support.clouds import write_e57, write_las
 from worker.cloud.formats.pcd import write_pcd
 from worker.cloud.formats.ply import write_ply
 from worker.cloud.formats.scan import Scan, read_scan
@@ -117,6 +118,30 @@ def test_room_808_with_nan_and_inf_keeps_the_others_in_order(shared_data):
     assert not np.isin(rows, np.arange(0, N_808, 10)).any() and 5 not in rows
 
 
+REAL = (ROOM_808, "room_scan/room_scan1.pcd", "corridor_pair/cloud_0.ply", "floor/geb079_occ.ply")
+
+
+@pytest.mark.parametrize("name", REAL)
+def test_a_real_scan_is_the_same_as_e57_and_to_the_millimetre_as_las_and_laz(shared_data, tmp_path, name):
+    known = read_scan(shared_data / name)
+    colors = None if known.colors is None else [known.colors]
+    exact = read_scan(write_e57(tmp_path / "a.e57", [known.points], colors=colors))
+    assert_array_equal(exact.points, known.points)
+    assert (exact.colors is None) == (known.colors is None)
+    for path in (tmp_path / "a.las", tmp_path / "a.laz"):
+        read = read_scan(write_las(path, known.points.astype(np.float64)))
+        assert_allclose(read.points, known.points, atol=6e-4)
+
+
+def test_missing_returns_of_a_kinect_are_dropped_and_counted_as_e57(shared_data, tmp_path):
+    frame = read_scan(shared_data / "kinect_pairwise/capture0001.pcd")
+    points = np.concatenate([np.zeros((frame.n_dropped, 3)), frame.points])
+    invalid = 2 * (np.arange(len(points)) < frame.n_dropped)
+    scan = read_scan(write_e57(tmp_path / "a.e57", [points], invalid=invalid))
+    assert (scan.n_dropped, len(scan.points)) == (57_553, 249_647)
+    assert_array_equal(scan.points, frame.points)
+
+
 def test_a_kinect_frame_is_the_same_packed_and_plain_and_looks_along_a_turned_sensor(shared_data):
     packed = read_scan(shared_data / "kinect_pairwise/capture0001.pcd")
     plain = read_scan(shared_data / "formats/capture0001_nan_binary.pcd")
@@ -135,8 +160,8 @@ def test_the_format_is_told_by_content_not_by_the_ending(tmp_path):
 
 def test_a_file_of_another_kind_is_refused(tmp_path):
     path = tmp_path / "scan.ply"
-    path.write_bytes(b"LASF\x00\x00\x00\x00 and more")
-    with pytest.raises(ScanError, match=r"^scan.ply: neither PLY nor PCD, it starts with b'LASF"):
+    path.write_bytes(b"glTF\x02\x00\x00\x00 and more")
+    with pytest.raises(ScanError, match=r"^scan.ply: neither PLY, PCD, E57 nor LAS, it starts with b'glTF"):
         read_scan(path)
 
 

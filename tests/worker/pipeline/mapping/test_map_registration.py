@@ -337,13 +337,13 @@ def test_a_file_that_is_no_scan_is_named_and_left_out(
     assert set(poses_of(found)) == {0, 1, 2} - {place_of_it}
     reason = found.outcomes[place_of_it].reason
     assert reason is not None
-    assert reason.startswith("broken scan.ply: neither PLY nor PCD")
+    assert reason.startswith("broken scan.ply: neither PLY, PCD, E57 nor LAS")
 
 
 def test_where_no_file_is_a_scan_the_first_is_named(tmp_path: Path) -> None:
     (tmp_path / "x.bin").write_bytes(b"nothing like a scan")
     files = [ScanFile(name=name, path=tmp_path / "x.bin") for name in ("one.ply", "two.ply")]
-    with pytest.raises(ScanError, match=r"^one\.ply: neither PLY nor PCD"):
+    with pytest.raises(ScanError, match=r"^one\.ply: neither PLY, PCD, E57 nor LAS"):
         register(files)
 
 
@@ -368,7 +368,9 @@ def test_a_bare_plane_makes_no_map(tmp_path: Path) -> None:
 def test_where_nothing_holds_a_pose_every_reason_is_told(tmp_path: Path) -> None:
     (tmp_path / "x.bin").write_bytes(b"nothing like a scan")
     files = [bare_plane(tmp_path / "plane.pcd"), ScanFile(name="x.ply", path=tmp_path / "x.bin")]
-    with pytest.raises(MapFailed, match=r"plane\.pcd: its surfaces leave.*; x\.ply: neither PLY nor PCD"):
+    with pytest.raises(
+        MapFailed, match=r"plane\.pcd: its surfaces leave.*; x\.ply: neither PLY, PCD, E57 nor LAS"
+    ):
         register(files)
 
 

@@ -152,3 +152,21 @@ def test_a_small_area_is_told_to_be_little(hall: Scan) -> None:
     (found,) = oddities(scan, prepare(scan, SETTINGS))
     assert (found.reason, "square metres of surfaces" in found.detail) == ("little_coverage", True)
     assert found.numbers["area"] == pytest.approx(3 * 1.08**2, rel=0.1)
+
+
+def test_a_scan_that_an_offset_was_taken_off_has_no_place_of_its_sensor_and_both_are_told(hall: Scan) -> None:
+    moved = replace(hall, offset=np.array([412_300.0, 5_654_300.0, 100.0]), tells_sensor=False)
+    assert prepare(moved, SETTINGS).origin is None  # though all points can be seen from the new origin
+    found = {one.reason: one for one in oddities(moved, prepare(moved, SETTINGS))}
+    assert set(found) == {"offset_taken_off", "no_sensor_place"}
+    assert found["offset_taken_off"].numbers == {"x": 412_300, "y": 5_654_300, "z": 100}
+    assert "(412300, 5654300, 100) m was taken off" in found["offset_taken_off"].detail
+
+
+def test_of_a_format_that_tells_no_sensor_it_is_told_where_the_points_contradict_the_origin(
+    hall: Scan,
+) -> None:
+    assert told(replace(hall, tells_sensor=False)) == {}
+    outside = replace(hall, points=hall.points + np.array([20, 0, 0], np.float32))
+    assert "no_sensor_place" not in told(outside)
+    assert set(told(replace(outside, tells_sensor=False))) == {"no_sensor_place"}

@@ -4,9 +4,11 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import laspy
 import numpy as np
 import open3d as o3d
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from tests.support.tilings import ORIGIN, four_states, in_tile
 from tests.support.tools import TESTS, needs_tools, run
@@ -18,6 +20,7 @@ from worker.pipeline.results.export import (
     KIND_COLORS,
     NOT_IN_A_TILE,
     STATE_COLORS,
+    ColouredCloud,
     PointKind,
     tile_results,
     write_coloured_cloud,
@@ -226,3 +229,15 @@ def test_there_is_a_result_for_every_tile() -> None:
         "inconsistent",
         "unobserved",
     ]
+
+
+def test_as_laz_the_cloud_has_the_same_points_colours_and_scalars(tmp_path: Path, by_voxels: Path) -> None:
+    cloud = ColouredCloud.of(*_by_voxels())
+    cloud.write_laz(tmp_path / "voxels.laz")
+    las, ply = laspy.read(tmp_path / "voxels.laz"), o3d.t.io.read_point_cloud(by_voxels).point
+    assert_allclose(las.xyz, ply["positions"].numpy(), atol=5.1e-4)
+    assert_array_equal(np.stack([las.red, las.green, las.blue], axis=1) // 257, ply["colors"].numpy())
+    for name in ("change_score", "tile_state", "kind", "object_id"):
+        assert_array_equal(las[name], ply[f"scalar_{name}"].numpy().ravel())
+        described = las.point_format.dimension_by_name(name).description
+        assert described.rstrip("\0")

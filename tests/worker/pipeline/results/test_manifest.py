@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from service.api.manifests import Manifest
 from tests.support.tilings import grid_of, in_tile
 from worker.cloud.tiling import TileGrid, cut, grown
 from worker.pipeline.results.manifest import manifest
@@ -32,6 +33,10 @@ def listing() -> dict[str, Any]:
 def test_the_fields_are_those_of_table_a1_and_where_the_grid_begins(listing: dict[str, Any]) -> None:
     assert set(listing) == FIELDS | {"tile_origin", "tile_lowest_idx"}
     assert all(set(patch) == PATCH_FIELDS for patch in listing["patches"])
+
+
+def test_the_api_describes_it_as_it_is(listing: dict[str, Any]) -> None:
+    assert Manifest.model_validate(listing).model_dump(mode="json") == listing
 
 
 def test_sizes_stand_as_given(listing: dict[str, Any]) -> None:

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
-from worker.pipeline.results.sheet import LeftOut, left_out_lines
+import numpy as np
+import pytest
+
+from worker.pipeline.results import sheet
+from worker.pipeline.results.sheet import LeftOut, left_out_lines, standing
 
 WIDTH = 7.6  # inches
 
@@ -27,3 +31,11 @@ def test_of_many_scans_those_that_have_no_room_are_counted() -> None:
     shown = line.count("other place")
     assert line.endswith(f", and {40 - shown} more")
     assert len(line) < WIDTH * 15
+
+
+def test_points_of_a_large_cloud_are_counted_some_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    points = np.random.default_rng(0).uniform(0, 3, (5000, 3)).astype(np.float32)
+    whole = standing(points, 0.0, (0.0, 3.0, 0.0, 3.0))
+    assert 0 < whole.sum() < 5000  # neither the floor nor what is above the head
+    monkeypatch.setattr(sheet, "_AT_ONCE", 333)
+    assert np.array_equal(standing(points, 0.0, (0.0, 3.0, 0.0, 3.0)), whole)

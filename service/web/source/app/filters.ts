@@ -1,0 +1,85 @@
+/** Which items the list and the scene show. */
+
+import type { Item } from "./items.ts";
+
+export interface Filters {
+  kinds: string[]; // empty: all
+  statuses: string[]; // empty: all
+  device: string; // empty: all
+  since: string; // "", "today", "monday", "7d", "30d", or a day as 2026-03-01
+  minScore: number; // 0..1
+  inSection: boolean; // only what the section shows
+}
+
+export const NO_FILTERS: Filters = { kinds: [], statuses: [], device: "", since: "", minScore: 0, inSection: false };
+
+export const PERIODS: readonly (readonly [string, string])[] = [
+  ["", "any time"],
+  ["today", "today"],
+  ["monday", "since Monday"],
+  ["7d", "last 7 days"],
+  ["30d", "last 30 days"],
+];
+
+/** Return the instant at which a period begins, in local time; null where it has no beginning. */
+export function beginOf(since: string, now = new Date()): Date | null {
+  const day = new Date(now.getFullYear(), now.getMonth(), now.getDate());
+  if (since === "today") return day;
+  if (since === "monday") return daysBefore(day, (day.getDay() + 6) % 7);
+  const days = /^(\d{1,4})d$/.exec(since);
+  if (days) return new Date(now.getTime() - Number(days[1]) * 86_400_000);
+  const date = /^(\d{4})-(\d\d)-(\d\d)$/.exec(since);
+  return date ? new Date(Number(date[1]), Number(date[2]) - 1, Number(date[3])) : null;
+}
+
+function daysBefore(day: Date, days: number): Date {
+  return new Date(day.getFullYear(), day.getMonth(), day.getDate() - days);
+}
+
+/** Return the items that the filters let through; `section` is what the scene shows, metres above and below. */
+export function filtered(
+  items: readonly Item[],
+  filters: Filters,
+  section: readonly [number, number] | null = null,
+  now = new Date(),
+): Item[] {
+  const begin = beginOf(filters.since, now);
+  return items.filter(
+    (item) =>
+      (!filters.kinds.length || filters.kinds.some((kind) => isKind(item, kind))) &&
+      (!filters.statuses.length || item.status === null || filters.statuses.includes(item.status)) &&
+      (!filters.device || item.device === filters.device) &&
+      (!begin || new Date(item.firstSeen) >= begin) &&
+      item.probability >= filters.minScore &&
+      (!filters.inSection || !section || (item.box.max[2] > section[0] && item.box.min[2] < section[1])),
+  );
+}
+
+/** Tell whether an item is of a kind; a tile where things appeared and disappeared is of both. */
+function isKind({ kind }: Item, wanted: string): boolean {
+  return kind === wanted || (kind === "both" && (wanted === "appeared" || wanted === "disappeared"));
+}
+
+/** Count how many filters are set. */
+export function active(filters: Filters): number {
+  return [
+    filters.kinds.length,
+    filters.statuses.length,
+    filters.device,
+    filters.since,
+    filters.minScore,
+    filters.inSection,
+  ].filter(Boolean).length;
+}
+
+/** Return `chosen` with a value added, or without it where it was there. */
+export function toggled(chosen: readonly string[], value: string): string[] {
+  return chosen.includes(value) ? chosen.filter((one) => one !== value) : [...chosen, value];
+}
+
+/** Return the different values in a stable order, with how often each comes. */
+export function tally(values: readonly (string | null)[]): [string, number][] {
+  const counts = new Map<string, number>();
+  for (const value of values) if (value) counts.set(value, (counts.get(value) ?? 0) + 1);
+  return [...counts].sort(([one], [other]) => (one < other ? -1 : 1));
+}

@@ -1,0 +1,45 @@
+/** Starts the page. */
+
+import "./styles/main.css";
+
+import { h, render } from "preact";
+
+import { Api } from "./api.ts";
+import { Controller } from "./controller.ts";
+import { listen } from "./keys.ts";
+import { listenForDrops } from "./drops.ts";
+import { drawing, shownTheme, Stage } from "./stage.ts";
+import { Page } from "./views/page.tsx";
+
+import { KIND_COLOURS, STATE_COLOURS } from "../scene/colours.ts";
+import type { Scene } from "../scene/scene.ts";
+
+declare global {
+  interface Window {
+    spicd?: { scene: Scene };
+  }
+}
+
+for (const [name, colour] of Object.entries({ ...STATE_COLOURS, ...KIND_COLOURS })) {
+  document.documentElement.style.setProperty(`--${name}`, colour);
+}
+
+const root = document.createElement("div");
+root.id = "app";
+document.body.append(root);
+
+const app = new Controller(new Api(document.baseURI), (state) => {
+  document.documentElement.dataset["theme"] = shownTheme(state);
+  const name = state.map.value?.name ?? state.place.map;
+  document.title = name ? `${name} · SPICD` : "SPICD";
+  render(h(Page, { app, stage, state }), root);
+  stage.sync(state);
+});
+const stage = new Stage(app);
+
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => app.update({}));
+listen(app, stage);
+listenForDrops(app);
+if (app.state.place.map) drawing().catch(() => {}); // the stage says why, if it cannot
+app.update({});
+app.start();

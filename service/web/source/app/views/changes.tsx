@@ -1,0 +1,234 @@
+/** The list of what changed, with its filters. */
+
+import { Fragment, h } from "preact";
+
+import { active, NO_FILTERS, PERIODS, tally, toggled, type Filters } from "../filters.ts";
+import { ago, count, instant, percent } from "../format.ts";
+import { whereOf, type Item } from "../items.ts";
+import { allItems, focusOf, jobOf, shownItems, type State } from "../state.ts";
+import { KINDS, sayingOf, STATUSES } from "../words.ts";
+import { newUpload, type Props } from "./page.tsx";
+import { Empty, Kind, Problem, Waiting } from "./parts.tsx";
+
+export function Changes(props: Props) {
+  const { app, state } = props;
+  const { place } = state;
+  const items = shownItems(state);
+  const set = active(place.filters);
+  return (
+    <>
+      <div class="list-head">
+        <div class="segments" role="group" aria-label="What is listed">
+          <button aria-pressed={place.list === "objects"} onClick={() => app.go({ list: "objects" })}>
+            Objects
+          </button>
+          <button aria-pressed={place.list === "tiles"} onClick={() => app.go({ list: "tiles" })}>
+            Tiles
+          </button>
+        </div>
+        <button aria-expanded={state.filtersOpen} aria-controls="filters" onClick={() => app.update({ filtersOpen: !state.filtersOpen })}>
+          {set ? `Filters (${set})` : "Filters"}
+        </button>
+      </div>
+      {state.filtersOpen && <FilterForm {...props} />}
+      <p class="list-count" role="status" aria-live="polite">
+        {words(state, items)}
+      </p>
+      <List {...props} items={items} />
+    </>
+  );
+}
+
+/** Say how many are listed, of which survey. */
+function words(state: State, items: readonly Item[]): string {
+  const { place } = state;
+  const all = allItems(state).length;
+  const noun = place.list === "tiles" ? "changed tile" : "object";
+  const number = items.length === all ? count(all, noun) : `${items.length} of ${count(all, noun)}`;
+  const chosen = place.survey && state.surveys.value?.find(({ survey_id }) => survey_id === place.survey);
+  return `${number} ${chosen ? `in the survey of ${instant(chosen.captured_at)}` : "over all surveys"}`;
+}
+
+function List({ app, state, items }: Props & { items: readonly Item[] }) {
+  const source = sourceOf(state);
+  if (source.problem) return <Problem problem={source.problem} again={() => app.jobsChanged()} />;
+  if (!items.length) return source.value ? <NoItems app={app} state={state} /> : <NothingYet app={app} state={state} />;
+  return (
+    <ul
+      class="items"
+      id="items"
+      role="listbox"
+      aria-label="What changed"
+      tabIndex={0}
+      aria-activedescendant={state.place.item ? rowId(state.place.item) : undefined}
+    >
+      {items.map((item) => (
+        <Row key={item.id} item={item} chosen={item.id === state.place.item} choose={() => app.go({ item: item.id, view: null })} />
+      ))}
+    </ul>
+  );
+}
+
+function sourceOf({ place, changes, sightings, objects }: State) {
+  if (place.list === "tiles") return changes;
+  return place.survey ? sightings : objects;
+}
+
+export function rowId(item: string): string {
+  return `item-${item.replace(/\W/g, "_")}`;
+}
+
+function Row({ item, chosen, choose }: { item: Item; chosen: boolean; choose: () => void }) {
+  const faint = item.status === "gone_again" || item.status === "accepted";
+  return (
+    <li id={rowId(item.id)} role="option" aria-selected={chosen} class={`item ${faint ? "item-faint" : ""}`} onClick={choose}>
+      <Kind kind={item.kind} />
+      <span class="item-title">
+        <strong>{KINDS[item.kind] ?? item.kind}</strong> {item.title}
+      </span>
+      <span class="item-score" title="probability of change">
+        {percent(item.probability)}
+      </span>
+      <span class="item-more">
+        {item.status && <span class={`status status-${item.status}`}>{STATUSES[item.status]?.[0] ?? item.status}</span>}
+        {item.history?.transient && <span class="status">comes and goes</span>}
+        <span title={ago(item.firstSeen)}>since {instant(item.firstSeen)}</span>
+        <span>{whereOf(item)}</span>
+        {item.device && <span>{item.device}</span>}
+      </span>
+    </li>
+  );
+}
+
+/** Nothing is listed: because of filters, because nothing changed, or because nothing could be said. */
+function NoItems({ app, state }: Pick<Props, "app" | "state">) {
+  if (allItems(state).length) {
+    return (
+      <Empty title="The filters hide everything.">
+        <button onClick={() => app.go({ filters: NO_FILTERS })}>Clear the filters</button>
+      </Empty>
+    );
+  }
+  return <NothingYet app={app} state={state} />;
+}
+
+function NothingYet({ app, state }: Pick<Props, "app" | "state">) {
+  const { place, surveys } = state;
+  if (!surveys.value) return <Waiting>Asking for the surveys…</Waiting>;
+  if (!surveys.value.length) {
+    return (
+      <Empty title="No survey yet.">
+        <p>Nothing has been compared with this map. Drop the scans of a later visit anywhere on the page, or choose them:</p>
+        <button class="primary" onClick={() => app.update({ upload: newUpload(place.map) })}>
+          Add a survey
+        </button>
+      </Empty>
+    );
+  }
+  if (sourceOf(state).busy) return <Waiting>Asking for what changed…</Waiting>;
+  const survey = place.survey ? surveys.value.find(({ survey_id }) => survey_id === place.survey) : focusOf(state);
+  if (!survey) return <Empty title={place.survey ? "There is no such survey of this map." : "No survey has a result yet."} />;
+  const { long, more } = sayingOf(survey, jobOf(state, survey.job_id));
+  if (survey.status === "ready" && !survey.objects && place.list === "objects" && survey.placement?.state !== "in_doubt") {
+    return (
+      <Empty title={`${survey.model} tells tiles, and no objects.`}>
+        <button onClick={() => app.go({ list: "tiles" })}>List the changed tiles</button>
+      </Empty>
+    );
+  }
+  return (
+    <Empty title={place.survey ? long : `The latest survey with a result, ${instant(survey.captured_at)}: ${long}`}>
+      {more && <p>{more}</p>}
+      {survey.status === "failed" && <button onClick={() => app.go({ survey: survey.survey_id, tab: "survey" })}>Why, scan by scan</button>}
+    </Empty>
+  );
+}
+
+function FilterForm({ app, state }: Props) {
+  const { filters } = state.place;
+  const all = allItems(state);
+  const set = (change: Partial<Filters>) => app.go({ filters: { ...filters, ...change } });
+  const devices = tally((state.surveys.value ?? []).map(({ device_id }) => device_id)).map(([name]) => name);
+  return (
+    <form id="filters" class="filters" onSubmit={(event) => event.preventDefault()}>
+      <Choices legend="Kind" chosen={filters.kinds} known={tally(all.map(({ kind }) => kind))} word={(kind) => KINDS[kind] ?? kind} pick={(kinds) => set({ kinds })} />
+      {state.place.list === "objects" && !state.place.survey && (
+        <Choices
+          legend="Status"
+          chosen={filters.statuses}
+          known={tally(all.map(({ status }) => status))}
+          word={(status) => STATUSES[status]?.[0] ?? status}
+          pick={(statuses) => set({ statuses })}
+        />
+      )}
+      <label>
+        First seen
+        <select value={isDay(filters.since) ? "day" : filters.since} onChange={({ currentTarget }) => set({ since: currentTarget.value === "day" ? today() : currentTarget.value })}>
+          {PERIODS.map(([value, word]) => (
+            <option value={value}>{word}</option>
+          ))}
+          <option value="day">since a day…</option>
+        </select>
+        {isDay(filters.since) && (
+          <input type="date" aria-label="First seen since" value={filters.since} onChange={({ currentTarget }) => set({ since: currentTarget.value })} />
+        )}
+      </label>
+      {devices.length > 0 && (
+        <label>
+          Device
+          <select value={filters.device} onChange={({ currentTarget }) => set({ device: currentTarget.value })}>
+            <option value="">any</option>
+            {devices.map((device) => (
+              <option value={device}>{device}</option>
+            ))}
+          </select>
+        </label>
+      )}
+      <label>
+        Probability at least {percent(filters.minScore)}
+        <input type="range" min={0} max={0.95} step={0.05} value={filters.minScore} onInput={({ currentTarget }) => set({ minScore: Number(currentTarget.value) })} />
+      </label>
+      <label class="check">
+        <input type="checkbox" checked={filters.inSection} onChange={({ currentTarget }) => set({ inSection: currentTarget.checked })} />
+        only at the heights that are shown, such as one floor
+      </label>
+      {active(filters) > 0 && (
+        <button type="button" onClick={() => set(NO_FILTERS)}>
+          Clear
+        </button>
+      )}
+    </form>
+  );
+}
+
+interface ChoicesProps {
+  legend: string;
+  chosen: string[];
+  known: [string, number][];
+  word: (value: string) => string;
+  pick: (values: string[]) => void;
+}
+
+function Choices({ legend, chosen, known, word, pick }: ChoicesProps) {
+  const missing = chosen.filter((value) => !known.some(([name]) => name === value)).map((value): [string, number] => [value, 0]);
+  return (
+    <fieldset class="choices">
+      <legend>{legend}</legend>
+      {[...known, ...missing].map(([value, number]) => (
+        <label class="choice">
+          <input type="checkbox" checked={chosen.includes(value)} onChange={() => pick(toggled(chosen, value))} />
+          {word(value)} <span class="number">{number}</span>
+        </label>
+      ))}
+    </fieldset>
+  );
+}
+
+function isDay(since: string): boolean {
+  return /^\d{4}-/.test(since);
+}
+
+function today(): string {
+  const now = new Date();
+  return [now.getFullYear(), now.getMonth() + 1, now.getDate()].map((part) => String(part).padStart(2, "0")).join("-");
+}

@@ -1,0 +1,121 @@
+/** The page: its head, the list of maps or one map, and what lies over it. */
+
+import { h } from "preact";
+
+import type { Controller } from "../controller.ts";
+import { shownTheme, type Stage } from "../stage.ts";
+import type { State, Theme } from "../state.ts";
+import { Dialogs } from "./dialogs.tsx";
+import { MapPage } from "./map.tsx";
+import { MapsPage } from "./maps.tsx";
+import { UploadDialog } from "./upload.tsx";
+
+export interface Props {
+  app: Controller;
+  stage: Stage;
+  state: State;
+}
+
+export function Page(props: Props) {
+  const { state } = props;
+  return (
+    <div class={`page ${state.place.embed ? "embedded" : ""}`}>
+      <a class="skip" href="#main" onClick={(event) => focusMain(event)}>
+        Skip to the content
+      </a>
+      <Head {...props} />
+      {state.place.map ? <MapPage {...props} /> : <MapsPage {...props} />}
+      <div class="notices" role="status" aria-live="polite">
+        {state.notice && <p class={`notice ${state.notice.tone}`}>{state.notice.text}</p>}
+      </div>
+      <UploadDialog {...props} />
+      <Dialogs {...props} />
+    </div>
+  );
+}
+
+function focusMain(event: Event): void {
+  event.preventDefault();
+  document.getElementById("main")?.focus();
+}
+
+const LINES = {
+  live: ["Live", "Changes show by themselves"],
+  polling: ["Live", "Changes show by themselves; something in between holds streams back, so the page asks again and again"],
+  offline: ["No connection", "The service does not answer; the page tries again by itself"],
+} as const;
+
+function Head({ app, state }: Props) {
+  const { map, place, line } = state;
+  const [word, title] = line ? LINES[line] : ["Connecting", "Asking the service"];
+  const name = map.value?.name ?? place.map;
+  return (
+    <header class="head">
+      <nav aria-label="Where you are">
+        <a class="brand" href="#" onClick={(event) => follow(event, () => app.open(null))}>
+          SPICD
+        </a>
+        {place.map && (
+          <span class="crumb">
+            <span aria-hidden="true">/</span> <h1>{name}</h1>
+          </span>
+        )}
+      </nav>
+      <span class={`line line-${line ?? "none"}`} role="status" title={title}>
+        {word}
+      </span>
+      <div class="actions">
+        {place.map && map.value?.status === "ready" && (
+          <button aria-label="Add survey" onClick={() => app.update({ upload: newUpload(place.map) })}>
+            Add<span class="wide-only"> survey</span>
+          </button>
+        )}
+        {!place.map && <button onClick={() => app.update({ upload: newUpload(null) })}>New map</button>}
+        {place.map && <button onClick={() => share(app)}>Share</button>}
+        <ThemeButton app={app} state={state} />
+        {state.hasKey && <button onClick={() => app.useKey(null)}>Forget key</button>}
+        <button aria-label="Keys and help" title="Keys and help (?)" onClick={() => app.update({ dialog: "help" })}>
+          ?
+        </button>
+      </div>
+    </header>
+  );
+}
+
+/** Switches between light and dark; on a small screen it is among the keys and help. */
+export function ThemeButton({ app, state, always }: Pick<Props, "app" | "state"> & { always?: boolean }) {
+  return (
+    <button type="button" class={always ? "" : "wide-only"} title={themeTitle(state.theme)} onClick={() => app.useTheme(nextTheme(state))}>
+      {shownTheme(state) === "dark" ? "Light" : "Dark"}
+    </button>
+  );
+}
+
+/** Do in the page what a link stands for; a new tab stays a new tab. */
+export function follow(event: MouseEvent, act: () => void): void {
+  if (event.metaKey || event.ctrlKey || event.shiftKey || event.button) return;
+  event.preventDefault();
+  act();
+}
+
+export function newUpload(map: string | null): State["upload"] {
+  return { map, files: [], refused: [], phase: "choosing", problem: null };
+}
+
+/** Copy the address of what is shown; where the browser does not let it, show it. */
+export async function share(app: Controller): Promise<void> {
+  try {
+    await navigator.clipboard.writeText(location.href);
+    app.tell("The link to this view is copied.");
+  } catch {
+    app.update({ dialog: "share" });
+  }
+}
+
+export function nextTheme(state: State): Theme {
+  return shownTheme(state) === "dark" ? "light" : "dark";
+}
+
+function themeTitle(theme: Theme): string {
+  return theme === "system" ? "Light or dark as the system has it; press to switch (d)" : `Chosen: ${theme} (d switches)`;
+}

@@ -1,0 +1,116 @@
+/** Small parts that every view uses. */
+
+import { Fragment, h, type ComponentChildren } from "preact";
+
+import type { Controller } from "../controller.ts";
+import type { ProblemDocument, ScanWarning } from "../documents.ts";
+import { percent } from "../format.ts";
+import { adviceOn, capital, REASONS } from "../words.ts";
+
+/** Show an error in the service's own words, and what to do about it. */
+export function Problem({ problem, again }: { problem: ProblemDocument; again?: () => void }) {
+  const advice = adviceOn(problem);
+  return (
+    <div class="problem" role="alert">
+      <strong>{problem.title}</strong>
+      <p>{capital(problem.detail)}</p>
+      {problem.errors?.map(({ place, detail }) => (
+        <p>
+          <code>{place}</code>: {detail}
+        </p>
+      ))}
+      {advice && <p class="advice">{advice}</p>}
+      {problem.instance && (
+        <p>
+          Named in the service's log: <code>{problem.instance}</code>
+        </p>
+      )}
+      {again && <button onClick={again}>Try again</button>}
+    </div>
+  );
+}
+
+/** Show what is odd about a scan or a survey. */
+export function Warnings({ warnings }: { warnings: readonly ScanWarning[] }) {
+  return (
+    <>
+      {warnings.map(({ reason, detail }) => (
+        <p class="warning">
+          <strong>{capital(REASONS[reason]?.[0] ?? reason)}.</strong> {capital(detail)}
+        </p>
+      ))}
+    </>
+  );
+}
+
+/** Show a share as a bar with its number. */
+export function Share({ value, label }: { value: number | null; label: string }) {
+  if (value === null) return <span class="faint">not told</span>;
+  return (
+    <span class="share">
+      <meter min={0} max={1} value={value} aria-label={label} />
+      {percent(value)}
+    </span>
+  );
+}
+
+/** Show a name with its value; nothing where there is no value. */
+export function Fact({ name, children, hint }: { name: string; children: ComponentChildren; hint?: string }) {
+  if (children === null || children === undefined || children === "") return null;
+  return (
+    <>
+      <dt title={hint}>{name}</dt>
+      <dd>{children}</dd>
+    </>
+  );
+}
+
+/** Show a dot in the colour of a kind, with a sign for who does not see colours. */
+export function Kind({ kind }: { kind: string }) {
+  return <span class={`kind kind-${kind}`} aria-hidden="true" />;
+}
+
+interface DownloadProps {
+  app: Controller;
+  path: string;
+  name: string; // of the file
+  children: ComponentChildren;
+}
+
+/** A link to a file; where a key is needed, which a plain link cannot bring, the page fetches the file. */
+export function Download({ app, path, name, children }: DownloadProps) {
+  const fetched = (event: Event) => {
+    event.preventDefault();
+    void app.attempt(async () => {
+      const link = document.createElement("a");
+      link.href = URL.createObjectURL(await (await app.api.fetch(path)).blob());
+      link.download = name;
+      link.click();
+      URL.revokeObjectURL(link.href);
+    });
+  };
+  return (
+    <a href={path} download={name} onClick={(event) => app.state.hasKey && fetched(event)}>
+      {children}
+    </a>
+  );
+}
+
+/** A place of the same size that says what is waited for. */
+export function Waiting({ children }: { children: ComponentChildren }) {
+  return (
+    <p class="waiting" role="status">
+      {children}
+    </p>
+  );
+}
+
+/** What is there where a list is empty: why, and what to do. */
+export function Empty({ title, children }: { title: string; children?: ComponentChildren }) {
+  return (
+    <div class="empty">
+      <strong>{title}</strong>
+      {children}
+    </div>
+  );
+}

@@ -1,0 +1,203 @@
+/** What is said of surveys, objects, scans and errors. Nothing found is never said where nothing was judged. */
+
+import { count, ordinal, percent, whole } from "./format.ts";
+import type { Counts, JobDocument, MapSummaryDocument, ProblemDocument, SurveySummaryDocument } from "./documents.ts";
+
+export type Tone = "changed" | "quiet" | "doubt" | "failed" | "running";
+
+export interface Saying {
+  tone: Tone;
+  short: string; // of two or three words
+  long: string; // a sentence
+  more?: string; // what has to be known beside it
+}
+
+export const KINDS: Record<string, string> = {
+  appeared: "Appeared",
+  disappeared: "Disappeared",
+  moved: "Moved",
+  both: "Appeared and disappeared",
+  changed: "Changed",
+};
+
+export const STATUSES: Record<string, [string, string]> = {
+  new: ["New", "the latest survey saw it for the first time"],
+  still_there: ["Still there", "the latest survey saw it, and an earlier one too"],
+  gone_again: ["Gone again", "the latest survey looked, and it is as in the map"],
+  unknown: ["Unknown", "the latest survey did not look there"],
+  accepted: ["Accepted", "a version of the map has taken it over"],
+};
+
+export const TILE_STATES: Record<string, string> = {
+  changed: "Changed",
+  inconsistent: "In doubt",
+  unobserved: "Not seen",
+  unchanged: "Unchanged",
+};
+
+/** Say what a survey found, or why it says nothing; `job` is that which compares it. */
+export function sayingOf(survey: SurveySummaryDocument, job?: JobDocument): Saying {
+  if (survey.status === "running") return { tone: "running", short: runningWords(job), long: progressOf(job) };
+  if (survey.status === "failed") return failedSaying(survey);
+  if (survey.placement?.state === "in_doubt") {
+    return {
+      tone: "doubt",
+      short: "in doubt",
+      long: `It is in doubt where the scans stand (confidence ${percent(survey.placement.confidence)}), so nothing is said about change.`,
+      more: "Visit the place again, with pose priors or with scans that show more of what the map holds.",
+    };
+  }
+  return readySaying(survey);
+}
+
+function failedSaying({ placement, problem }: SurveySummaryDocument): Saying {
+  const long =
+    placement?.state === "refused"
+      ? "No scan could be placed on the map. This is not the same as no change: nothing was compared."
+      : `The survey failed: ${problem?.title ?? "nobody said why"}. Nothing was compared.`;
+  return { tone: "failed", short: placement?.state === "refused" ? "not registered" : "failed", long, ...(problem ? { more: problem.detail } : {}) };
+}
+
+function readySaying(survey: SurveySummaryDocument): Saying {
+  const { changed = 0 } = survey.counts;
+  const found = survey.objects ? sum(survey.objects) : changed;
+  const moving = survey.moving ? ` ${count(survey.moving, "thing")} moved during the visit and ${survey.moving === 1 ? "is" : "are"} not counted.` : "";
+  const more = `${coverage(survey.counts)}${moving}`.trim();
+  if (!found && !changed) {
+    const few = lowCoverage(survey.counts);
+    const short = !judged(survey.counts) ? "nothing judged" : few ? "nothing changed in part" : "nothing changed";
+    return { tone: judged(survey.counts) ? "quiet" : "doubt", short, long: nothingChanged(survey.counts), more: few ? more : moving.trim() };
+  }
+  if (!found) {
+    return { tone: "quiet", short: "no object", long: `No object changed, but ${count(changed, "tile")} did.`, more };
+  }
+  const what = survey.objects
+    ? `${count(found, "object")} changed: ${kinds(survey.objects)}.`
+    : `${count(changed, "tile")} of ${whole(judged(survey.counts))} changed; this model tells tiles and no objects.`;
+  return { tone: "changed", short: `${whole(found)} changed`, long: what, more };
+}
+
+/** Say that nothing changed, in how many tiles, and how many say nothing. */
+export function nothingChanged(counts: Counts): string {
+  const { unobserved = 0 } = counts;
+  if (!judged(counts)) return "No tile was seen well enough to judge. Nothing is said about change.";
+  const { inconsistent = 0 } = counts;
+  const unseen = unobserved ? `; ${whole(unobserved)} ${unobserved === 1 ? "was" : "were"} not seen` : "";
+  const doubted = inconsistent ? `; ${whole(inconsistent)} ${inconsistent === 1 ? "is" : "are"} in doubt` : "";
+  return `Nothing changed in ${count(judged(counts), "judged tile")}${unseen}${doubted}.`;
+}
+
+/** Say how much of a map a survey saw; empty where it was all. */
+export function coverage(counts: Counts): string {
+  const { tiles = 0, unobserved = 0, inconsistent = 0 } = counts;
+  const words: string[] = [];
+  if (lowCoverage(counts)) {
+    words.push(`${percent(unobserved / tiles)} of the map was not seen (${whole(unobserved)} of ${count(tiles, "tile")}): nothing is said about it.`);
+  } else if (unobserved) {
+    words.push(`${whole(unobserved)} of ${count(tiles, "tile")} not seen.`);
+  }
+  if (inconsistent) words.push(`${count(inconsistent, "tile")} in doubt: the registration there is not sure.`);
+  return words.join(" ");
+}
+
+function lowCoverage({ tiles = 0, unobserved = 0 }: Counts): boolean {
+  return unobserved >= tiles * 0.25 && unobserved > 0;
+}
+
+function judged(counts: Counts): number {
+  return (counts["unchanged"] ?? 0) + (counts["changed"] ?? 0);
+}
+
+/** List counts by kind: `2 appeared, 1 moved`. */
+export function kinds(counts: Counts): string {
+  const told = Object.entries(counts).filter(([, number]) => number);
+  return told.map(([kind, number]) => `${whole(number)} ${kind.replaceAll("_", " ")}`).join(", ");
+}
+
+export function sum(counts: Counts): number {
+  return Object.values(counts).reduce((total, number) => total + number, 0);
+}
+
+/** Say what the objects of a map are in short, those that count now first. */
+export function objectsOf({ objects }: Pick<MapSummaryDocument, "objects">): string {
+  const words: [string, string][] = [
+    ["new", "new"],
+    ["still_there", "still there"],
+    ["unknown", "not looked at lately"],
+    ["gone_again", "gone again"],
+    ["accepted", "accepted"],
+  ];
+  const told = words.filter(([name]) => objects[name]).map(([name, word]) => `${whole(objects[name]!)} ${word}`);
+  return told.join(", ");
+}
+
+function runningWords(job?: JobDocument): string {
+  if (!job) return "running";
+  return job.queue_position ? `waits, ${ordinal(job.queue_position)}` : `${job.progress} %`;
+}
+
+/** Say how far a job is. */
+export function progressOf(job?: JobDocument): string {
+  if (!job) return "It is being compared with the map.";
+  if (job.status === "failed") return `Failed: ${job.problem?.title ?? "nobody said why"}`;
+  if (job.status === "dismissed") return "Stopped";
+  if (job.status === "successful") return "Done";
+  const stage = job.message || "waiting";
+  if (job.queue_position === 1) return `${capital(stage)}, next in the queue`;
+  if (job.queue_position) return `${capital(stage)}, number ${job.queue_position} in the queue`;
+  return `${capital(stage)}, ${job.progress} %`;
+}
+
+export function capital(text: string): string {
+  return text.charAt(0).toUpperCase() + text.slice(1);
+}
+
+/** Why a scan was left out or what is odd about it, and what to do; docs/reasons.md has the same list. */
+export const REASONS: Record<string, [string, string]> = {
+  unreadable: ["cannot be read", "write the file again"],
+  damaged: ["points as in a damaged file", "send the scan as the sensor gave it"],
+  too_few_points: ["too few points", "scan for longer"],
+  degenerate: ["its surfaces leave a motion free", "scan where there are more surfaces, in more directions"],
+  too_little_overlap: ["the map covers too little of it", "scan more of the mapped place, or extend the map first"],
+  no_fit: ["lies nowhere on the map", "check that it is the right map; give a pose prior"],
+  other_place: ["another place", "check that it is the right map"],
+  ambiguous: ["fits at two poses or more", "give a pose prior, or scan more of the mapped place"],
+  mirrored: ["its mirror image fits", "look for an axis that is turned round on the way from the sensor to the file"],
+  wrong_scale: ["fits after scaling", "write metres; calibrate the sensor"],
+  other_up_axis: ["another axis is up", "write the file with z up"],
+  wrong_prior: ["the given pose is far off", "send the scan without a pose, or with a better one"],
+  moved_while_scanning: ["the sensor moved", "stand still while a scan is taken"],
+  disagrees: ["other scans contradict it", "scan there again"],
+  wrong_units: ["not in metres", "write metres"],
+  far_from_origin: ["kilometres from its origin", "subtract one offset from all scans of the place"],
+  far_points: ["a few points far away were left out", "filter reflections"],
+  missing_returns: ["most points are missing returns", "see that nothing covers the sensor"],
+  odd_density: ["points on each other, or on a grid", "send each point once"],
+  odd_size: ["an odd size for rooms", "write metres, with z up"],
+  little_coverage: ["shows few surfaces or directions", "scan for longer, in more directions"],
+  clock: ["its time cannot be right", "set the device's clock"],
+};
+
+const ADVICE: Record<string, string> = {
+  no_answer: "See that the service runs and the network reaches it. What was sent is kept; it goes on by itself.",
+  unauthorized: "Enter an API key; whoever runs the service makes one with `spicd keys add`.",
+  forbidden: "Ask whoever runs the service for a key that may do this, or for this map.",
+  scan_unreadable: "Write the file again as PLY or PCD and send that.",
+  too_large: "Send fewer or smaller files, or have SPICD_MAX_UPLOAD_BYTES raised.",
+  disk_full: "Delete surveys or maps that nobody needs, or have the disk enlarged; then send it again.",
+  queue_full: "Wait until some jobs are done, then send it again.",
+  not_found: "It may have been deleted. Go back to the list of maps.",
+  not_ready: "Wait for its job; a failed one says why.",
+  registration_failed: "Check that it is the right map, give pose priors, or scan more of the mapped place.",
+  internal: "Tell whoever runs the service the id of the job, or the instance that is named here.",
+};
+
+/** Return the stable code of a problem: what stands behind the last colon of its type. */
+export function codeOf(problem: ProblemDocument): string {
+  return problem.type.split(":").at(-1) ?? "";
+}
+
+/** Say what to do about a problem; empty where its detail is all that is known. */
+export function adviceOn(problem: ProblemDocument): string {
+  return ADVICE[codeOf(problem)] ?? (problem.status && problem.status >= 500 ? "Try again in a moment." : "");
+}

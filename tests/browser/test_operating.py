@@ -1,0 +1,222 @@
+"""The page as somebody works with it: with the keyboard alone, on a phone, with a key, with files and with links."""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from playwright.sync_api import expect
+
+from service.catalog.records import JobRecord
+from service.catalog.steps import STEPS
+from service.queue import Claim, QueueState, step_id
+from tests.support.house import environment, run
+from tests.support.live import Live
+from tests.support.samples import RememberingQueue
+from tests.support.viewer_data import MAP, ViewerData
+from tests.support.viewer_page import Opener, ViewerPage
+from worker.detectors.card import MODEL_STORE
+
+PHONE = {
+    "viewport": {"width": 390, "height": 780},
+    "device_scale_factor": 2,
+    "has_touch": True,
+    "is_mobile": True,
+}
+#: The words on buttons that a finger hardly hits.
+_SMALL = """() => [...document.querySelectorAll("button:not(.as-link), summary, select")]
+  .filter((one) => one.checkVisibility() && one.offsetHeight < 24).map((one) => one.outerHTML)"""
+#: Drops files on the page, as a hand with a mouse does: names, and contents in base64.
+_DROP = """(files) => {
+  const dataTransfer = new DataTransfer();
+  for (const [name, content] of files)
+    dataTransfer.items.add(new File([Uint8Array.from(atob(content), (letter) => letter.charCodeAt(0))], name));
+  for (const type of ["dragenter", "dragover", "drop"])
+    document.body.dispatchEvent(new DragEvent(type, { dataTransfer, bubbles: true, cancelable: true }));
+}"""
+
+
+def tabbed_to(viewer: ViewerPage, selector: str) -> None:
+    """Press Tab until the focus is on what a selector names."""
+    for _ in range(30):
+        viewer.page.keyboard.press("Tab")
+        if viewer.page.evaluate("(wanted) => document.activeElement?.matches(wanted)", selector):
+            return
+    raise AssertionError(f"Tab does not lead to {selector}")
+
+
+def test_the_keyboard_alone_leads_from_the_maps_to_the_evidence_of_an_object(
+    opened: Opener, viewer_data: ViewerData
+) -> None:
+    viewer = opened()
+    page, keys = viewer.page, viewer.page.keyboard
+    page.get_by_text("The den", exact=True).wait_for()
+    tabbed_to(viewer, f"a[href='#map={MAP}']")
+    keys.press("Enter")
+    viewer.drawn()
+    survey = viewer_data.surveys["objects"]
+    for _ in range(6):
+        if f"survey={survey}" in page.url:
+            break
+        keys.press("[")
+    assert f"survey={survey}" in page.url
+    expect(page.locator("#items li")).to_have_count(3)
+    keys.press("j")
+    expect(page.locator(".details h2")).to_be_visible()
+    keys.press("j")
+    expect(page.locator("#items [aria-selected=true]")).to_have_count(1)
+    details = page.locator(".details")
+    for said in ("Probability", "Judged", "Seen", "First seen"):
+        expect(details).to_contain_text(said)
+    viewer.drawn()
+    expect(page.locator(".split-words")).to_be_visible()
+    keys.press("Escape")
+    expect(details).to_have_count(0)
+
+
+def test_what_has_the_focus_is_seen(opened: Opener) -> None:
+    viewer = opened()
+    viewer.page.get_by_text("The den", exact=True).wait_for()
+    tabbed_to(viewer, f"a[href='#map={MAP}']")
+    style = "() => { const s = getComputedStyle(document.activeElement); return [s.outlineStyle, s.outlineWidth, s.boxShadow]; }"
+    outline, width, shadow = viewer.page.evaluate(style)
+    assert (outline != "none" and width != "0px") or shadow != "none"
+
+
+def test_a_link_opens_the_same_view_and_another_link_in_the_address_changes_it(
+    opened: Opener, viewer_data: ViewerData
+) -> None:
+    survey, quiet = viewer_data.surveys["objects"], viewer_data.surveys["quiet"]
+    viewer = opened(f"#map={MAP}&survey={survey}&view=1,1,9,3,2.5,0&section=0.2,1.8").drawn()
+    viewer.page.context.grant_permissions(["clipboard-read", "clipboard-write"])
+    viewer.page.locator("#items li").first.click()
+    viewer.until("() => location.hash.includes('object=')")
+    viewer.until("() => location.hash.includes('view=')")  # the camera has come to rest at the object
+    viewer.page.get_by_role("button", name="Share").click()
+    link = viewer.until("() => navigator.clipboard.readText()")
+    assert link == viewer.page.url
+    other = opened(link.partition("/#")[2] and "#" + link.partition("#")[2]).drawn()
+    shown = "() => [window.spicd.scene.view, document.querySelector('[aria-selected=true].item')?.id]"
+    assert rounded(other.page.evaluate(shown)) == rounded(viewer.page.evaluate(shown))
+    other.page.evaluate("(hash) => { location.hash = hash; }", f"#map={MAP}&survey={quiet}")
+    expect(other.page.locator(f"#visit-{quiet}")).to_have_attribute("aria-pressed", "true")
+    expect(other.page.locator(".details")).to_have_count(0)
+
+
+def rounded(value: object) -> object:
+    """Return what a page told with its numbers to the centimetre, as links have them."""
+    return json.loads(json.dumps(value), parse_float=lambda text: round(float(text), 1))
+
+
+def test_surveys_say_what_they_found_and_what_they_cannot_say(
+    opened: Opener, viewer_data: ViewerData
+) -> None:
+    said = {
+        "quiet": "Nothing changed in 74 judged tiles",
+        "objects": "3 objects changed: 1 appeared, 1 disappeared, 1 moved",
+        "half": "of the map was not seen",
+        "failed": "No scan could be placed on the map",
+    }
+    viewer = opened(f"#map={MAP}&tab=survey")
+    for survey, words in said.items():
+        viewer.page.locator(f"#visit-{viewer_data.surveys[survey]}").click()
+        expect(viewer.page.locator(".about")).to_contain_text(words)
+    expect(viewer.page.locator(".about")).to_contain_text("lies nowhere on the map")
+    expect(viewer.page.locator(".about")).not_to_contain_text("Nothing changed")
+
+
+def test_a_phone_shows_list_and_scene_and_nothing_beside_its_screen(
+    opened: Opener, viewer_data: ViewerData
+) -> None:
+    viewer = opened(f"#map={MAP}&survey={viewer_data.surveys['objects']}", **PHONE).drawn()
+    page = viewer.page
+    assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+    canvas = page.locator(".canvas canvas").bounding_box()
+    assert canvas is not None
+    assert canvas["width"] > 300 < canvas["height"] + 100
+    page.locator("#items li").nth(1).tap()
+    expect(page.locator(".details h2")).to_be_in_viewport()
+    assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+    small = page.evaluate(_SMALL)
+    assert small == []  # WCAG 2.2, 2.5.8: targets of 24 CSS pixels
+
+
+def test_dark_follows_the_system_until_somebody_chooses(opened: Opener) -> None:
+    viewer = opened(f"#map={MAP}", color_scheme="dark").drawn()
+    assert viewer.pixels()[2, 2].mean() < 60
+    viewer.page.keyboard.press("d")
+    viewer.until("() => document.documentElement.dataset.theme === 'light'")
+    assert viewer.pixels()[2, 2].mean() > 200
+    viewer.page.reload()
+    viewer.drawn()
+    assert viewer.pixels()[2, 2].mean() > 200
+
+
+def test_a_service_that_wants_a_key_is_asked_with_the_one_that_was_entered_and_no_address_bears_it(
+    opened: Opener, serve: Callable[..., Live]
+) -> None:
+    service = serve(auth="required")
+    _, secret = service.services.catalog.keys.add("viewer", scopes=["changes:read"])
+    viewer = opened(f"#map={MAP}", url=service.url)
+    viewer.watch.expect("401")
+    field = viewer.page.get_by_label("Key", exact=True)
+    field.fill("spicd_wrong")
+    field.press("Enter")
+    expect(viewer.page.locator("dialog .warning")).to_be_visible()
+    field.fill(secret)
+    field.press("Enter")
+    viewer.drawn()
+    viewer.page.reload()
+    viewer.drawn()
+    assert not any(secret in url for url in viewer.watch.requests)
+    assert secret not in viewer.page.url
+    other = opened(f"#map={MAP}", url=service.url)
+    other.watch.expect("401")
+    expect(other.page.get_by_label("Key", exact=True)).to_be_visible()
+
+
+def test_dropped_scans_become_a_survey_whose_job_is_followed_until_its_result_is_shown(
+    opened: Opener, serve: Callable[..., Live], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    environment(monkeypatch, tmp_path / "data", MODEL_STORE)
+    queue = RememberingQueue()
+    service = serve(queue=queue)
+    catalog = service.services.catalog
+    viewer = opened(f"#map={MAP}", url=service.url).drawn()
+    viewer.page.evaluate(_DROP, [*scan_and_pose(service, "march-2-0"), *scan_and_pose(service, "march-2-1")])
+    expect(viewer.page.locator(".files li")).to_have_count(2)
+    viewer.page.get_by_label("Device").last.fill("robot-9")
+    viewer.page.get_by_role("button", name="Compare 2 scans").click()
+    job_row = viewer.page.locator(".job")
+    expect(job_row).to_have_count(1, timeout=20_000)
+    survey = next(one for one in catalog.surveys.page(MAP).items if one.device_id == "robot-9")
+    job = catalog.jobs.get(survey.job_id)
+    queue.state = held_by_a_worker(job)
+    begun = catalog.jobs.begin(job.job_id, "register")
+    assert begun is not None
+    catalog.jobs.report(begun, message="registering", progress=0.42)
+    expect(job_row).to_contain_text("42 %", timeout=20_000)
+    run(job)
+    found = viewer.page.locator(f"#visit-{survey.survey_id}")
+    expect(found).to_contain_text("nothing changed", timeout=20_000)
+    expect(job_row).to_have_count(0)
+
+
+def held_by_a_worker(job: JobRecord) -> QueueState:
+    """Return the state of a queue in which a worker has claimed whatever step of a job is due."""
+    claims = [
+        Claim(step=step_id(job.job_id, step.name), execution="1", worker="w") for step in STEPS[job.kind]
+    ]
+    return QueueState(answering=("w",), claims=tuple(claims))
+
+
+def scan_and_pose(service: Live, name: str) -> list[list[str]]:
+    """Return a scan of the data and what tells its pose as two files for `_DROP`."""
+    catalog = service.services.catalog
+    (scan,) = (one for one in catalog.scans.page().items if one.filename == f"{name}.ply")
+    content = catalog.blobs.get_bytes(scan.key)
+    files = {f"{name}.ply": content, f"{name}.pose.json": json.dumps({"pose": scan.pose}).encode()}
+    return [[name, base64.b64encode(content).decode()] for name, content in files.items()]

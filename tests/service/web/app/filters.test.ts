@@ -1,0 +1,68 @@
+import assert from "node:assert/strict";
+import { test } from "node:test";
+
+import { active, beginOf, filtered, NO_FILTERS, tally, toggled } from "../../../../service/web/source/app/filters.ts";
+import { itemOfObject, itemOfTile } from "../../../../service/web/source/app/items.ts";
+import { box, object, tile } from "./samples.ts";
+
+const THURSDAY = new Date(2026, 2, 5, 15, 30); // 5 March 2026, local time
+
+const items = [
+  itemOfObject(object({ object_id: "old", first_seen: "2026-02-20T12:00:00Z", status: "still_there", probability: 0.6 })),
+  itemOfObject(object({ object_id: "late", first_seen: "2026-03-03T12:00:00Z", kind: "moved", before: box(0, 0), device_id: "robot-8" })),
+  itemOfObject(object({ object_id: "upstairs", first_seen: "2026-03-05T10:00:00Z", now: { ...box(2, 2), center: [2, 2, 4.5] } })),
+];
+
+function ids(filters: Partial<typeof NO_FILTERS>, section: [number, number] | null = null): string[] {
+  return filtered(items, { ...NO_FILTERS, ...filters }, section, THURSDAY).map(({ id }) => id);
+}
+
+test("no filter lets everything through", () => {
+  assert.deepEqual(ids({}), ["old", "late", "upstairs"]);
+});
+
+test("kinds, statuses, device and probability each keep what they name", () => {
+  assert.deepEqual(ids({ kinds: ["moved"] }), ["late"]);
+  assert.deepEqual(ids({ kinds: ["moved", "appeared"] }), ["old", "late", "upstairs"]);
+  assert.deepEqual(ids({ statuses: ["still_there"] }), ["old"]);
+  assert.deepEqual(ids({ device: "robot-8" }), ["late"]);
+  assert.deepEqual(ids({ minScore: 0.7 }), ["late", "upstairs"]);
+});
+
+test("a tile where something appeared and something disappeared is of both kinds", () => {
+  const both = [itemOfTile(tile({ appeared: 3, disappeared: 4 }))];
+  for (const kind of ["appeared", "disappeared", "both"]) assert.equal(filtered(both, { ...NO_FILTERS, kinds: [kind] }).length, 1);
+  assert.equal(filtered(both, { ...NO_FILTERS, kinds: ["moved"] }).length, 0);
+});
+
+test("since Monday is since the night to this week's Monday", () => {
+  assert.deepEqual(beginOf("monday", THURSDAY), new Date(2026, 2, 2));
+  assert.deepEqual(beginOf("monday", new Date(2026, 2, 2, 8)), new Date(2026, 2, 2));
+  assert.deepEqual(beginOf("monday", new Date(2026, 2, 8, 23)), new Date(2026, 2, 2));
+  assert.deepEqual(ids({ since: "monday" }), ["late", "upstairs"]);
+});
+
+test("periods begin where they say, and one that cannot be read has no beginning", () => {
+  assert.deepEqual(beginOf("today", THURSDAY), new Date(2026, 2, 5));
+  assert.deepEqual(beginOf("7d", THURSDAY), new Date(THURSDAY.getTime() - 7 * 86_400_000));
+  assert.deepEqual(beginOf("2026-03-01", THURSDAY), new Date(2026, 2, 1));
+  assert.equal(beginOf("", THURSDAY), null);
+  assert.equal(beginOf("yesterday", THURSDAY), null);
+});
+
+test("the second floor is what the section shows", () => {
+  assert.deepEqual(ids({ inSection: true }, [3, 6]), ["upstairs"]);
+  assert.deepEqual(ids({ inSection: true }, [0, 2.5]), ["old", "late"]);
+  assert.deepEqual(ids({ inSection: false }, [3, 6]), ["old", "late", "upstairs"]);
+});
+
+test("filters that are set are counted", () => {
+  assert.equal(active(NO_FILTERS), 0);
+  assert.equal(active({ ...NO_FILTERS, kinds: ["moved"], since: "today", minScore: 0.5 }), 3);
+});
+
+test("a value is toggled, values are tallied in order", () => {
+  assert.deepEqual(toggled(["a"], "b"), ["a", "b"]);
+  assert.deepEqual(toggled(["a", "b"], "a"), ["b"]);
+  assert.deepEqual(tally(["b", null, "a", "b"]), [["a", 1], ["b", 2]]);
+});
