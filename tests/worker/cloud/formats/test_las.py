@@ -203,5 +203,5 @@ def test_a_layer_that_claims_gigabytes_is_refused_before_memory_is_taken(tmp_pat
     content = path.read_bytes()
     start = struct.unpack_from("<I", content, 96)[0]
     layers = start + 8 + struct.unpack_from("<H", content, 105)[0] + 4  # behind the first point and the count
-    with pytest.raises(ScanError, match="chunk 1 of 1 has .* bytes, its layers declare more"):
+    with pytest.raises(ScanError, match=r"chunk 1 of 1 has .* bytes, its layers declare more"):
         read(changed(path, layers + 4 * 3, "I", 2**32 - 1))
