@@ -45,7 +45,7 @@ _COLORS = ("colorRed", "colorGreen", "colorBlue")
 class Field:
     """One value of a point, as the prototype of the points has it."""
 
-    kind: str  #: Integer, ScaledInteger or Float
+    kind: str  #: Integer, ScaledInteger or Float; empty: no number
     bits: int  #: that each point takes of the file
     low: float | None  #: least value that is declared
     high: float | None
@@ -82,7 +82,7 @@ def read_stations(buffer: mmap.mmap) -> tuple[Station, ...]:
     """Return the scans of a file that hold points, each held against the file's size. Raises ScanError."""
     root = _xml(buffer)
     data = _child(root, "data3D")
-    children = [] if data is None else list(data)
+    children = list(data) if data is not None and data.get("type") == "Vector" else []
     if len(children) > MOST_STATIONS:
         raise ScanError(f"it holds {len(children)} scans, at most {MOST_STATIONS} are read; split the file")
     stations = [_station(child, index, buffer) for index, child in enumerate(children)]
@@ -232,6 +232,8 @@ def _station(scan: Element, index: int, buffer: mmap.mmap) -> Station | None:
     points = _child(scan, "points")
     if points is None:
         return None
+    if (scan.get("type"), points.get("type")) != ("Structure", "CompressedVector"):
+        raise ScanError(f"scan {index + 1} is a {scan.get('type')!r} with points of {points.get('type')!r}")
     n = _count(points, "recordCount")
     name = "".join(letter for letter in (_text(scan, "name") or "") if letter.isprintable())[:100]
     prototype = _child(points, "prototype")
@@ -246,7 +248,7 @@ def _station(scan: Element, index: int, buffer: mmap.mmap) -> Station | None:
         fields=fields,
         color_limits=_color_limits(scan, fields),
     )
-    missing = [name for name in station.position if name not in fields]
+    missing = [name for name in station.position if name not in fields or not fields[name].kind]
     if missing and n:
         raise ScanError(f"scan {index + 1} has no {missing[0]}: its points have no position")
     if n:
@@ -304,7 +306,7 @@ def _field(element: Element) -> Field:
             raise ScanError(f"field {name!r} has scale 0")
         low, high = sorted((least * scale + offset, most * scale + offset))
         return Field(kind=kind, bits=(most - least).bit_length(), low=low, high=high)
-    return Field(kind=kind, bits=0, low=None, high=None)
+    return Field(kind="", bits=0, low=None, high=None)
 
 
 def _bound(element: Element, which: str, name: str) -> float | None:
@@ -363,7 +365,7 @@ def _pose(element: Element | None) -> Matrix4 | None:
 
 def _color_limits(scan: Element, fields: dict[str, Field]) -> tuple[tuple[float, float], ...] | None:
     """Return what is black and what is full of each colour: as declared of the scan, else of the field, else by kind."""
-    if not all(name in fields for name in _COLORS):
+    if not all(name in fields and fields[name].kind for name in _COLORS):
         return None
     told = _child(scan, "colorLimits")
     limits = []

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import mmap
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, BinaryIO
 
@@ -32,6 +32,9 @@ _MOST_RECORDS = 10_000  #: of variable length
 _RECORD_HEADER = struct.Struct("<2x16sHH32x")  #: user id, record id, length
 _LASZIP = (b"laszip encoded", 22204)
 _ANY_SIZE = 2**32 - 1  #: points of a chunk where chunks differ, as in COPC
+_LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}  #: of a chunk, by kind of item: point, colour, infrared, wave
+_BYTES = 14  #: the kind of extra bytes, a layer each
+_LAYERED = 3  #: the compressor of formats 6 to 10
 _AT_ONCE = 64 * 1024**2  #: bytes of points that are held together
 _POINTS_AT_ONCE = 1_000_000
 _PLAIN_PER_POINT = 100  #: bytes a point of the limit that a LAZ may unpack to; format 10 takes 67
@@ -196,11 +199,9 @@ def _check_laszip(header: LasHeader, laszip: bytes) -> None:
     n_items = struct.unpack_from("<H", laszip, 32)[0]
     if compressor not in (2, 3) or coder != 0 or len(laszip) < 34 + 6 * n_items:
         raise ScanError(f"LASzip compressor {compressor}, coder {coder}, {n_items} items are not known")
-    sizes = [struct.unpack_from("<HHH", laszip, 34 + 6 * item)[1] for item in range(n_items)]
-    if sum(sizes) != header.record_size:
-        raise ScanError(
-            f"LASzip unpacks {sum(sizes)} bytes a point, the header declares {header.record_size}"
-        )
+    total = sum(size for _, size in _items(laszip))
+    if total != header.record_size:
+        raise ScanError(f"LASzip unpacks {total} bytes a point, the header declares {header.record_size}")
 
 
 def _check_chunk_table(header: LasHeader, laszip: bytes, buffer: mmap.mmap, file: BinaryIO) -> None:
@@ -218,7 +219,10 @@ def _check_chunk_table(header: LasHeader, laszip: bytes, buffer: mmap.mmap, file
     chunk_size = int(struct.unpack_from("<I", laszip, 12)[0])
     version, n_chunks = struct.unpack_from("<II", buffer, at)
     varies = chunk_size in (0, _ANY_SIZE)
-    if version != 0 or not (n_chunks <= header.n if varies else n_chunks == -(-header.n // chunk_size)):
+    most = min(
+        header.n, (at - header.start - 8) // header.record_size
+    )  # the first point of each is not packed
+    if version != 0 or not (n_chunks <= most if varies else n_chunks == -(-header.n // chunk_size)):
         raise ScanError(
             f"a table (version {version}) of {n_chunks} chunks of {chunk_size} points is declared for {header.n} points"
         )
@@ -238,6 +242,38 @@ def _check_chunk_table(header: LasHeader, laszip: bytes, buffer: mmap.mmap, file
         raise ScanError(
             f"its chunks take {packed} bytes, but {at - header.start - 8} lie before their table; upload it again"
         )
+    if struct.unpack_from("<H", laszip)[0] == _LAYERED:
+        _check_layers(header, laszip, buffer, chunks)
+
+
+def _check_layers(
+    header: LasHeader, laszip: bytes, buffer: mmap.mmap, chunks: Sequence[tuple[int, int]]
+) -> None:
+    """Hold the layers of each chunk against its bytes: lazrs takes memory by what they declare.
+
+    A chunk of formats 6 to 10 is a point as it stands, a count, the bytes of each layer, and the layers.
+    """
+    n_layers = 0
+    for kind, size in _items(laszip):
+        if kind not in _LAYERS and kind != _BYTES:
+            raise ScanError(f"LASzip item {kind} is not one of layers")
+        n_layers += size if kind == _BYTES else _LAYERS[kind]
+    at, before = header.start + 8, header.record_size + 4 + 4 * n_layers
+    for number, (_, size) in enumerate(chunks, 1):
+        if size < before:
+            raise ScanError(
+                f"chunk {number} of {len(chunks)} has {size} bytes, its sizes alone take {before}"
+            )
+        layers = np.frombuffer(buffer, "<u4", count=n_layers, offset=at + before - 4 * n_layers)
+        if before + int(layers.sum(dtype=np.int64)) > size:
+            raise ScanError(f"chunk {number} of {len(chunks)} has {size} bytes, its layers declare more")
+        at += size
+
+
+def _items(laszip: bytes) -> list[tuple[int, int]]:
+    """Return kind and bytes of each part of a point, as the record of LASzip has them."""
+    n_items = struct.unpack_from("<H", laszip, 32)[0]
+    return [struct.unpack_from("<HH", laszip, 34 + 6 * item) for item in range(n_items)]
 
 
 def _check_gain(header: LasHeader, size: int, *, max_points: int) -> None:

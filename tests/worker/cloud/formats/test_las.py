@@ -195,3 +195,13 @@ def test_a_broken_chunk_table_is_an_error_and_not_the_end_of_the_worker(tmp_path
     path.write_bytes(content[:where] + b"\xff\xff\xff\x7f" + content[where + 4 :])
     with pytest.raises(ScanError):
         read_scan(path)
+
+
+@pytest.mark.parametrize("point_format", [6, 7, 10])
+def test_a_layer_that_claims_gigabytes_is_refused_before_memory_is_taken(tmp_path, point_format):
+    path = write_las(tmp_path / "room.laz", room(), point_format=point_format, extra=2)
+    content = path.read_bytes()
+    start = struct.unpack_from("<I", content, 96)[0]
+    layers = start + 8 + struct.unpack_from("<H", content, 105)[0] + 4  # behind the first point and the count
+    with pytest.raises(ScanError, match=r"chunk 1 of 1 has .* bytes, its layers declare more"):
+        read(changed(path, layers + 4 * 3, "I", 2**32 - 1))
