@@ -70,7 +70,9 @@ class Watch:
     origin: str  #: of the service, `http://127.0.0.1:8000`
     complaints: list[str] = field(default_factory=list)
     requests: list[str] = field(default_factory=list)  #: URLs, in the order in which they were made
-    pending: set[Request] = field(default_factory=set)  #: that are not answered yet, but for streams of events
+    pending: set[Request] = field(
+        default_factory=set
+    )  #: that are not answered yet, but for streams of events
     _expected: list[re.Pattern[str]] = field(default_factory=list)
 
     def expect(self, pattern: str) -> None:
