@@ -101,6 +101,11 @@ export class Controller {
     this.update({ line });
   }
 
+  /** Say that the service does not answer; the next event, or sign of life, says that it does. */
+  unreachable(): void {
+    this.#onLine("offline");
+  }
+
   #happened(events: CloudEvent[]): void {
     const { map } = this.state.place;
     if (map && !events.some(({ data }) => data.map_id === map)) return;
@@ -117,7 +122,7 @@ export class Controller {
   }
 
   #again(): void {
-    if (this.state.place.map) void loads.map(this, true);
+    if (this.state.place.map) void loads.map(this);
     else void loads.maps(this);
     this.#watchJobs(0);
   }
@@ -134,7 +139,7 @@ export class Controller {
   /** Look at the jobs at once, for one was made, stopped or run again. */
   jobsChanged(): void {
     this.#watchJobs(0);
-    if (this.state.place.map) void loads.map(this, true);
+    if (this.state.place.map) void loads.map(this);
     else void loads.maps(this);
   }
 

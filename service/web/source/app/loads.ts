@@ -1,5 +1,6 @@
 /** What is asked of the service for what is shown. */
 
+import { ApiError } from "./api.ts";
 import type { Controller } from "./controller.ts";
 import type {
   Box,
@@ -43,13 +44,12 @@ export async function maps(app: Controller): Promise<void> {
   });
 }
 
-/** Ask for all of the map that is shown; `again`: for something of it changed. */
-export async function map(app: Controller, again = false): Promise<void> {
+/** Ask for all of the map that is shown; what is there already stays until the answers are. */
+export async function map(app: Controller): Promise<void> {
   const id = app.state.place.map as string;
   await app.load("map", () => app.api.get<MapDocument>(`maps/${id}`));
   if (!app.state.map.value || app.state.place.map !== id) return;
   await Promise.all([app.load("surveys", () => surveysOf(app, id)), app.load("versions", () => versionsOf(app, id))]);
-  if (again) app.update({ tiles: {}, looks: NOT_ASKED });
   if (app.state.map.value.status === "ready") await Promise.all([objects(app), ofSurvey(app), ofItem(app)]);
   if (app.state.place.tab === "map") await ofTab(app);
 }
@@ -200,8 +200,8 @@ export async function jobs(app: Controller): Promise<void> {
     const before = new Set(app.state.jobs.filter(isOpen).map(({ jobID }) => jobID));
     app.update({ jobs: known.filter((job) => isOpen(job) || failedLately(job)) });
     if (known.some((job) => !isOpen(job) && before.has(job.jobID)) && app.state.line !== "live") app.jobsChanged();
-  } catch {
-    // the line says whether the service answers
+  } catch (error) {
+    if (error instanceof ApiError && error.code === "no_answer") app.unreachable(); // a broken stream may tell later
   }
 }
 

@@ -23,6 +23,12 @@ export async function addFiles(app: Controller, files: File[]): Promise<void> {
   });
 }
 
+/** Leave a file out again. */
+export function leaveOut(app: Controller, n: number): void {
+  chosen.splice(n, 1);
+  change(app, { files: app.state.upload?.files.filter((_, at) => at !== n) ?? [] });
+}
+
 function rowOf({ name, size }: File): Sending {
   return { name, size, sent: 0, waiting: null, problem: null, scan: null };
 }

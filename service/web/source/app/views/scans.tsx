@@ -84,7 +84,7 @@ function Refused({ scan, name }: { scan: ScanOutcome; name: string }) {
       <strong>
         {name}: {what}
       </strong>
-      {scan.detail && <p>{capital(scan.detail)}</p>}
+      {scan.detail && <p>{scan.detail}</p>}
       {numbers.length > 0 && <p class="faint">{capital(numbers.join(", "))}</p>}
       {advice && <p class="advice">{capital(advice)}.</p>}
       <Warnings warnings={scan.warnings} />

@@ -62,9 +62,9 @@ export function SurveyTab(props: Props) {
       <div class="row">
         {focus.status === "failed" && <Retry app={app} jobId={focus.job_id} />}
         {canBeTakenOver(focus) && <button onClick={() => takeOver(props, focus)}>Take over into the map</button>}
-        {focus.status === "ready" && <Files app={app} survey={focus} />}
         {!(job && isOpen(job)) && <button onClick={() => remove(props, focus)}>Delete</button>}
       </div>
+      {focus.status === "ready" && <Files app={app} survey={focus} />}
       {problem && <Problem problem={problem} />}
       {value ? <Scans scans={value.scans} names={state.names} placing={focus.status === "running"} /> : !problem && <Waiting>Asking for its scans…</Waiting>}
     </div>
@@ -73,16 +73,17 @@ export function SurveyTab(props: Props) {
 
 function Files({ app, survey }: { app: Props["app"]; survey: SurveySummaryDocument }) {
   const here = `surveys/${survey.survey_id}`;
-  const files: [string, string][] = [["cloud.ply", "PLY"], ["picture.png", "Picture"], ["tiles", "Tiles (GeoJSON)"]];
-  if (survey.objects) files.push(["objects", "Objects (GeoJSON)"]);
+  const files: [string, string][] = [["cloud.ply", "PLY"], ["picture.png", "picture"], ["tiles", "tiles (GeoJSON)"]];
+  if (survey.objects) files.push(["objects", "objects"]);
   return (
-    <>
+    <p class="row">
+      <span class="faint">Download</span>
       {files.map(([file, word]) => (
         <Download app={app} path={`${here}/${file}`} name={`${survey.survey_id}-${file}${file.includes(".") ? "" : ".geojson"}`}>
           {word}
         </Download>
       ))}
-    </>
+    </p>
   );
 }
 

@@ -5,7 +5,7 @@ import { Fragment, h } from "preact";
 import type { Controller } from "../controller.ts";
 import { bytes, count } from "../format.ts";
 import type { Sending, UploadState } from "../state.ts";
-import { addFiles, cancel, submit } from "../submit.ts";
+import { addFiles, cancel, leaveOut, submit } from "../submit.ts";
 import type { Props } from "./page.tsx";
 import { Problem } from "./parts.tsx";
 
@@ -53,8 +53,8 @@ function Form({ app, upload, name }: { app: Controller; upload: UploadState; nam
       ))}
       {files.length > 0 && (
         <ul class="files">
-          {files.map((file) => (
-            <FileRow key={file.name} file={file} />
+          {files.map((file, n) => (
+            <FileRow key={file.name} file={file} {...(busy ? {} : { leaveOut: () => leaveOut(app, n) })} />
           ))}
         </ul>
       )}
@@ -109,13 +109,16 @@ function Fields({ upload, disabled }: { upload: UploadState; disabled: boolean }
   );
 }
 
-function FileRow({ file }: { file: Sending }) {
+function FileRow({ file, leaveOut }: { file: Sending; leaveOut?: () => void }) {
   const { name, size, sent, waiting, problem, scan } = file;
   const state = scan ? "sent" : waiting ? `waits: ${waiting}` : sent ? `${bytes(sent)} of ${bytes(size)}` : bytes(size);
   return (
     <li>
       <span class="name">{name}</span>
       <span class="faint">{state}</span>
+      <button type="button" class="small" aria-label={`Leave ${name} out`} title="Leave it out" disabled={!leaveOut} onClick={leaveOut}>
+        ✕
+      </button>
       <progress max={size} value={sent} aria-label={`${name}: ${state}`} />
       {problem && <Problem problem={problem} />}
     </li>
