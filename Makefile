@@ -10,7 +10,7 @@ NODE_VERSION := 24.19.0
 WEB := service/web/source
 BUNDLE := service/web/built/index.html
 
-.PHONY: help web browser servers tools demo up test test-fast acceptance-shared check format bench chaos fuzz schemathesis load soak openapi client clean
+.PHONY: help web browser servers tools demo up test test-fast acceptance-shared check format bench chaos fuzz schemathesis load soak big-maps openapi client clean
 help: ## this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
 
@@ -69,6 +69,9 @@ load: $(INSTALLED) ## 20 robots at 200 kB/s, 50 surveys, 5 dashboards against a 
 
 soak: $(INSTALLED) ## two hours of light work; fails where a process grows
 	$(BIN)/python -m tests.breaking.soak
+
+big-maps: $(INSTALLED) ## memory and time of made maps of 1, 5 and 20 million points, from fusing to the tileset: half an hour
+	$(BIN)/python -m tests.breaking.big_maps
 
 openapi: $(INSTALLED) ## write openapi/openapi.json anew
 	$(BIN)/python -m service.api.openapi

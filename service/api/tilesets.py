@@ -23,6 +23,7 @@ from service.api.http.problems import MADE
 from service.catalog import blob_keys
 from service.catalog.records import Anchor, Bounds, MapRecord, Tileset
 from service.catalog.tilesets import ContentName
+from service.catalog.versions import tileset_of
 from service.errors import NotFound
 from service.tile_features import MAP_FRAME
 
@@ -40,7 +41,6 @@ Content = Annotated[
 ]
 
 GLB = "model/gltf-binary"
-ECEF = "http://www.opengis.net/def/crs/EPSG/0/4978"  #: x, y, z from the Earth's centre, metres
 _PAD = 1e-4  #: of the box of a cloud: contents are quantised, and their boxes are wider by that
 
 
@@ -50,7 +50,12 @@ class PlacedRequest(BaseModel):
     model_config = ConfigDict(extra="ignore", frozen=True)
 
     crs: Annotated[
-        Literal["map", "EPSG:4978", "http://www.opengis.net/def/crs/OGC/0/Engineering3D", ECEF],
+        Literal[
+            "map",
+            "EPSG:4978",
+            "http://www.opengis.net/def/crs/OGC/0/Engineering3D",
+            "http://www.opengis.net/def/crs/EPSG/0/4978",
+        ],
         Field(
             description="`map`: metres in the map's own frame; `EPSG:4978`: Earth-centred, by the map's anchor, as globes "
             "want it; also by their URIs"
@@ -77,7 +82,7 @@ async def get_map_tileset(
     has an anchor, `crs=EPSG:4978` puts it on the Earth.
     """
     ready = await run_in_threadpool(services.catalog.maps.ready, map_id)
-    _require(ready.tileset, f"version {ready.version} of map {map_id!r}")
+    tileset_of(ready.tileset, f"version {ready.version} of map {map_id!r}")
     document = _of_version_in_use(ready, on_earth=asked.crs not in ("map", MAP_FRAME))
     return JSONResponse(document, headers={"Cache-Control": files.REVALIDATED})
 
@@ -90,9 +95,8 @@ async def get_map_tileset(
 )
 async def get_version_tileset(services: Provided, map_id: MapId, number: Number) -> Response:
     """3D Tiles 1.1 of the version's fused cloud, in metres of the map's frame, z up; each point is in one content."""
-    version = await run_in_threadpool(services.catalog.versions.ready, map_id, number)
-    _require(version.tileset, f"version {number} of map {map_id!r}")
-    key = blob_keys.map_tileset(version.job_id)
+    job_id, _ = await run_in_threadpool(services.catalog.versions.tileset, map_id, number)
+    key = blob_keys.map_tileset(job_id)
     return await blob_response(services.catalog.blobs, key, media_type=bodies.JSON, asked_again=True)
 
 
@@ -106,9 +110,8 @@ async def get_version_tileset_content(
     services: Provided, map_id: MapId, number: Number, content: Content
 ) -> Response:
     """Points as GLB: quantised positions (KHR_mesh_quantization), with colours or normals."""
-    version = await run_in_threadpool(services.catalog.versions.ready, map_id, number)
-    name = _named(content, version.tileset)
-    key = blob_keys.map_tileset_contents(version.job_id)
+    job_id, tileset = await run_in_threadpool(services.catalog.versions.tileset, map_id, number)
+    name, key = _named(content, tileset), blob_keys.map_tileset_contents(job_id)
     return await content_response(services.catalog.blobs, key, name, media_type=GLB)
 
 
@@ -120,8 +123,7 @@ async def get_version_tileset_content(
 )
 async def get_survey_tileset(services: Provided, survey_id: SurveyId) -> Response:
     """3D Tiles 1.1 of the coloured cloud of a survey that is too large to be read whole (a million points)."""
-    survey = await run_in_threadpool(services.catalog.surveys.ready, survey_id)
-    _require(survey.tileset, f"survey {survey_id!r}")
+    await run_in_threadpool(services.catalog.surveys.tileset, survey_id)
     key = blob_keys.survey_tileset(survey_id)
     return await blob_response(services.catalog.blobs, key, media_type=bodies.JSON, immutable=True)
 
@@ -134,24 +136,15 @@ async def get_survey_tileset(services: Provided, survey_id: SurveyId) -> Respons
 )
 async def get_survey_tileset_content(services: Provided, survey_id: SurveyId, content: Content) -> Response:
     """Points as GLB: quantised positions (KHR_mesh_quantization), with the colours of `cloud.ply`."""
-    survey = await run_in_threadpool(services.catalog.surveys.ready, survey_id)
-    name = _named(content, survey.tileset)
-    key = blob_keys.survey_tileset_contents(survey_id)
+    tileset = await run_in_threadpool(services.catalog.surveys.tileset, survey_id)
+    name, key = _named(content, tileset), blob_keys.survey_tileset_contents(survey_id)
     return await content_response(services.catalog.blobs, key, name, media_type=GLB)
 
 
-def _require(tileset: Tileset | None, what: str) -> None:
-    """Raise NotFound where a cloud has no tileset."""
-    if tileset is None:
-        raise NotFound(
-            f"{what} has no tileset: an earlier release built it, or its cloud is small; read cloud.ply"
-        )
-
-
-def _named(content: str, tileset: Tileset | None) -> ContentName:
+def _named(content: str, tileset: Tileset) -> ContentName:
     """Read the name of a content. Raises NotFound for one of another tileset, or none."""
     name = ContentName.of(content)
-    if name is None or tileset is None or not name.is_of(tileset.sha256):
+    if name is None or not name.is_of(tileset.sha256):
         raise NotFound(f"no content {content[:100]!r}; tileset.json names those there are")
     return name
 

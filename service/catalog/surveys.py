@@ -43,7 +43,7 @@ from service.catalog.scans import (
     write_outcomes,
 )
 from service.catalog.tables import Survey, SurveyObject, SurveyTile, new_id, now
-from service.catalog.versions import map_row, version_in_use
+from service.catalog.versions import map_row, tileset_of, version_in_use
 from service.errors import Conflict, NotFound, NotReady
 
 
@@ -118,11 +118,18 @@ class Surveys:
     def ready(self, survey_id: str) -> SurveyRecord:
         """Return one survey that is done. Raises NotFound and NotReady."""
         survey = self.get(survey_id)
-        if survey.status == "running":
-            raise NotReady(f"survey {survey_id!r} is still running; follow job {survey.job_id}")
-        if survey.status == "failed":
-            raise NotReady(f"survey {survey_id!r} has no result; job {survey.job_id} says why")
+        _check_ready(survey.status, survey_id, survey.job_id)
         return survey
+
+    def tileset(self, survey_id: str) -> Tileset:
+        """Return the tileset of a survey that is done; of the scans nothing is read.
+
+        Raises NotFound, also for a survey without a tileset, and NotReady.
+        """
+        with self._database.read() as session:
+            row = _row(session, survey_id)
+            _check_ready(row.status, survey_id, row.job_id)
+            return tileset_of(row.tileset, f"survey {survey_id!r}")
 
     def page(self, map_id: str, *, after: Position | None = None, limit: int = 100) -> Page[SurveySummary]:
         """Return surveys of a map, newest first."""
@@ -211,6 +218,14 @@ def _check_unused(session: Session, row: Survey) -> None:
             f"version {built.version} of map {row.map_id!r} is being built of survey {row.survey_id!r}; wait for job "
             f"{built.job_id}, or dismiss it"
         )
+
+
+def _check_ready(status: str, survey_id: str, job_id: str) -> None:
+    """Raise NotReady, with the job to look at, for a survey that is not done."""
+    if status == "running":
+        raise NotReady(f"survey {survey_id!r} is still running; follow job {job_id}")
+    if status == "failed":
+        raise NotReady(f"survey {survey_id!r} has no result; job {job_id} says why")
 
 
 def _locked(session: Session, survey_id: str) -> Survey:

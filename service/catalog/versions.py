@@ -93,6 +93,17 @@ class Versions:
         check_ready(version.status, f"version {number} of map {map_id!r}", version.job_id)
         return version
 
+    def tileset(self, map_id: str, number: int) -> tuple[str, Tileset]:
+        """Return the job of a version that is built, and its tileset; of the scans nothing is read.
+
+        Viewers ask hundreds of times. Raises NotFound, also for a version without a tileset, and NotReady.
+        """
+        what = f"version {number} of map {map_id!r}"
+        with self._database.read() as session:
+            row = _row(session, map_id, number)
+            check_ready(row.status, what, row.job_id)
+            return row.job_id, tileset_of(row.tileset, what)
+
     def of_job(self, job_id: str) -> VersionRecord:
         """Return the version that a job builds. Raises NotFound, also where it was deleted since."""
         with self._database.read() as session:
@@ -157,6 +168,15 @@ class Versions:
         """Delete a version whose job never reached the queue."""
         with self._database.write() as session:
             _delete(session, _row_of_job(session, job_id))
+
+
+def tileset_of(told: Tileset | dict[str, Any] | None, what: str) -> Tileset:
+    """Return the tileset that a row or a record tells of. Raises NotFound where there is none."""
+    if told is None:
+        raise NotFound(
+            f"{what} has no tileset: an earlier release built it, or its cloud is small; read cloud.ply"
+        )
+    return Tileset.model_validate(told)
 
 
 def map_row(session: Session, map_id: str, *, lock: bool = False) -> tables.Map:

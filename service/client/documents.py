@@ -461,31 +461,6 @@ class SurveyRequest(TypedDict):
     threshold: NotRequired[float | None]
 
 
-class SurveySummaryDocument(TypedDict):
-    """A survey in short; the survey itself tells what became of each scan."""
-
-    asked_threshold: float | None
-    captured_at: str
-    counts: dict[str, int]
-    created: str
-    device_id: str | None
-    job_id: str
-    links: list[Link]
-    map_id: str
-    map_version: int
-    model: str
-    moving: int | None
-    objects: dict[str, int] | None
-    placement: Placement | None
-    problem: ProblemDocument | None
-    scan_count: int
-    status: Literal["running", "ready", "failed"]
-    survey_id: str
-    threshold: float | None
-    updated: str
-    warnings: list[ScanWarning]
-
-
 class TileProperties(TypedDict):
     """What is said of a tile."""
 
@@ -518,6 +493,15 @@ class TileProperties(TypedDict):
     tile_index: list[int]
     z_max: float
     z_min: float
+
+
+class Tileset(TypedDict):
+    """How large the tileset of a cloud is (3D Tiles 1.1)."""
+
+    bytes: int
+    contents: int
+    n_points: int
+    sha256: str
 
 
 class Time(TypedDict):
@@ -585,6 +569,7 @@ class VersionSummaryDocument(TypedDict):
     scan_count: int
     status: Literal["building", "ready", "failed"]
     survey_id: str | None
+    tileset: Tileset | None
     updated: str
     version: int
 
@@ -880,6 +865,7 @@ class MapSummaryDocument(TypedDict):
     problem: ProblemDocument | None
     scan_count: int
     status: Literal["building", "ready", "failed"]
+    tileset: Tileset | None
     updated: str
     version: int
 
@@ -1004,15 +990,35 @@ class SurveyDocument(TypedDict):
     status: Literal["running", "ready", "failed"]
     survey_id: str
     threshold: float | None
+    tileset: Tileset | None
     updated: str
     warnings: list[ScanWarning]
 
 
-class SurveyList(TypedDict):
-    """Surveys, newest first."""
+class SurveySummaryDocument(TypedDict):
+    """A survey in short; the survey itself tells what became of each scan."""
 
+    asked_threshold: float | None
+    captured_at: str
+    counts: dict[str, int]
+    created: str
+    device_id: str | None
+    job_id: str
     links: list[Link]
-    surveys: list[SurveySummaryDocument]
+    map_id: str
+    map_version: int
+    model: str
+    moving: int | None
+    objects: dict[str, int] | None
+    placement: Placement | None
+    problem: ProblemDocument | None
+    scan_count: int
+    status: Literal["running", "ready", "failed"]
+    survey_id: str
+    threshold: float | None
+    tileset: Tileset | None
+    updated: str
+    warnings: list[ScanWarning]
 
 
 class TileFeature(TypedDict):
@@ -1042,6 +1048,7 @@ class VersionDocument(TypedDict):
     settings: dict[str, Any]
     status: Literal["building", "ready", "failed"]
     survey_id: str | None
+    tileset: Tileset | None
     updated: str
     version: int
 
@@ -1131,6 +1138,7 @@ class MapDocument(TypedDict):
     scans: list[ScanOutcome]
     settings: dict[str, Any]
     status: Literal["building", "ready", "failed"]
+    tileset: Tileset | None
     updated: str
     version: int
 
@@ -1206,6 +1214,13 @@ class SightingCollection(TypedDict):
     numberReturned: int
     timeStamp: str
     type: Literal["FeatureCollection"]
+
+
+class SurveyList(TypedDict):
+    """Surveys, newest first."""
+
+    links: list[Link]
+    surveys: list[SurveySummaryDocument]
 
 
 class TileCollection(TypedDict):

@@ -69,6 +69,7 @@ def run(points: int, folder: Path, *, colors: bool = False) -> dict[str, Any]:
     from worker.cloud import npz
     from worker.cloud.formats.ply import write_ply
     from worker.cloud.seen import Seen
+    from worker.cloud.sight import Sights
     from worker.cloud.tilesets.writer import pieces_of, write_tileset
     from worker.pipeline.flow import fused_scans, tiled_map, watched
     from worker.pipeline.results.manifest import manifest
@@ -81,7 +82,8 @@ def run(points: int, folder: Path, *, colors: bool = False) -> dict[str, Any]:
         registration=settings.registration.with_values(voxel_size=_VOXEL),
         tiling=settings.tiling.with_values(tiles="touched", min_points=1),
     )
-    scans, sights = scans_of(points, colors=colors), []
+    scans = scans_of(points, colors=colors)
+    sights: list[Sights | None] = []
     with stages.measured("fusing"):
         fused = fused_scans(watched(scans, sights), scans_in(points), settings, no_progress)
     with stages.measured("normals and tiles"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from typing import Any
 
@@ -112,6 +113,24 @@ def test_further_scans_make_a_version_that_keeps_the_base_as_it_was(
     assert off < 0.02
     assert (second.counts["scans"], second.counts["accepted"]) == (3, 3)
     assert {name: house.files()[name] for name in files} == files  # nothing of the old one was touched
+
+
+def test_each_version_has_a_tileset_of_its_own_which_goes_with_it(house: House, further: ScanRecord) -> None:
+    run(extend(house, further))
+    first, second = version(house, 1), version(house, 2)
+    for one in (first, second):
+        contents = house.catalog.blobs.get_bytes(blob_keys.map_tileset_contents(one.job_id))
+        assert one.tileset is not None
+        assert one.tileset.n_points == one.counts["points"] == len(cloud(house, one.job_id))
+        assert (one.tileset.bytes, one.tileset.sha256) == (
+            len(contents),
+            hashlib.sha256(contents).hexdigest(),
+        )
+        assert house.catalog.blobs.exists(blob_keys.map_tileset(one.job_id))
+    assert first.tileset != second.tileset
+    house.catalog.versions.delete(MAP, 1)
+    assert not house.catalog.blobs.exists(blob_keys.map_tileset_contents(first.job_id))
+    assert house.catalog.blobs.exists(blob_keys.map_tileset_contents(second.job_id))
 
 
 def test_tiles_keep_their_ids_from_version_to_version(house: House, further: ScanRecord) -> None:

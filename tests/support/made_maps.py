@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -10,7 +11,7 @@ import numpy as np
 from service.catalog import blob_keys
 from service.catalog.catalog import Catalog
 from service.catalog.records import Bounds, Tileset
-from service.catalog.tilesets import addresses
+from service.catalog.tilesets import address
 from tests.support.samples import IDENTITY, ScanOutcome, add_scan
 from worker.cloud.formats.ply import write_ply
 from worker.cloud.tilesets.writer import pieces_of, write_tileset
@@ -71,8 +72,12 @@ def put_map(catalog: Catalog, map_id: str, points: Points, *, tileset: bool, ply
 def _put_tileset(catalog: Catalog, job_id: str, points: Points, folder: Path) -> Tileset:
     index, contents = folder / "tileset.json", folder / "tileset.bin"
     summary = write_tileset(
-        index, contents, lambda: pieces_of(points), scratch=folder, address=addresses(job_id)
+        index,
+        contents,
+        lambda: pieces_of(points),
+        scratch=folder,
+        address=lambda at: address(at.sha256, at.offset, at.length),
     )
     catalog.blobs.put_file(blob_keys.map_tileset_contents(job_id), contents, move=True)
     catalog.blobs.put_file(blob_keys.map_tileset(job_id), index, move=True)
-    return Tileset(n_points=summary.n_points, contents=summary.contents, bytes=summary.bytes)
+    return Tileset.model_validate(asdict(summary))

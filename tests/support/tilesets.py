@@ -11,7 +11,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-_TYPES = {5120: np.dtype("i1"), 5121: np.dtype("u1"), 5123: np.dtype("<u2"), 5126: np.dtype("<f4")}
+_TYPES: dict[int, np.dtype[Any]] = {
+    5120: np.dtype("i1"),
+    5121: np.dtype("u1"),
+    5123: np.dtype("<u2"),
+    5126: np.dtype("<f4"),
+}
 _WIDTHS = {"VEC3": 3, "VEC4": 4}
 
 

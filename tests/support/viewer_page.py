@@ -27,7 +27,13 @@ _PIXELS = """() => {
   return { width, height, rgba: btoa(text) };
 }"""
 _SEEN = "(point) => window.spicd.scene.project(point)"
-_DRAWN = "() => Boolean(window.spicd?.scene.extent) && !document.querySelector('.over-middle')"
+#: Whether the clouds that shall be shown are: that of the map, and unless it is shown alone one of a survey.
+_DRAWN = """() => {
+  const shown = document.querySelector(".over-top [aria-pressed=true]")?.textContent;
+  const came = performance.getEntriesByType("resource").some(({ name }) => /surveys\\/[^/]+\\/(cloud|tileset)\\./.test(name));
+  const loading = document.querySelector(".over-middle");
+  return Boolean(window.spicd?.scene.extent) && !loading && shown && (shown === "Reference" || came);
+}"""
 
 
 @dataclass
@@ -52,6 +58,15 @@ class ViewerPage:
         """Wait until every cloud that is asked for has come, which the page tells by saying no more that it loads."""
         self.until(_DRAWN)
         return self
+
+    def rests(self) -> None:
+        """Wait until two pictures of the scene, one after the other, are the same: nothing loads or moves any more."""
+        before = self.pixels()
+        end = time.monotonic() + WAITS_S
+        while not np.array_equal(before, after := self.pixels()):
+            assert time.monotonic() < end, "the scene does not come to rest"
+            self.page.wait_for_timeout(200)
+            before = after
 
     def pixels(self) -> Pixels:
         """Return what the scene drew."""

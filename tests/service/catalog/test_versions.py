@@ -6,9 +6,10 @@ from concurrent.futures import ThreadPoolExecutor
 from threading import Barrier
 
 import pytest
+from sqlalchemy import event
 
 from service.catalog.catalog import Catalog
-from service.catalog.records import Problem, ScanOutcome
+from service.catalog.records import Problem, ScanOutcome, Tileset
 from service.errors import Conflict, NotFound, NotReady
 from tests.support.samples import BOUNDS, IDENTITY, add_map, add_scan, add_survey, add_version, tile
 
@@ -142,3 +143,26 @@ def test_a_version_keeps_the_poses_of_its_base_beside_those_of_its_own(catalog: 
     catalog.scans.correct(first, pose=IDENTITY)
     version, _ = catalog.versions.create("hall", scan_ids=[further], poses={further: MOVED})
     assert [scan.pose for scan in version.scans] == [MOVED, MOVED]
+
+
+def test_the_tileset_of_a_version_is_told_without_its_scans(catalog: Catalog) -> None:
+    job_id = add_map(catalog)
+    with pytest.raises(NotFound, match="no tileset"):
+        catalog.versions.tileset("lobby", 1)
+    told = Tileset(n_points=3, contents=1, bytes=64, sha256="0" * 64)
+    catalog.versions.save_result(job_id, outcomes=[], bounds=BOUNDS, counts={}, tileset=told)
+    asked: list[str] = []
+
+    def listen(_connection: object, _cursor: object, statement: str, *_: object) -> None:
+        asked.append(statement)
+
+    event.listen(catalog.database.engine, "before_cursor_execute", listen)
+    assert catalog.versions.tileset("lobby", 1) == (job_id, told)
+    event.remove(catalog.database.engine, "before_cursor_execute", listen)
+    assert asked
+    assert not any("version_scans" in statement for statement in asked)
+    with pytest.raises(NotFound, match="no version 2"):
+        catalog.versions.tileset("lobby", 2)
+    add_version(catalog, ready=False)
+    with pytest.raises(NotReady, match="still building"):
+        catalog.versions.tileset("lobby", 2)

@@ -143,7 +143,7 @@ test("what is no tile of points is refused", () => {
 });
 
 test("a box at an angle holds what is in it and is met where it stands", () => {
-  const turned = { size: [2, 0.2, 1] as [number, number, number], yaw: Math.PI / 4 };
+  const turned = { centre: [0, 0, 0.5] as [number, number, number], size: [2, 0.2, 1] as [number, number, number], yaw: Math.PI / 4 };
   const solid = solidOf({ min: [-0.8, -0.8, 0], max: [0.8, 0.8, 1], turned });
   assert.ok(holds(solid, 0.6, 0.6, 0.5));
   assert.ok(!holds(solid, 0.6, -0.6, 0.5)); // in the upright box around it alone

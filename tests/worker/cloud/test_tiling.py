@@ -223,7 +223,9 @@ def test_chosen_pairs_keep_their_two_sides_together() -> None:
 
 
 def test_points_of_a_large_cloud_are_located_some_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    points = np.random.default_rng(0).uniform(-1, 9, (500, 3)).astype(np.float32) + np.float32(ORIGIN)
+    points = np.random.default_rng(0).uniform(-1, 9, (500, 3)).astype(np.float32) + np.array(
+        ORIGIN, np.float32
+    )
     grid = grid_of(4, 4, 4)
     whole = grid.locate(points)
     monkeypatch.setattr(module, "_AT_ONCE", 64)

@@ -41,7 +41,8 @@ class Cube:
         """Return the place of each point (N, 3) within the cube."""
         cells = ((points - self.lower) * ((1 << BITS) / self.side)).astype(np.int64)
         x, y, z = np.clip(cells, 0, (1 << BITS) - 1).astype(np.uint64).T
-        return _spread(x) | (_spread(y) << np.uint64(1)) | (_spread(z) << np.uint64(2))
+        codes: Codes = _spread(x) | (_spread(y) << np.uint64(1)) | (_spread(z) << np.uint64(2))
+        return codes
 
     def spacing(self, level: int) -> float:
         """Return the edge, metres, of the cells of which a node of this level shows one point each."""

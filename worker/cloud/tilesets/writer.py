@@ -8,6 +8,7 @@ is a sort of each part. All contents stand one after the other in one file: thei
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import json
 import tempfile
@@ -28,7 +29,7 @@ from worker.cloud.types import Colors, Floats, Normals, Points
 BYTES_A_POINT = (
     96  #: that a part takes while it is built: rows, places, hashes, an order, and copies of these
 )
-_AT_ONCE = 1_000_000  # points that are read together, less where memory is scarce
+_AT_ONCE = 1_000_000  # points that are read together
 _COUNTED = 7  # level of the nodes that points are counted in: 128 a side
 
 
@@ -100,10 +101,11 @@ def write_tileset(
     The same points give the same bytes, whatever the memory. Raises ValueError for a cloud without a point.
     """
     settings = settings or TilesetSettings()
+    most = max(settings.memory_bytes // BYTES_A_POINT, settings.leaf_points)
+    pieces = functools.partial(_smaller, pieces, most)
     lower, upper, n_points, extra_is = _surveyed(pieces)
     cube = Cube.around(lower, upper)
     with tempfile.TemporaryDirectory(dir=scratch) as folder, contents.open("wb") as file:
-        most = max(settings.memory_bytes // BYTES_A_POINT, settings.leaf_points)
         counts = _counted(pieces, cube)
         parts = _Parts(folder=Path(folder), row=_row_of(extra_is), most=most, counts=counts)
         progress(0.1)
@@ -130,6 +132,12 @@ def write_tileset(
     return TilesetSummary(
         n_points=n_points, contents=len(builder.contents), bytes=contents.stat().st_size, sha256=sha256
     )
+
+
+def _smaller(pieces: Pieces, most: int) -> Iterator[Piece]:
+    """Yield the pieces, cut to at most so many points."""
+    for piece in pieces():
+        yield from pieces_of(piece.points, colors=piece.colors, normals=piece.normals, at_once=most)
 
 
 def _surveyed(pieces: Pieces) -> tuple[NDArray[np.float32], NDArray[np.float32], int, Extra | None]:

@@ -150,7 +150,8 @@ export interface JobList {
 /** An upright box, map frame, metres. */
 export interface Box {
   center: Vector;
-  size: Vector;
+  size: Vector; // along its own axes
+  yaw_degrees: number; // of its first axis, counter-clockwise from x
   footprint: [number, number][]; // closed
   height_over_floor: number | null;
   volume: number; // cubic metres

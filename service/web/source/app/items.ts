@@ -31,7 +31,7 @@ export interface Item {
   tile: TileProperties | null;
 }
 
-/** Return the axis-aligned box around a place, metres, map frame. */
+/** Return the axis-aligned box around a place, and how it stands in that; metres, map frame. */
 export function boxOf(place: Box): SceneBox {
   const xs = place.footprint.map(([x]) => x);
   const ys = place.footprint.map(([, y]) => y);
@@ -39,6 +39,7 @@ export function boxOf(place: Box): SceneBox {
   return {
     min: [Math.min(...xs), Math.min(...ys), place.center[2] - half],
     max: [Math.max(...xs), Math.max(...ys), place.center[2] + half],
+    turned: { centre: place.center, size: place.size, yaw: (place.yaw_degrees * Math.PI) / 180 },
   };
 }
 

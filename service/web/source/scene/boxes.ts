@@ -13,7 +13,7 @@ export interface Solid {
 /** Return what a box encloses, `margin` metres larger on each side. */
 export function solidOf(box: Box, margin = 0): Solid {
   const size = box.turned?.size ?? across(box);
-  return { centre: centreOf(box), half: size.map((side) => side / 2 + margin) as Point, yaw: box.turned?.yaw ?? 0 };
+  return { centre: box.turned?.centre ?? centreOf(box), half: size.map((side) => side / 2 + margin) as Point, yaw: box.turned?.yaw ?? 0 };
 }
 
 export function centreOf({ min, max }: Box): Point {

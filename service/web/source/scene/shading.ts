@@ -39,7 +39,7 @@ export interface PointUniforms {
   middle: { value: Color };
   high: { value: Color };
   back: { value: Color };
-  /** 1: what is outside of the chosen boxes is dim. */
+  /** 1: what is outside of the chosen boxes is dim, and what would hide them is left out. */
   dim: { value: number };
   chosen: { value: [Vector3, Vector3, Vector3, Vector3] };
   /** Pixels of the picture that a metre takes at a distance of a metre. */
@@ -49,6 +49,7 @@ export interface PointUniforms {
 const POINT_VERTEX = /* glsl */ `
 precision highp float;
 uniform mat4 modelMatrix, viewMatrix, projectionMatrix;
+uniform vec3 cameraPosition;
 uniform vec2 section, ramp;
 uniform vec3 low, middle, high, back;
 uniform vec3 chosen[4];
@@ -62,6 +63,14 @@ out vec3 colour;
 
 bool inside(vec3 p, vec3 least, vec3 most) { return all(greaterThan(p, least)) && all(lessThan(p, most)); }
 
+/* Tell whether a point stands before a chosen box, in the cone from the camera to it: it would hide what is shown. */
+bool hides(vec3 p, vec3 least, vec3 most) {
+  vec3 centre = 0.5 * (least + most), towards = centre - cameraPosition;
+  float radius = 0.55 * length(most - least), far = length(towards);
+  float along = dot(p - cameraPosition, towards / far);
+  return along < far - radius && length(p - cameraPosition - along * towards / far) < radius * along / far;
+}
+
 void main() {
   vec4 world = modelMatrix * vec4(position, 1.0);
   int part = 1;
@@ -69,6 +78,11 @@ void main() {
   if (tint.a > 0.55 && tint.a < 0.75) part = 2;
 #endif
   if (world.z < section.x || world.z > section.y || (parts & part) == 0) {
+    gl_Position = vec4(2.0, 2.0, 2.0, 1.0);
+    return;
+  }
+  bool other = dim > 0.0 && !inside(world.xyz, chosen[0], chosen[1]) && !inside(world.xyz, chosen[2], chosen[3]);
+  if (other && (hides(world.xyz, chosen[0], chosen[1]) || hides(world.xyz, chosen[2], chosen[3]))) {
     gl_Position = vec4(2.0, 2.0, 2.0, 1.0);
     return;
   }
@@ -80,9 +94,7 @@ void main() {
   else if (tint.a > 0.4) { colour = tint.rgb; size = 1.9; }
   else if (tint.a > 0.1) colour = mix(colour, back, 0.5);
 #endif
-  if (dim > 0.0 && !inside(world.xyz, chosen[0], chosen[1]) && !inside(world.xyz, chosen[2], chosen[3])) {
-    colour = mix(colour, back, 0.55 * dim);
-  }
+  if (other) colour = mix(colour, back, 0.45 * dim);
   vec4 eye = viewMatrix * world;
   gl_Position = projectionMatrix * eye;
   gl_PointSize = clamp(size * spacing * scale * inversesqrt(share) / -eye.z, 1.5, cap);
@@ -117,10 +129,30 @@ float logDistance(ivec2 pixel) {
   return depth == 1.0 ? 100.0 : log2(planes.x * planes.y / (planes.y - depth * (planes.y - planes.x)));
 }
 
+/* Return a neighbour in whose stead a pixel is painted that is a hole in a surface: most around it are not empty. */
+ivec2 filled(ivec2 pixel) {
+  for (int reach = 1; reach <= 2; reach++) {
+    int taken = 0;
+    float nearest = 1.0;
+    ivec2 best = pixel;
+    for (int i = 0; i < 8; i++) {
+      ivec2 next = pixel + reach * ivec2((i < 3 ? -1 : i < 5 ? 0 : 1), (i == 0 || i == 3 || i == 5 ? -1 : i == 1 || i == 6 ? 0 : 1));
+      float depth = texelFetch(depths, clamp(next, ivec2(area.xy), ivec2(area.zw) - 1), 0).r;
+      if (depth == 1.0) continue;
+      taken++;
+      if (depth < nearest) { nearest = depth; best = next; }
+    }
+    if (taken == 0) return pixel;
+    if (taken >= 5) return best;
+  }
+  return pixel;
+}
+
 void main() {
   ivec2 pixel = ivec2(gl_FragCoord.xy);
   float depth = texelFetch(depths, pixel, 0).r;
   vec3 back = mix(backLow, backHigh, gl_FragCoord.y / area.w);
+  if (depth == 1.0) { pixel = filled(pixel); depth = texelFetch(depths, pixel, 0).r; }
   gl_FragDepth = depth;
   if (depth == 1.0) { painted = vec4(back, 1.0); return; }
   float here = logDistance(pixel);

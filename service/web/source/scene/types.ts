@@ -10,8 +10,8 @@ export type Point = [number, number, number];
 export interface Box {
   min: Point;
   max: Point;
-  /** What stands at an angle in it, about the same middle: its sides before the turn, and the turn around z, radians. */
-  turned?: { size: Point; yaw: number };
+  /** What stands at an angle in it: its middle, its sides along its own axes, and its turn around z, radians. */
+  turned?: { centre: Point; size: Point; yaw: number };
 }
 
 /** An object that changed. */

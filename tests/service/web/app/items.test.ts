@@ -5,7 +5,13 @@ import { boxOf, itemOfObject, itemOfSighting, itemOfTile, kindOfTile, markOf, ti
 import { box, object, sighting, tile } from "./samples.ts";
 
 test("the box of a place goes around its outline, from floor to top", () => {
-  assert.deepEqual(boxOf(box(2, 3, 1)), { min: [1.5, 2.5, 0], max: [2.5, 3.5, 1] });
+  const { min, max } = boxOf(box(2, 3, 1));
+  assert.deepEqual({ min, max }, { min: [1.5, 2.5, 0], max: [2.5, 3.5, 1] });
+});
+
+test("what stands at an angle keeps it", () => {
+  const { turned } = boxOf({ ...box(2, 3, 1), yaw_degrees: 90 });
+  assert.deepEqual(turned, { centre: [2, 3, 0.5], size: box(2, 3, 1).size, yaw: Math.PI / 2 });
 });
 
 test("an object has its status and its history, and is where its latest sighting saw it", () => {

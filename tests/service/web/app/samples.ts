@@ -16,6 +16,7 @@ export function box(x: number, y: number, size = 1): Box {
   return {
     center: [x, y, half],
     size: [size, size, size],
+    yaw_degrees: 0,
     footprint: [...corners, corners[0]!],
     height_over_floor: 0,
     volume: size ** 3,

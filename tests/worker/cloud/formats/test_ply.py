@@ -230,8 +230,8 @@ def test_write_ply_refuses_a_comment_that_would_make_a_broken_header(tmp_path, c
 
 def test_write_ply_in_pieces_gives_the_same_file(tmp_path, monkeypatch):
     points = np.random.default_rng(0).normal(size=(100, 3)).astype(np.float32)
-    columns = {"colors": np.arange(300).reshape(100, 3).astype(np.uint8), "scalars": {"n": np.arange(100)}}
-    write_ply(tmp_path / "whole.ply", points, **columns)
+    colors, scalars = np.arange(300).reshape(100, 3).astype(np.uint8), {"n": np.arange(100)}
+    write_ply(tmp_path / "whole.ply", points, colors=colors, scalars=scalars)
     monkeypatch.setattr(module, "_AT_ONCE", 7)
-    write_ply(tmp_path / "pieces.ply", points, **columns)
+    write_ply(tmp_path / "pieces.ply", points, colors=colors, scalars=scalars)
     assert (tmp_path / "pieces.ply").read_bytes() == (tmp_path / "whole.ply").read_bytes()
