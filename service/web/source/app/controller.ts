@@ -6,7 +6,15 @@ import { follow, type Line } from "./follow.ts";
 import { count } from "./format.ts";
 import { NOWHERE, readPlace, writePlace, type Place } from "./link.ts";
 import * as loads from "./loads.ts";
-import { firstState, isOpen, nothingOfAMap, type Loaded, type Question, type State, type Theme } from "./state.ts";
+import {
+  firstState,
+  isOpen,
+  nothingOfAMap,
+  type Loaded,
+  type Question,
+  type State,
+  type Theme,
+} from "./state.ts";
 import { kinds } from "./words.ts";
 
 const KEY = "spicd-key"; // in sessionStorage: it goes with the tab
@@ -115,7 +123,8 @@ export class Controller {
     for (const { type, data } of events) {
       if (type === "survey.ready") this.tell(`A survey is ready${foundBy(data)}.`);
       if (type === "survey.failed") this.tell("A survey failed; the timeline says why.", "bad");
-      if (type === "version.ready" && map) this.tell(`Version ${String(data["version"])} of the map is ready.`);
+      if (type === "version.ready" && map)
+        this.tell(`Version ${String(data["version"])} of the map is ready.`);
     }
     clearTimeout(this.#refresh);
     this.#refresh = setTimeout(() => this.#again(), SETTLE_MS);
@@ -132,7 +141,9 @@ export class Controller {
     clearTimeout(this.#jobs);
     if (document.hidden) return;
     this.#jobs = setTimeout(() => {
-      void loads.jobs(this).then(() => this.#watchJobs(this.state.jobs.some(isOpen) ? JOBS_BUSY_MS : JOBS_IDLE_MS));
+      void loads
+        .jobs(this)
+        .then(() => this.#watchJobs(this.state.jobs.some(isOpen) ? JOBS_BUSY_MS : JOBS_IDLE_MS));
     }, after);
   }
 
@@ -156,7 +167,8 @@ export class Controller {
       const gone = error instanceof ApiError && (error.code === "not_found" || error.code === "forbidden");
       loaded = { value: gone ? null : before.value, problem: problemOf(error), busy: false };
     }
-    if (map === this.state.place.map && turn === this.#turns[name]) this.update({ [name]: loaded } as Partial<State>);
+    if (map === this.state.place.map && turn === this.#turns[name])
+      this.update({ [name]: loaded } as Partial<State>);
   }
   #turns: Record<string, number> = {};
 

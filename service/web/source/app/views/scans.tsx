@@ -42,7 +42,12 @@ export function Scans({ scans, names, placing }: ScansProps) {
           </thead>
           <tbody>
             {accepted.map((scan) => (
-              <Accepted key={scan.scan_id} scan={scan} sure={sure} name={names[scan.scan_id] || scan.scan_id} />
+              <Accepted
+                key={scan.scan_id}
+                scan={scan}
+                sure={sure}
+                name={names[scan.scan_id] || scan.scan_id}
+              />
             ))}
           </tbody>
         </table>
