@@ -37,7 +37,7 @@ browser: ## a headless Chromium for the tests of the viewer, where apt-get may i
 
 servers: $(SERVERS)/bin/moto_server ## an S3 server for tests, in an environment of its own; PostgreSQL has to be there
 
-tools: $(TOOLS)/.installed ## what tests drive the service with: GeoPandas, schemathesis, tus clients, Node and its compilers
+tools: $(TOOLS)/.installed ## what tests drive the service with: GeoPandas, schemathesis, tus clients, Node, its compilers and a viewer
 
 acceptance-shared: $(INSTALLED) $(SERVERS)/bin/moto_server ## tests of the catalog on PostgreSQL; acceptance with S3 too, one host and two
 	SPICD_TEST_DATABASE_URL=postgresql $(BIN)/pytest tests/service/catalog tests/service/api -m fast -n auto --dist loadscope
