@@ -10,7 +10,7 @@ NODE_VERSION := 24.19.0
 WEB := service/web/source
 BUNDLE := service/web/built/index.html
 
-.PHONY: help web browser servers tools demo up test test-fast acceptance-shared check format bench chaos fuzz schemathesis load soak big-maps openapi client clean
+.PHONY: help web screenshots browser servers tools demo up test test-fast acceptance-shared check format bench chaos fuzz schemathesis load soak big-maps openapi client clean
 help: ## this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
 
@@ -29,12 +29,15 @@ test: $(INSTALLED) $(BUNDLE) ## every test, on all cores
 test-fast: $(INSTALLED) $(BUNDLE) ## the tests that take no longer than a second or so: under a minute on two cores
 	$(BIN)/pytest -m fast -n auto --dist loadscope
 
+screenshots: $(INSTALLED) web browser ## draw the pictures of docs/viewer-pictures.md and the README anew: two minutes
+	$(BIN)/python -m tests.browser.screenshots
+
 browser: ## a headless Chromium for the tests of the viewer, where apt-get may install one
 	@sh docker/browser.sh
 
 servers: $(SERVERS)/bin/moto_server ## an S3 server for tests, in an environment of its own; PostgreSQL has to be there
 
-tools: $(TOOLS)/.installed ## what tests drive the service with: GeoPandas, schemathesis, tus clients, Node and its compilers
+tools: $(TOOLS)/.installed ## what tests drive the service with: GeoPandas, schemathesis, tus clients, Node, its compilers and a viewer
 
 acceptance-shared: $(INSTALLED) $(SERVERS)/bin/moto_server ## tests of the catalog on PostgreSQL; acceptance with S3 too, one host and two
 	SPICD_TEST_DATABASE_URL=postgresql $(BIN)/pytest tests/service/catalog tests/service/api -m fast -n auto --dist loadscope

@@ -19,7 +19,7 @@ import httpx
 import numpy as np
 import pytest
 
-from tests.breaking import fuzz_api, fuzz_readers, load, soak
+from tests.breaking import big_maps, fuzz_api, fuzz_readers, load, soak
 from tests.breaking.fuzz_readers import Fuzz, declared_points, run_batch, what_is_wrong
 from tests.breaking.requests import Request, Requests
 from tests.breaking.scan_mutations import N, samples
@@ -186,3 +186,17 @@ def test_a_percentile_is_a_value_that_was_measured() -> None:
     assert load.percentile([3.0, 1.0, 2.0], 50) == 2.0
     assert load.percentile([float(i) for i in range(1, 201)], 99) == 198.0
     assert load.percentile([5.0], 99) == 5.0
+
+
+def test_a_made_map_goes_through_the_last_part_of_a_build_with_all_its_points(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, value in (("_STOREYS", 1), ("_CELL", 3.0), ("_ROOM", 3.0)):
+        monkeypatch.setattr(big_maps, name, value)
+    told = big_maps.run(1, tmp_path)
+    assert told["whole"]
+    assert 10_000 < told["points"] < 16_000
+    assert {"cloud.ply", "picture.png", "reference.npz", "tileset.bin", "tileset.json"} <= told[
+        "sizes"
+    ].keys()
+    assert len(big_maps._table([told]).splitlines()) == 2 + len(told["stages"]) + len(told["sizes"]) + 1

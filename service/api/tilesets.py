@@ -45,7 +45,7 @@ _PAD = 1e-4  #: of the box of a cloud: contents are quantised, and their boxes a
 
 
 class PlacedRequest(BaseModel):
-    """Where the tileset shall lie."""
+    """Where the tileset shall lie. What a map's tileset names takes it too: CesiumJS hands it on to all that it loads."""
 
     model_config = ConfigDict(extra="ignore", frozen=True)
 
@@ -93,7 +93,9 @@ async def get_map_tileset(
     response_model=dict[str, Any],
     responses=_DOCUMENT,
 )
-async def get_version_tileset(services: Provided, map_id: MapId, number: Number) -> Response:
+async def get_version_tileset(
+    services: Provided, map_id: MapId, number: Number, _handed_on: Annotated[PlacedRequest, Query()]
+) -> Response:
     """3D Tiles 1.1 of the version's fused cloud, in metres of the map's frame, z up; each point is in one content."""
     job_id, _ = await run_in_threadpool(services.catalog.versions.tileset, map_id, number)
     key = blob_keys.map_tileset(job_id)
@@ -107,7 +109,11 @@ async def get_version_tileset(services: Provided, map_id: MapId, number: Number)
     responses=_CONTENT,
 )
 async def get_version_tileset_content(
-    services: Provided, map_id: MapId, number: Number, content: Content
+    services: Provided,
+    map_id: MapId,
+    number: Number,
+    content: Content,
+    _handed_on: Annotated[PlacedRequest, Query()],
 ) -> Response:
     """Points as GLB: quantised positions (KHR_mesh_quantization), with colours or normals."""
     job_id, tileset = await run_in_threadpool(services.catalog.versions.tileset, map_id, number)

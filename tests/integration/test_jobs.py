@@ -14,6 +14,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from service.catalog import blob_keys
+from service.catalog.blobs import Blobs
 from service.catalog.jobs import Jobs, Run
 from service.catalog.records import JobRecord, Placement, Problem, ScanRecord, Tileset
 from service.catalog.steps import STEPS, JobKind
@@ -224,6 +225,30 @@ def test_each_step_of_a_map_may_run_twice(house: House) -> None:
         for folder in (blob_keys.map_folder(house.catalog.maps.get(name).job_id) for name in ("again", MAP))
     )
     assert made == first != {}  # the same scans give the same map, to the byte
+
+
+def test_a_build_that_is_killed_between_the_files_of_its_tileset_makes_the_same_again(house: House) -> None:
+    first, blobs = house.catalog.maps.get(MAP), house.catalog.blobs
+    scans = (house.catalog.scans.get(outcome.scan_id) for outcome in first.scans)
+    job = house.map_of(*scans, map_id="again")
+    put = Blobs.put_file
+
+    def killed(self: Blobs, key: str, path: Path, *, move: bool = False) -> None:
+        if key == blob_keys.map_tileset(job.job_id):
+            raise KeyboardInterrupt
+        put(self, key, path, move=move)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Blobs, "put_file", killed)
+        with pytest.raises(KeyboardInterrupt):
+            run(job, "register")
+    assert blobs.exists(blob_keys.map_tileset_contents(job.job_id))
+    assert not blobs.exists(blob_keys.map_tileset(job.job_id))
+    assert house.catalog.maps.get("again").tileset is None  # so nobody is led to it
+    run(job, "register")
+    assert house.catalog.maps.get("again").tileset == first.tileset
+    for key in (blob_keys.map_tileset, blob_keys.map_tileset_contents):
+        assert blobs.get_bytes(key(job.job_id)) == blobs.get_bytes(key(first.job_id))
 
 
 def test_a_finished_job_is_left_alone(house: House) -> None:

@@ -70,6 +70,9 @@ class Watch:
     origin: str  #: of the service, `http://127.0.0.1:8000`
     complaints: list[str] = field(default_factory=list)
     requests: list[str] = field(default_factory=list)  #: URLs, in the order in which they were made
+    pending: set[Request] = field(
+        default_factory=set
+    )  #: that are not answered yet, but for streams of events
     _expected: list[re.Pattern[str]] = field(default_factory=list)
 
     def expect(self, pattern: str) -> None:
@@ -86,6 +89,11 @@ class Watch:
         page.on("console", self._console)
         page.on("pageerror", self._error)
         page.on("request", self._request)
+        page.on("requestfinished", self._ended)
+        page.on("requestfailed", self._ended)
+
+    def _ended(self, request: Request) -> None:
+        self.pending.discard(request)
 
     def _console(self, message: ConsoleMessage) -> None:
         if message.type == "error":
@@ -97,6 +105,8 @@ class Watch:
     def _request(self, request: Request) -> None:
         self.requests.append(request.url)
         parts = urlsplit(request.url)
+        if not parts.path.endswith("/events"):
+            self.pending.add(request)
         if (
             parts.scheme in ("http", "https", "ws", "wss")
             and f"{parts.scheme}://{parts.netloc}" != self.origin

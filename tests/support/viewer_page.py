@@ -60,11 +60,11 @@ class ViewerPage:
         return self
 
     def rests(self) -> None:
-        """Wait until two pictures of the scene, one after the other, are the same: nothing loads or moves any more."""
+        """Wait until all is answered and two pictures, one after the other, are the same: nothing loads or moves more."""
         before = self.pixels()
         end = time.monotonic() + WAITS_S
-        while not np.array_equal(before, after := self.pixels()):
-            assert time.monotonic() < end, "the scene does not come to rest"
+        while not np.array_equal(before, after := self.pixels()) or self.watch.pending:
+            assert time.monotonic() < end, f"the page does not come to rest: {self.watch.pending}"
             self.page.wait_for_timeout(200)
             before = after
 

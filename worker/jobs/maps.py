@@ -91,7 +91,7 @@ def _put_map(context: Context, built: BuiltMap, card: Card) -> Tileset:
         lambda: pieces_of(reference.points, colors=reference.colors, normals=reference.normals),
         document=blob_keys.map_tileset(job_id),
         contents=blob_keys.map_tileset_contents(job_id),
-        progress=lambda share: context.report("saving", share),
+        progress=lambda share: context.report("exporting", share),
     )
 
 

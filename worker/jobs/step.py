@@ -33,7 +33,8 @@ MAP_STAGES = {
     "refining": (0.5, 0.75),
     "fusing": (0.75, 0.85),
     "tiling": (0.85, 0.88),
-    "saving": (0.88, 0.92),
+    "saving": (0.88, 0.9),
+    "exporting": (0.9, 0.92),
     "encoding": (0.92, 0.95),
     "calibrating": (0.95, 1.0),
 }

@@ -262,6 +262,16 @@ def test_a_map_with_an_anchor_lies_on_the_earth_where_that_is_asked_for(
     assert np.linalg.det(matrix[:3, :3]) == pytest.approx(1)
 
 
+def test_what_a_tileset_names_takes_the_parameter_that_cesium_hands_on(
+    client: TestClient, uris: list[str]
+) -> None:
+    for path in ("/maps/lobby/versions/1/tileset.json", *uris):
+        plain = client.get(path)
+        handed_on = client.get(f"{path}?crs=EPSG%3A4978")
+        assert plain.status_code == handed_on.status_code == 200
+        assert handed_on.content == plain.content
+
+
 def test_nobody_can_put_a_map_without_an_anchor_on_the_earth(client: TestClient, uris: list[str]) -> None:
     answer = client.get("/maps/lobby/tileset.json?crs=EPSG:4978")
     assert answer.status_code == 422

@@ -45,7 +45,14 @@ export interface StageState {
 }
 
 export const NO_LAYER: LayerState = { url: null, share: 0, loaded: false, problem: null };
-const EMPTY_STAGE: StageState = { problem: null, reference: NO_LAYER, survey: NO_LAYER, drawn: false, extent: null, ceiling: null };
+const EMPTY_STAGE: StageState = {
+  problem: null,
+  reference: NO_LAYER,
+  survey: NO_LAYER,
+  drawn: false,
+  extent: null,
+  ceiling: null,
+};
 
 /** How much of an object's place a survey that did not tell it had seen. */
 export interface Look {
@@ -58,6 +65,12 @@ export interface ObjectLooks {
   history: ObjectHistory;
   looks: Look[]; // of surveys that did not see it, since it was first seen
   tiles: TileProperties[]; // that it lies in, as the latest survey which saw it has them
+}
+
+/** The survey of a map that was captured last, and the last that has a result; null: there is none. */
+export interface Latest {
+  survey: SurveySummaryDocument | null;
+  result: SurveySummaryDocument | null;
 }
 
 export interface Sending {
@@ -93,7 +106,7 @@ export interface State {
   hasKey: boolean;
   asksKey: ProblemDocument | null; // of the request that was refused
   maps: Loaded<MapSummaryDocument[]>;
-  latest: Record<string, SurveySummaryDocument | null>; // by map; null: there is none
+  latest: Record<string, Latest>; // by map
   jobs: JobDocument[]; // that wait or run, and those that failed last
   map: Loaded<MapDocument>;
   versions: Loaded<VersionSummaryDocument[]>;
