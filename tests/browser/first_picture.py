@@ -15,30 +15,30 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
-from playwright.sync_api import Browser, CDPSession, Page
+from playwright.sync_api import Browser, CDPSession
 
 from service.settings import Settings
-from tests.support.browser import new_context, started_browser
+from tests.support.browser import Watch, new_context, started_browser
 from tests.support.live import Live, live
 from tests.support.made_maps import office_points, put_map
+from tests.support.viewer_page import ViewerPage
 from worker.detectors.card import MODEL_STORE
 
 SIZES = (10_000, 100_000, 300_000, 1_000_000, 5_000_000, 20_000_000)
 WHOLE = 1_000_000  #: points; a larger map is a tileset
 FRAMES = 30  #: of a turn of the camera
 
-#: Notes when the scene says that it has drawn points.
+#: Notes when the scene says that it has drawn points; a scene is there a while before its first cloud has come.
 _NOTE = """
-let kept;
-Object.defineProperty(window, "spicd", {
-  configurable: true,
-  get: () => kept,
-  set(value) {
-    kept = value;
-    value.scene?.on("drawn", () => (window.firstPicture ??= performance.now()));
-  },
-});
+let known;
+setInterval(() => {
+  const scene = window.spicd?.scene;
+  if (!scene || scene === known) return;
+  known = scene;
+  scene.on("drawn", () => (window.firstPicture ??= performance.now()));
+}, 2);
 """
 _RENDERER = """() => {
   const context = document.createElement("canvas").getContext("webgl2");
@@ -77,6 +77,7 @@ def main() -> None:
     with TemporaryDirectory() as name, started_browser(gpu=options.gpu) as browser:
         settings = Settings(data_dir=Path(name) / "data", model_store=MODEL_STORE, min_free_bytes=0)
         with live(settings) as service:
+            service.http.get("/maps")  # the first request of all has the API describe itself
             print(f"drawn by {renderer(browser)}\n")
             print(
                 "| points | as | first picture | loaded by then | a frame |\n| ---: | --- | ---: | ---: | ---: |"
@@ -107,13 +108,15 @@ def measure(browser: Browser, service: Live, points: int, *, runs: int) -> Measu
     for run in range(runs):
         context = new_context(browser, service.url)
         context.add_init_script(_NOTE)
-        page = context.new_page()
+        page, watch = context.new_page(), Watch(origin=service.url)
+        watch.follow(page)
         loaded = _Loaded(context.new_cdp_session(page))
         page.goto(f"/#map=points-{points}")
-        page.wait_for_function("window.firstPicture !== undefined", polling=20)
-        firsts.append((float(page.evaluate("window.firstPicture")) / 1000, loaded.bytes))
+        viewer = ViewerPage(page, watch)
+        firsts.append((float(viewer.until("() => window.firstPicture")) / 1000, loaded.bytes))
         if run == 0:
-            frames = _turned(page)
+            viewer.rests()
+            frames = page.evaluate(_TURN, FRAMES)
         context.close()
     middle = sorted(firsts)[len(firsts) // 2]
     return Measured(
@@ -121,22 +124,26 @@ def measure(browser: Browser, service: Live, points: int, *, runs: int) -> Measu
     )
 
 
-def _turned(page: Page) -> list[float]:
-    page.wait_for_load_state("networkidle")
-    taken: list[float] = page.evaluate(_TURN, FRAMES)
-    return taken
-
-
 class _Loaded:
-    """Counts the bytes that a page receives, as they come over the wire."""
+    """Counts the bytes that a page receives, as they come over the wire: packed where they are packed."""
 
     def __init__(self, session: CDPSession) -> None:
-        self.bytes = 0
+        self._by_request: dict[str, float] = {}
         session.on("Network.dataReceived", self._received)
+        session.on("Network.loadingFinished", self._finished)
         session.send("Network.enable")
 
-    def _received(self, event: dict[str, int]) -> None:
-        self.bytes += event["encodedDataLength"] or event["dataLength"]
+    @property
+    def bytes(self) -> int:
+        """Of all requests so far, those that are still under way too."""
+        return int(sum(self._by_request.values()))
+
+    def _received(self, event: dict[str, Any]) -> None:
+        known = self._by_request.get(event["requestId"], 0)
+        self._by_request[event["requestId"]] = known + event["encodedDataLength"]
+
+    def _finished(self, event: dict[str, Any]) -> None:
+        self._by_request[event["requestId"]] = event["encodedDataLength"]
 
 
 def _row(one: Measured) -> str:

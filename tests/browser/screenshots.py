@@ -75,7 +75,7 @@ def main() -> None:
                 _draw(browser, url, _address(shot, MAP, data.surveys), shot, options.to)
         demo = options.demo or _run_demo(folder / "demo")
         with served(_copied(demo, folder / "shown")) as url:
-            shot = Shot("viewer", None, ("show=both",))
+            shot = Shot("viewer", None, ("show=both", "tiles="))
             _draw(browser, url, _address(shot, DEMO, {}), shot, options.to)
 
 

@@ -58,7 +58,7 @@ def test_a_request_to_another_host_is_refused_by_the_policy_and_told_by_the_watc
     assert answer == "refused"
     with pytest.raises(AssertionError, match="connect-src"):
         viewer.watch.raise_complaints()
-    viewer.watch.expect("connect-src|another host")
+    viewer.watch.expect("connect-src|another host|ERR_BLOCKED_BY_CSP|Fetch API cannot load")
 
 
 def test_a_map_is_shown_under_the_path_that_a_proxy_gives_the_service(

@@ -89,8 +89,11 @@ class Watch:
         page.on("console", self._console)
         page.on("pageerror", self._error)
         page.on("request", self._request)
-        page.on("requestfinished", self.pending.discard)
-        page.on("requestfailed", self.pending.discard)
+        page.on("requestfinished", self._ended)
+        page.on("requestfailed", self._ended)
+
+    def _ended(self, request: Request) -> None:
+        self.pending.discard(request)
 
     def _console(self, message: ConsoleMessage) -> None:
         if message.type == "error":

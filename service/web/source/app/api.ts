@@ -31,7 +31,9 @@ export function problemOf(error: unknown): ProblemDocument {
 
 /** Return a name that nobody else takes; `crypto.randomUUID` is only there on HTTPS and localhost. */
 export function unique(): string {
-  return Array.from(crypto.getRandomValues(new Uint8Array(16)), (byte) => byte.toString(16).padStart(2, "0")).join("");
+  return Array.from(crypto.getRandomValues(new Uint8Array(16)), (byte) =>
+    byte.toString(16).padStart(2, "0"),
+  ).join("");
 }
 
 export class Api {
@@ -70,7 +72,10 @@ export class Api {
   };
 
   async get<T>(path: string, signal?: AbortSignal): Promise<T> {
-    const answer = await this.fetch(path, { headers: { Accept: "application/json, application/geo+json" }, ...(signal ? { signal } : {}) });
+    const answer = await this.fetch(path, {
+      headers: { Accept: "application/json, application/geo+json" },
+      ...(signal ? { signal } : {}),
+    });
     return (await answer.json()) as T;
   }
 
@@ -79,7 +84,11 @@ export class Api {
     const headers: Record<string, string> = { Accept: "application/json" };
     if (method === "POST") headers["Idempotency-Key"] = key;
     if (body !== undefined) headers["Content-Type"] = "application/json";
-    const answer = await this.fetch(path, { method, headers, ...(body === undefined ? {} : { body: JSON.stringify(body) }) });
+    const answer = await this.fetch(path, {
+      method,
+      headers,
+      ...(body === undefined ? {} : { body: JSON.stringify(body) }),
+    });
     return (answer.status === 204 ? undefined : await answer.json()) as T;
   }
 
@@ -91,7 +100,7 @@ export class Api {
     signal?: AbortSignal,
   ): Promise<T[]> {
     const all: T[] = [];
-    for (let next: string | undefined = path; next && all.length < most; ) {
+    for (let next: string | undefined = path; next && all.length < most;) {
       const document: D = await this.get<D>(next, signal);
       all.push(...items(document));
       next = document.links.find((link) => link.rel === "next")?.href;

@@ -6,7 +6,15 @@ import { follow, type Line } from "./follow.ts";
 import { count } from "./format.ts";
 import { NOWHERE, readPlace, writePlace, type Place } from "./link.ts";
 import * as loads from "./loads.ts";
-import { firstState, isOpen, nothingOfAMap, type Loaded, type Question, type State, type Theme } from "./state.ts";
+import {
+  firstState,
+  isOpen,
+  nothingOfAMap,
+  type Loaded,
+  type Question,
+  type State,
+  type Theme,
+} from "./state.ts";
 import { kinds } from "./words.ts";
 
 const KEY = "spicd-key"; // in sessionStorage: it goes with the tab
@@ -101,6 +109,11 @@ export class Controller {
     this.update({ line });
   }
 
+  /** Say that the service does not answer; the next event, or sign of life, says that it does. */
+  unreachable(): void {
+    this.#onLine("offline");
+  }
+
   #happened(events: CloudEvent[]): void {
     const { map } = this.state.place;
     if (map && !events.some(({ data }) => data.map_id === map)) return;
@@ -110,14 +123,15 @@ export class Controller {
     for (const { type, data } of events) {
       if (type === "survey.ready") this.tell(`A survey is ready${foundBy(data)}.`);
       if (type === "survey.failed") this.tell("A survey failed; the timeline says why.", "bad");
-      if (type === "version.ready" && map) this.tell(`Version ${String(data["version"])} of the map is ready.`);
+      if (type === "version.ready" && map)
+        this.tell(`Version ${String(data["version"])} of the map is ready.`);
     }
     clearTimeout(this.#refresh);
     this.#refresh = setTimeout(() => this.#again(), SETTLE_MS);
   }
 
   #again(): void {
-    if (this.state.place.map) void loads.map(this, true);
+    if (this.state.place.map) void loads.map(this);
     else void loads.maps(this);
     this.#watchJobs(0);
   }
@@ -127,14 +141,16 @@ export class Controller {
     clearTimeout(this.#jobs);
     if (document.hidden) return;
     this.#jobs = setTimeout(() => {
-      void loads.jobs(this).then(() => this.#watchJobs(this.state.jobs.some(isOpen) ? JOBS_BUSY_MS : JOBS_IDLE_MS));
+      void loads
+        .jobs(this)
+        .then(() => this.#watchJobs(this.state.jobs.some(isOpen) ? JOBS_BUSY_MS : JOBS_IDLE_MS));
     }, after);
   }
 
   /** Look at the jobs at once, for one was made, stopped or run again. */
   jobsChanged(): void {
     this.#watchJobs(0);
-    if (this.state.place.map) void loads.map(this, true);
+    if (this.state.place.map) void loads.map(this);
     else void loads.maps(this);
   }
 
@@ -151,7 +167,8 @@ export class Controller {
       const gone = error instanceof ApiError && (error.code === "not_found" || error.code === "forbidden");
       loaded = { value: gone ? null : before.value, problem: problemOf(error), busy: false };
     }
-    if (map === this.state.place.map && turn === this.#turns[name]) this.update({ [name]: loaded } as Partial<State>);
+    if (map === this.state.place.map && turn === this.#turns[name])
+      this.update({ [name]: loaded } as Partial<State>);
   }
   #turns: Record<string, number> = {};
 

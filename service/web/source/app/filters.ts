@@ -11,7 +11,14 @@ export interface Filters {
   inSection: boolean; // only what the section shows
 }
 
-export const NO_FILTERS: Filters = { kinds: [], statuses: [], device: "", since: "", minScore: 0, inSection: false };
+export const NO_FILTERS: Filters = {
+  kinds: [],
+  statuses: [],
+  device: "",
+  since: "",
+  minScore: 0,
+  inSection: false,
+};
 
 export const PERIODS: readonly (readonly [string, string])[] = [
   ["", "any time"],

@@ -17,7 +17,12 @@ const WAIT_S = 20;
 const PAUSES_MS = [500, 1000, 2000, 5000, 10_000];
 
 /** Follow until `signal` aborts. A failure is told as `offline`, and tried again for ever. */
-export async function follow(api: Api, follower: Follower, signal: AbortSignal, after: string | null = null): Promise<void> {
+export async function follow(
+  api: Api,
+  follower: Follower,
+  signal: AbortSignal,
+  after: string | null = null,
+): Promise<void> {
   const state = { cursor: after, streams: true, failures: 0 };
   while (!signal.aborted) {
     try {

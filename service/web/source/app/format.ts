@@ -69,12 +69,16 @@ export function ago(text: string, now = new Date()): string {
 /** Write the sides of a map: `10 × 8 m, 2.7 m high`. */
 export function extent(bounds: { min: number[]; max: number[] } | null): string {
   if (!bounds) return "";
-  const [x, y, z] = [0, 1, 2].map((axis) => bounds.max[axis]! - bounds.min[axis]!) as [number, number, number];
+  const [x, y, z] = [0, 1, 2].map((axis) => bounds.max[axis]! - bounds.min[axis]!) as [
+    number,
+    number,
+    number,
+  ];
   return `${x.toFixed(x < 10 ? 1 : 0)} × ${y.toFixed(y < 10 ? 1 : 0)} m, ${z.toFixed(1)} m high`;
 }
 
 /** Write an ordinal: `1st`, `2nd`, `11th`. */
 export function ordinal(number: number): string {
   const teens = number % 100 >= 11 && number % 100 <= 13;
-  return `${number}${teens ? "th" : ["th", "st", "nd", "rd"][number % 10] ?? "th"}`;
+  return `${number}${teens ? "th" : (["th", "st", "nd", "rd"][number % 10] ?? "th")}`;
 }

@@ -47,7 +47,13 @@ export function boxOf(place: Box): SceneBox {
 export function itemOfObject(feature: Feature<ObjectProperties>): Item {
   const known = feature.properties;
   const item = itemOfSighting(feature);
-  return { ...item, status: known.status, history: known, firstSeen: known.first_seen ?? known.captured_at, lastSeen: known.last_seen };
+  return {
+    ...item,
+    status: known.status,
+    history: known,
+    firstSeen: known.first_seen ?? known.captured_at,
+    lastSeen: known.last_seen,
+  };
 }
 
 /** Return an object of `/surveys/{id}/objects`. */

@@ -63,7 +63,12 @@ export function listen(app: Controller, stage: Stage): void {
     if (target.closest("dialog, input:not([type=checkbox]), select, textarea")) return;
     const isControl = target.closest("button, a, input, summary") !== null;
     if (isControl && (event.key === "Enter" || event.key === " ")) return;
-    if (event.key.startsWith("Arrow") && target !== document.body && !target.closest("#items, #main, .details")) return;
+    if (
+      event.key.startsWith("Arrow") &&
+      target !== document.body &&
+      !target.closest("#items, #main, .details")
+    )
+      return;
     if (act(event.key, app, stage)) event.preventDefault();
   });
 }

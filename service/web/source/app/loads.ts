@@ -1,5 +1,6 @@
 /** What is asked of the service for what is shown. */
 
+import { ApiError } from "./api.ts";
 import type { Controller } from "./controller.ts";
 import type {
   Box,
@@ -38,18 +39,23 @@ export async function maps(app: Controller): Promise<void> {
   await eachOf(ids, async (id) => {
     const { surveys } = await app.api.get<SurveyList>(`maps/${id}/surveys?limit=${MOST_LATE}`);
     const inOrder = byTime(surveys);
-    const found = { survey: inOrder.at(-1) ?? null, result: inOrder.findLast(({ status }) => status === "ready") ?? null };
+    const found = {
+      survey: inOrder.at(-1) ?? null,
+      result: inOrder.findLast(({ status }) => status === "ready") ?? null,
+    };
     app.update({ latest: { ...app.state.latest, [id]: found } });
   });
 }
 
-/** Ask for all of the map that is shown; `again`: for something of it changed. */
-export async function map(app: Controller, again = false): Promise<void> {
+/** Ask for all of the map that is shown; what is there already stays until the answers are. */
+export async function map(app: Controller): Promise<void> {
   const id = app.state.place.map as string;
   await app.load("map", () => app.api.get<MapDocument>(`maps/${id}`));
   if (!app.state.map.value || app.state.place.map !== id) return;
-  await Promise.all([app.load("surveys", () => surveysOf(app, id)), app.load("versions", () => versionsOf(app, id))]);
-  if (again) app.update({ tiles: {}, looks: NOT_ASKED });
+  await Promise.all([
+    app.load("surveys", () => surveysOf(app, id)),
+    app.load("versions", () => versionsOf(app, id)),
+  ]);
   if (app.state.map.value.status === "ready") await Promise.all([objects(app), ofSurvey(app), ofItem(app)]);
   if (app.state.place.tab === "map") await ofTab(app);
 }
@@ -107,7 +113,11 @@ async function ofSurvey(app: Controller): Promise<void> {
   const chosen = place.survey ? surveys.value?.find(({ survey_id }) => survey_id === place.survey) : null;
   if (chosen?.objects) {
     const path = `surveys/${chosen.survey_id}/objects?limit=1000`;
-    jobs.push(app.load("sightings", () => items(app, path, (one: Feature<SightingProperties>) => itemOfSighting(one))));
+    jobs.push(
+      app.load("sightings", () =>
+        items(app, path, (one: Feature<SightingProperties>) => itemOfSighting(one)),
+      ),
+    );
   }
   if (place.list === "tiles" && (!place.survey || chosen?.status === "ready")) jobs.push(changes(app));
   if (focus?.status === "ready") jobs.push(...place.tiles.map((state) => tiles(app, focus.survey_id, state)));
@@ -117,14 +127,19 @@ async function ofSurvey(app: Controller): Promise<void> {
 async function changes(app: Controller): Promise<void> {
   const { map: id, survey } = app.state.place;
   const path = survey ? `surveys/${survey}/tiles?state=changed&` : `maps/${id}/changes?`;
-  await app.load("changes", () => items(app, `${path}profile=jsonfg&limit=1000`, (one: FgTileFeature) => itemOfTile(one)));
+  await app.load("changes", () =>
+    items(app, `${path}profile=jsonfg&limit=1000`, (one: FgTileFeature) => itemOfTile(one)),
+  );
 }
 
 async function tiles(app: Controller, survey: string, state: string): Promise<void> {
   if (app.state.tiles[state]) return;
   await app.attempt(async () => {
     const path = `surveys/${survey}/tiles?state=${state}&profile=jsonfg&limit=5000`;
-    const features = await app.api.pages(path, (collection: Collection<FgTileFeature>) => collection.features);
+    const features = await app.api.pages(
+      path,
+      (collection: Collection<FgTileFeature>) => collection.features,
+    );
     if (focusOf(app.state)?.survey_id !== survey) return;
     app.update({ tiles: { ...app.state.tiles, [state]: features } });
   });
@@ -159,14 +174,21 @@ async function looksAt(app: Controller, { properties, sightings }: ObjectHistory
   const saw = new Set(sightings.map((sighting) => sighting.properties.survey_id));
   const since = Date.parse(properties.first_seen ?? properties.captured_at);
   const others = (app.state.surveys.value ?? []).filter(
-    (survey) => survey.status === "ready" && survey.objects && !saw.has(survey.survey_id) && Date.parse(survey.captured_at) > since,
+    (survey) =>
+      survey.status === "ready" &&
+      survey.objects &&
+      !saw.has(survey.survey_id) &&
+      Date.parse(survey.captured_at) > since,
   );
   const place = properties.now ?? properties.before;
   const looks = new Map<string, number | null>();
   if (place) {
     await eachOf(others.slice(-MOST_LOOKS), async ({ survey_id }) => {
       const tiles = await tilesAt(app, survey_id, place);
-      looks.set(survey_id, tiles.reduce((total, tile) => total + (tile.observed_share ?? 0), 0) / place.tiles.length);
+      looks.set(
+        survey_id,
+        tiles.reduce((total, tile) => total + (tile.observed_share ?? 0), 0) / place.tiles.length,
+      );
     });
   }
   return others.map((survey) => ({ survey, share: looks.get(survey.survey_id) ?? null }));
@@ -176,15 +198,23 @@ async function looksAt(app: Controller, { properties, sightings }: ObjectHistory
 async function ofTab(app: Controller): Promise<void> {
   const { place, map: shown, survey } = app.state;
   if (place.tab === "map") {
-    await names(app, (shown.value?.scans ?? []).map(({ scan_id }) => scan_id));
+    await names(
+      app,
+      (shown.value?.scans ?? []).map(({ scan_id }) => scan_id),
+    );
   }
-  if (place.tab === "survey") await names(app, (survey.value?.scans ?? []).map(({ scan_id }) => scan_id));
+  if (place.tab === "survey")
+    await names(
+      app,
+      (survey.value?.scans ?? []).map(({ scan_id }) => scan_id),
+    );
 }
 
 /** Ask for the file names of scans, of each once; a scan that cannot be looked at keeps its id. */
 export async function names(app: Controller, ids: string[]): Promise<void> {
   const missing = ids.filter((id) => !(id in app.state.names)).slice(0, MOST_NAMES);
-  if (missing.length) app.update({ names: { ...app.state.names, ...Object.fromEntries(missing.map((id) => [id, ""])) } });
+  if (missing.length)
+    app.update({ names: { ...app.state.names, ...Object.fromEntries(missing.map((id) => [id, ""])) } });
   await eachOf(missing, async (id) => {
     const { filename } = await app.api.get<ScanDocument>(`scans/${id}`);
     app.update({ names: { ...app.state.names, [id]: filename } });
@@ -199,9 +229,11 @@ export async function jobs(app: Controller): Promise<void> {
     const { jobs: known } = await app.api.get<JobList>(`jobs?limit=50${filter}`);
     const before = new Set(app.state.jobs.filter(isOpen).map(({ jobID }) => jobID));
     app.update({ jobs: known.filter((job) => isOpen(job) || failedLately(job)) });
-    if (known.some((job) => !isOpen(job) && before.has(job.jobID)) && app.state.line !== "live") app.jobsChanged();
-  } catch {
-    // the line says whether the service answers
+    if (known.some((job) => !isOpen(job) && before.has(job.jobID)) && app.state.line !== "live")
+      app.jobsChanged();
+  } catch (error) {
+    // a broken stream may tell later
+    if (error instanceof ApiError && error.code === "no_answer") app.unreachable();
   }
 }
 

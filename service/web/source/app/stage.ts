@@ -5,7 +5,16 @@ import type { Box, CloudSource, Layer, View } from "../scene/types.ts";
 import type { Controller } from "./controller.ts";
 import type { MapDocument } from "./documents.ts";
 import { markOf, tileMarkOf } from "./items.ts";
-import { chosenItem, focusOf, NO_LAYER, sectionOf, showOf, shownItems, type LayerState, type State } from "./state.ts";
+import {
+  chosenItem,
+  focusOf,
+  NO_LAYER,
+  sectionOf,
+  showOf,
+  shownItems,
+  type LayerState,
+  type State,
+} from "./state.ts";
 
 const MOST_POINTS = 1_000_000; // of a cloud that is loaded whole, where there is a tileset of it
 const PADDING = 0.6; // metres around an object that the camera flies to
@@ -55,13 +64,16 @@ export class Stage {
       scene.on("drawn", () => this.#drawn(scene));
       this.sync(this.#app.state);
     } catch (error) {
-      const problem = `This browser cannot draw in 3D (${(error as Error).message}). The lists and their details are all there.`;
+      const why = (error as Error).message;
+      const problem = `This browser cannot draw in 3D (${why}). The lists and their details are all there.`;
       this.#app.update({ stage: { ...this.#app.state.stage, problem } });
     }
   }
 
   #drawn({ extent, suggestedCeiling }: Scene): void {
-    this.#app.update({ stage: { ...this.#app.state.stage, drawn: true, extent, ceiling: suggestedCeiling } });
+    this.#app.update({
+      stage: { ...this.#app.state.stage, drawn: true, extent, ceiling: suggestedCeiling },
+    });
   }
 
   #end(): void {
@@ -82,7 +94,9 @@ export class Stage {
     this.#load("survey", showOf(state) === "reference" ? this.#kept(state) : surveyOf(state));
     const show = state.stage.survey.loaded ? showOf(state) : "reference";
     this.#once("show", show, () => scene.show(show));
-    this.#once("marks", shownItems(state), () => scene.setMarks(state.place.list === "tiles" ? [] : shownItems(state).map(markOf)));
+    this.#once("marks", shownItems(state), () =>
+      scene.setMarks(state.place.list === "tiles" ? [] : shownItems(state).map(markOf)),
+    );
     this.#syncTiles(scene, state);
     const section = sectionOf(state);
     if (section) this.#once("section", section.join(), () => scene.setSection(...section));
@@ -100,7 +114,8 @@ export class Stage {
     this.#once("item", item?.id ?? null, () => scene.select(item?.id ?? null));
     if (!state.stage.reference.loaded) return;
     const { view } = state.place;
-    if (view && view !== this.#told) scene.view = this.#told = view; // a link says where to look from
+    if (view && view !== this.#told)
+      scene.view = this.#told = view; // a link says where to look from
     else if (!view && item && this.#flown !== item.id) scene.flyTo(around(item.box, item.from));
     this.#flown = item?.id ?? null;
   }
@@ -146,7 +161,8 @@ export class Stage {
       const found = layer === "reference" ? { extent, ceiling: suggestedCeiling } : {};
       this.#tell(layer, { url: source.url, share: 1, loaded: true, problem: null }, found);
     } catch (error) {
-      if (!signal.aborted) this.#tell(layer, { ...NO_LAYER, url: source.url, problem: (error as Error).message });
+      if (!signal.aborted)
+        this.#tell(layer, { ...NO_LAYER, url: source.url, problem: (error as Error).message });
     }
   }
 
@@ -194,7 +210,9 @@ function referenceOf(state: State): CloudSource | null {
 /** Return the tileset of a large cloud that has one, else its PLY, which is loaded whole. */
 function cloudOf({ links, counts }: Pick<MapDocument, "links" | "counts">, ply: string): CloudSource {
   const tileset = links.find(({ rel }) => rel === "tileset");
-  return tileset && (counts["points"] ?? 0) > MOST_POINTS ? { url: tileset.href, kind: "tileset" } : { url: ply, kind: "ply" };
+  return tileset && (counts["points"] ?? 0) > MOST_POINTS
+    ? { url: tileset.href, kind: "tileset" }
+    : { url: ply, kind: "ply" };
 }
 
 function surveyOf(state: State): CloudSource | null {
@@ -212,5 +230,8 @@ function around(box: Box, from?: Box): Box {
     side === "min"
       ? Math.min(...boxes.map(({ min }) => min[axis]!)) - PADDING
       : Math.max(...boxes.map(({ max }) => max[axis]!)) + PADDING;
-  return { min: [edge("min", 0), edge("min", 1), edge("min", 2)], max: [edge("max", 0), edge("max", 1), edge("max", 2)] };
+  return {
+    min: [edge("min", 0), edge("min", 1), edge("min", 2)],
+    max: [edge("max", 0), edge("max", 1), edge("max", 2)],
+  };
 }

@@ -45,7 +45,14 @@ export interface StageState {
 }
 
 export const NO_LAYER: LayerState = { url: null, share: 0, loaded: false, problem: null };
-const EMPTY_STAGE: StageState = { problem: null, reference: NO_LAYER, survey: NO_LAYER, drawn: false, extent: null, ceiling: null };
+const EMPTY_STAGE: StageState = {
+  problem: null,
+  reference: NO_LAYER,
+  survey: NO_LAYER,
+  drawn: false,
+  extent: null,
+  ceiling: null,
+};
 
 /** How much of an object's place a survey that did not tell it had seen. */
 export interface Look {

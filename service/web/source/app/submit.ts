@@ -19,8 +19,20 @@ export async function addFiles(app: Controller, files: File[]): Promise<void> {
   const known = new Set(chosen.map(({ file }) => `${file.name} ${file.size}`));
   chosen.push(...scans.filter(({ file }) => !known.has(`${file.name} ${file.size}`)));
   app.update({
-    upload: { map: before ? before.map : app.state.place.map, files: chosen.map(({ file }) => rowOf(file)), refused, phase: "choosing", problem: null },
+    upload: {
+      map: before ? before.map : app.state.place.map,
+      files: chosen.map(({ file }) => rowOf(file)),
+      refused,
+      phase: "choosing",
+      problem: null,
+    },
   });
+}
+
+/** Leave a file out again. */
+export function leaveOut(app: Controller, n: number): void {
+  chosen.splice(n, 1);
+  change(app, { files: app.state.upload?.files.filter((_, at) => at !== n) ?? [] });
 }
 
 function rowOf({ name, size }: File): Sending {
@@ -56,11 +68,20 @@ function shared({ device_id, captured_at }: Record<string, string>): Told {
   return { ...(device_id ? { device_id } : {}), ...(captured_at ? { captured_at } : {}) };
 }
 
-async function sendOne(app: Controller, n: number, file: File, told: Told, signal: AbortSignal): Promise<void> {
+async function sendOne(
+  app: Controller,
+  n: number,
+  file: File,
+  told: Told,
+  signal: AbortSignal,
+): Promise<void> {
   const row = (part: Partial<Sending>) =>
-    change(app, { files: app.state.upload?.files.map((one, at) => (at === n ? { ...one, ...part } : one)) ?? [] });
+    change(app, {
+      files: app.state.upload?.files.map((one, at) => (at === n ? { ...one, ...part } : one)) ?? [],
+    });
   row({ problem: null });
-  const progress = (sent: number, waiting: string | null) => row(waiting ? { waiting } : { sent, waiting: null });
+  const progress = (sent: number, waiting: string | null) =>
+    row(waiting ? { waiting } : { sent, waiting: null });
   try {
     const scan = await sendScan(app.api, file, told, progress, localStorage, signal);
     row({ scan, sent: file.size, waiting: null });
@@ -75,8 +96,15 @@ async function askFor(app: Controller, said: Record<string, string>, scans: stri
   idempotencyKey ||= unique(); // the same when it is tried again, so that no second job comes of it
   try {
     const path = map ? `maps/${map}/surveys` : "maps";
-    const body = map ? { ...shared(said), scan_ids: scans } : { name: said["name"] ?? null, id: said["id"] ?? null, scan_ids: scans };
-    const made = await app.api.send<{ map_id: string; survey_id?: string }>("POST", path, body, idempotencyKey);
+    const body = map
+      ? { ...shared(said), scan_ids: scans }
+      : { name: said["name"] ?? null, id: said["id"] ?? null, scan_ids: scans };
+    const made = await app.api.send<{ map_id: string; survey_id?: string }>(
+      "POST",
+      path,
+      body,
+      idempotencyKey,
+    );
     idempotencyKey = "";
     cancel(app);
     if (made.survey_id) app.tell("The survey is being compared with the map.");

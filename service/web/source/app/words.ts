@@ -1,7 +1,13 @@
 /** What is said of surveys, objects, scans and errors. Nothing found is never said where nothing was judged. */
 
 import { count, ordinal, percent, whole } from "./format.ts";
-import type { Counts, JobDocument, MapSummaryDocument, ProblemDocument, SurveySummaryDocument } from "./documents.ts";
+import type {
+  Counts,
+  JobDocument,
+  MapSummaryDocument,
+  ProblemDocument,
+  SurveySummaryDocument,
+} from "./documents.ts";
 
 export type Tone = "changed" | "quiet" | "doubt" | "failed" | "running";
 
@@ -37,13 +43,16 @@ export const TILE_STATES: Record<string, string> = {
 
 /** Say what a survey found, or why it says nothing; `job` is that which compares it. */
 export function sayingOf(survey: SurveySummaryDocument, job?: JobDocument): Saying {
-  if (survey.status === "running") return { tone: "running", short: runningWords(job), long: progressOf(job) };
+  if (survey.status === "running")
+    return { tone: "running", short: runningWords(job), long: progressOf(job) };
   if (survey.status === "failed") return failedSaying(survey);
   if (survey.placement?.state === "in_doubt") {
     return {
       tone: "doubt",
       short: "in doubt",
-      long: `It is in doubt where the scans stand (confidence ${percent(survey.placement.confidence)}), so nothing is said about change.`,
+      long:
+        `It is in doubt where the scans stand (confidence ${percent(survey.placement.confidence)}), ` +
+        "so nothing is said about change.",
       more: "Visit the place again, with pose priors or with scans that show more of what the map holds.",
     };
   }
@@ -55,21 +64,42 @@ function failedSaying({ placement, problem }: SurveySummaryDocument): Saying {
     placement?.state === "refused"
       ? "No scan could be placed on the map. This is not the same as no change: nothing was compared."
       : `The survey failed: ${problem?.title ?? "nobody said why"}. Nothing was compared.`;
-  return { tone: "failed", short: placement?.state === "refused" ? "not registered" : "failed", long, ...(problem ? { more: problem.detail } : {}) };
+  return {
+    tone: "failed",
+    short: placement?.state === "refused" ? "not registered" : "failed",
+    long,
+    ...(problem ? { more: problem.detail } : {}),
+  };
 }
 
 function readySaying(survey: SurveySummaryDocument): Saying {
   const { changed = 0 } = survey.counts;
   const found = survey.objects ? sum(survey.objects) : changed;
-  const moving = survey.moving ? ` ${count(survey.moving, "thing")} moved during the visit and ${survey.moving === 1 ? "is" : "are"} not counted.` : "";
+  const moving = survey.moving
+    ? ` ${count(survey.moving, "thing")} moved during the visit and ${survey.moving === 1 ? "is" : "are"} not counted.`
+    : "";
   const more = `${coverage(survey.counts)}${moving}`.trim();
   if (!found && !changed) {
     const few = lowCoverage(survey.counts);
-    const short = !judged(survey.counts) ? "nothing judged" : few ? "nothing changed in part" : "nothing changed";
-    return { tone: judged(survey.counts) ? "quiet" : "doubt", short, long: nothingChanged(survey.counts), more: few ? more : moving.trim() };
+    const short = !judged(survey.counts)
+      ? "nothing judged"
+      : few
+        ? "nothing changed in part"
+        : "nothing changed";
+    return {
+      tone: judged(survey.counts) ? "quiet" : "doubt",
+      short,
+      long: nothingChanged(survey.counts),
+      more: few ? more : moving.trim(),
+    };
   }
   if (!found) {
-    return { tone: "quiet", short: "no object", long: `No object changed, but ${count(changed, "tile")} did.`, more };
+    return {
+      tone: "quiet",
+      short: "no object",
+      long: `No object changed, but ${count(changed, "tile")} did.`,
+      more,
+    };
   }
   const what = survey.objects
     ? `${count(found, "object")} changed: ${kinds(survey.objects)}.`
@@ -83,7 +113,9 @@ export function nothingChanged(counts: Counts): string {
   if (!judged(counts)) return "No tile was seen well enough to judge. Nothing is said about change.";
   const { inconsistent = 0 } = counts;
   const unseen = unobserved ? `; ${whole(unobserved)} ${unobserved === 1 ? "was" : "were"} not seen` : "";
-  const doubted = inconsistent ? `; ${whole(inconsistent)} ${inconsistent === 1 ? "is" : "are"} in doubt` : "";
+  const doubted = inconsistent
+    ? `; ${whole(inconsistent)} ${inconsistent === 1 ? "is" : "are"} in doubt`
+    : "";
   return `Nothing changed in ${count(judged(counts), "judged tile")}${unseen}${doubted}.`;
 }
 
@@ -92,11 +124,15 @@ export function coverage(counts: Counts): string {
   const { tiles = 0, unobserved = 0, inconsistent = 0 } = counts;
   const words: string[] = [];
   if (lowCoverage(counts)) {
-    words.push(`${percent(unobserved / tiles)} of the map was not seen (${whole(unobserved)} of ${count(tiles, "tile")}): nothing is said about it.`);
+    words.push(
+      `${percent(unobserved / tiles)} of the map was not seen (${whole(unobserved)} of ${count(tiles, "tile")}): ` +
+        "nothing is said about it.",
+    );
   } else if (unobserved) {
     words.push(`${whole(unobserved)} of ${count(tiles, "tile")} not seen.`);
   }
-  if (inconsistent) words.push(`${count(inconsistent, "tile")} in doubt: the registration there is not sure.`);
+  if (inconsistent)
+    words.push(`${count(inconsistent, "tile")} in doubt: the registration there is not sure.`);
   return words.join(" ");
 }
 
@@ -127,7 +163,9 @@ export function objectsOf({ objects }: Pick<MapSummaryDocument, "objects">): str
     ["gone_again", "gone again"],
     ["accepted", "accepted"],
   ];
-  const told = words.filter(([name]) => objects[name]).map(([name, word]) => `${whole(objects[name]!)} ${word}`);
+  const told = words
+    .filter(([name]) => objects[name])
+    .map(([name, word]) => `${whole(objects[name]!)} ${word}`);
   return told.join(", ");
 }
 
@@ -158,11 +196,17 @@ export const REASONS: Record<string, [string, string]> = {
   damaged: ["points as in a damaged file", "send the scan as the sensor gave it"],
   too_few_points: ["too few points", "scan for longer"],
   degenerate: ["its surfaces leave a motion free", "scan where there are more surfaces, in more directions"],
-  too_little_overlap: ["the map covers too little of it", "scan more of the mapped place, or extend the map first"],
+  too_little_overlap: [
+    "the map covers too little of it",
+    "scan more of the mapped place, or extend the map first",
+  ],
   no_fit: ["lies nowhere on the map", "check that it is the right map; give a pose prior"],
   other_place: ["another place", "check that it is the right map"],
   ambiguous: ["fits at two poses or more", "give a pose prior, or scan more of the mapped place"],
-  mirrored: ["its mirror image fits", "look for an axis that is turned round on the way from the sensor to the file"],
+  mirrored: [
+    "its mirror image fits",
+    "look for an axis that is turned round on the way from the sensor to the file",
+  ],
   wrong_scale: ["fits after scaling", "write metres; calibrate the sensor"],
   other_up_axis: ["another axis is up", "write the file with z up"],
   wrong_prior: ["the given pose is far off", "send the scan without a pose, or with a better one"],
@@ -179,7 +223,8 @@ export const REASONS: Record<string, [string, string]> = {
 };
 
 const ADVICE: Record<string, string> = {
-  no_answer: "See that the service runs and the network reaches it. What was sent is kept; it goes on by itself.",
+  no_answer:
+    "See that the service runs and the network reaches it. What was sent is kept; it goes on by itself.",
   unauthorized: "Enter an API key; whoever runs the service makes one with `spicd keys add`.",
   forbidden: "Ask whoever runs the service for a key that may do this, or for this map.",
   scan_unreadable: "Write the file again as PLY or PCD and send that.",

@@ -1,16 +1,44 @@
 import assert from "node:assert/strict";
 import { test } from "node:test";
 
-import { active, beginOf, filtered, NO_FILTERS, tally, toggled } from "../../../../service/web/source/app/filters.ts";
+import {
+  active,
+  beginOf,
+  filtered,
+  NO_FILTERS,
+  tally,
+  toggled,
+} from "../../../../service/web/source/app/filters.ts";
 import { itemOfObject, itemOfTile } from "../../../../service/web/source/app/items.ts";
 import { box, object, tile } from "./samples.ts";
 
 const THURSDAY = new Date(2026, 2, 5, 15, 30); // 5 March 2026, local time
 
 const items = [
-  itemOfObject(object({ object_id: "old", first_seen: "2026-02-20T12:00:00Z", status: "still_there", probability: 0.6 })),
-  itemOfObject(object({ object_id: "late", first_seen: "2026-03-03T12:00:00Z", kind: "moved", before: box(0, 0), device_id: "robot-8" })),
-  itemOfObject(object({ object_id: "upstairs", first_seen: "2026-03-05T10:00:00Z", now: { ...box(2, 2), center: [2, 2, 4.5] } })),
+  itemOfObject(
+    object({
+      object_id: "old",
+      first_seen: "2026-02-20T12:00:00Z",
+      status: "still_there",
+      probability: 0.6,
+    }),
+  ),
+  itemOfObject(
+    object({
+      object_id: "late",
+      first_seen: "2026-03-03T12:00:00Z",
+      kind: "moved",
+      before: box(0, 0),
+      device_id: "robot-8",
+    }),
+  ),
+  itemOfObject(
+    object({
+      object_id: "upstairs",
+      first_seen: "2026-03-05T10:00:00Z",
+      now: { ...box(2, 2), center: [2, 2, 4.5] },
+    }),
+  ),
 ];
 
 function ids(filters: Partial<typeof NO_FILTERS>, section: [number, number] | null = null): string[] {
@@ -31,7 +59,8 @@ test("kinds, statuses, device and probability each keep what they name", () => {
 
 test("a tile where something appeared and something disappeared is of both kinds", () => {
   const both = [itemOfTile(tile({ appeared: 3, disappeared: 4 }))];
-  for (const kind of ["appeared", "disappeared", "both"]) assert.equal(filtered(both, { ...NO_FILTERS, kinds: [kind] }).length, 1);
+  for (const kind of ["appeared", "disappeared", "both"])
+    assert.equal(filtered(both, { ...NO_FILTERS, kinds: [kind] }).length, 1);
   assert.equal(filtered(both, { ...NO_FILTERS, kinds: ["moved"] }).length, 0);
 });
 
@@ -64,5 +93,8 @@ test("filters that are set are counted", () => {
 test("a value is toggled, values are tallied in order", () => {
   assert.deepEqual(toggled(["a"], "b"), ["a", "b"]);
   assert.deepEqual(toggled(["a", "b"], "a"), ["b"]);
-  assert.deepEqual(tally(["b", null, "a", "b"]), [["a", 1], ["b", 2]]);
+  assert.deepEqual(tally(["b", null, "a", "b"]), [
+    ["a", 1],
+    ["b", 2],
+  ]);
 });

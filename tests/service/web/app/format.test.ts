@@ -1,7 +1,18 @@
 import assert from "node:assert/strict";
 import { test } from "node:test";
 
-import { ago, bytes, count, extent, height, instant, metres, ordinal, percent, whole } from "../../../../service/web/source/app/format.ts";
+import {
+  ago,
+  bytes,
+  count,
+  extent,
+  height,
+  instant,
+  metres,
+  ordinal,
+  percent,
+  whole,
+} from "../../../../service/web/source/app/format.ts";
 
 const NOW = new Date("2026-03-05T12:00:00Z");
 
@@ -32,9 +43,14 @@ test("instants are told in local time, and how long ago", () => {
   assert.equal(instant("2026-03-02T09:30:00Z", NOW, "UTC"), "Mon 2 Mar, 09:30");
   assert.match(instant("2025-03-02T09:30:00Z", NOW, "UTC"), /2025/);
   assert.deepEqual(
-    ["2026-03-05T11:59:50Z", "2026-03-05T11:20:00Z", "2026-03-05T07:00:00Z", "2026-03-04T07:00:00Z", "2026-02-20T12:00:00Z", "2026-03-06T12:00:00Z"].map(
-      (text) => ago(text, NOW),
-    ),
+    [
+      "2026-03-05T11:59:50Z",
+      "2026-03-05T11:20:00Z",
+      "2026-03-05T07:00:00Z",
+      "2026-03-04T07:00:00Z",
+      "2026-02-20T12:00:00Z",
+      "2026-03-06T12:00:00Z",
+    ].map((text) => ago(text, NOW)),
     ["just now", "40 min ago", "5 h ago", "a day ago", "13 days ago", "in the future"],
   );
 });

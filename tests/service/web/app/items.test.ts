@@ -1,7 +1,16 @@
 import assert from "node:assert/strict";
 import { test } from "node:test";
 
-import { boxOf, itemOfObject, itemOfSighting, itemOfTile, kindOfTile, markOf, tileMarkOf, whereOf } from "../../../../service/web/source/app/items.ts";
+import {
+  boxOf,
+  itemOfObject,
+  itemOfSighting,
+  itemOfTile,
+  kindOfTile,
+  markOf,
+  tileMarkOf,
+  whereOf,
+} from "../../../../service/web/source/app/items.ts";
 import { box, object, sighting, tile } from "./samples.ts";
 
 test("the box of a place goes around its outline, from floor to top", () => {
@@ -44,6 +53,14 @@ test("a tile has the corners of its place, and the kind of its voxels", () => {
   assert.equal(item.id, "tile:tile_000_001_000");
   assert.equal(item.probability, 0.97);
   assert.deepEqual(tileMarkOf(tile()), { id: item.id, box: item.box, state: "changed", score: 0.93 });
-  const kinds = [{ appeared: 3, disappeared: 0 }, { appeared: 0, disappeared: 4 }, { appeared: 1, disappeared: 1 }, { appeared: null, disappeared: null }];
-  assert.deepEqual(kinds.map((known) => kindOfTile(tile(known).properties)), ["appeared", "disappeared", "both", "changed"]);
+  const kinds = [
+    { appeared: 3, disappeared: 0 },
+    { appeared: 0, disappeared: 4 },
+    { appeared: 1, disappeared: 1 },
+    { appeared: null, disappeared: null },
+  ];
+  assert.deepEqual(
+    kinds.map((known) => kindOfTile(tile(known).properties)),
+    ["appeared", "disappeared", "both", "changed"],
+  );
 });

@@ -19,7 +19,14 @@ test("a place is the same after it was written and read", () => {
     tiles: ["changed", "unobserved"],
     tab: "survey",
     list: "tiles",
-    filters: { kinds: ["appeared", "moved"], statuses: ["new"], device: "robot 7/ä", since: "monday", minScore: 0.5, inSection: true },
+    filters: {
+      kinds: ["appeared", "moved"],
+      statuses: ["new"],
+      device: "robot 7/ä",
+      since: "monday",
+      minScore: 0.5,
+      inSection: true,
+    },
     embed: true,
   };
   assert.deepEqual(readPlace(`#${writePlace(place)}`), place);
@@ -38,7 +45,9 @@ test("no tiles at all is not the same as left out", () => {
 });
 
 test("what cannot be read counts as left out", () => {
-  const place = readPlace("#map=lobby&show=upside&view=1,2,x&section=3,1&tiles=changed,purple&tab=9&min_score=7");
+  const place = readPlace(
+    "#map=lobby&show=upside&view=1,2,x&section=3,1&tiles=changed,purple&tab=9&min_score=7",
+  );
   assert.deepEqual(place, { ...NOWHERE, map: "lobby" });
 });
 
@@ -50,6 +59,10 @@ test("an id that is none does not become part of a path", () => {
 });
 
 test("a camera is kept to the centimetre", () => {
-  const place = { ...NOWHERE, map: "lobby", view: { position: [1.23456, 2, 3], target: [0, 0, 0] } } as Place;
+  const place = {
+    ...NOWHERE,
+    map: "lobby",
+    view: { position: [1.23456, 2, 3], target: [0, 0, 0] },
+  } as Place;
   assert.equal(writePlace(place), "map=lobby&view=1.23,2,3,0,0,0");
 });

@@ -12,7 +12,12 @@ import type {
 
 export function box(x: number, y: number, size = 1): Box {
   const half = size / 2;
-  const corners: [number, number][] = [[x - half, y - half], [x + half, y - half], [x + half, y + half], [x - half, y + half]];
+  const corners: [number, number][] = [
+    [x - half, y - half],
+    [x + half, y - half],
+    [x + half, y + half],
+    [x - half, y + half],
+  ];
   return {
     center: [x, y, half],
     size: [size, size, size],
@@ -69,7 +74,21 @@ export function object(known: Partial<ObjectProperties> = {}): Feature<ObjectPro
 export function tile(known: Partial<TileProperties> = {}): FgTileFeature {
   return {
     id: "survey-1.tile_000_001_000",
-    place: { base: { coordinates: [[[0, 1.5], [1.5, 1.5], [1.5, 3], [0, 3], [0, 1.5]]] }, lower: -0.1, upper: 0.9 },
+    place: {
+      base: {
+        coordinates: [
+          [
+            [0, 1.5],
+            [1.5, 1.5],
+            [1.5, 3],
+            [0, 3],
+            [0, 1.5],
+          ],
+        ],
+      },
+      lower: -0.1,
+      upper: 0.9,
+    },
     properties: {
       tile_id: "tile_000_001_000",
       center: [0.75, 2.25, 0.4],

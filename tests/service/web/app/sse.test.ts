@@ -20,9 +20,13 @@ test("wherever a chunk ends, and whichever line ends are used, the messages are 
     for (const size of [1, 2, 3, 7]) {
       const parser = new SseParser();
       const messages = [];
-      for (let at = 0; at < stream.length; at += size) messages.push(...parser.feed(stream.slice(at, at + size)));
+      for (let at = 0; at < stream.length; at += size)
+        messages.push(...parser.feed(stream.slice(at, at + size)));
       messages.push(...parser.feed("\n").filter(({ data }) => data)); // an end that a lone CR left open
-      assert.deepEqual(messages.filter(({ id }, n) => n === 0 || messages[n - 1]?.id !== id), READ);
+      assert.deepEqual(
+        messages.filter(({ id }, n) => n === 0 || messages[n - 1]?.id !== id),
+        READ,
+      );
     }
   }
 });

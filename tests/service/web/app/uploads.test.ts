@@ -20,29 +20,54 @@ class Tus {
     assert.equal(headers.get("Tus-Resumable"), "1.0.0");
     if (method === "POST") {
       this.metadata = headers.get("Upload-Metadata") ?? "";
-      return new Response(null, { status: 201, headers: { Location: "/uploads/abc", "Upload-Offset": "0" } });
+      return new Response(null, {
+        status: 201,
+        headers: { Location: "/uploads/abc", "Upload-Offset": "0" },
+      });
     }
     if (method === "PATCH") {
       assert.equal(headers.get("Upload-Offset"), String(this.stored.length));
-      this.stored = new Uint8Array([...this.stored, ...new Uint8Array(await (init.body as Blob).arrayBuffer())]);
+      this.stored = new Uint8Array([
+        ...this.stored,
+        ...new Uint8Array(await (init.body as Blob).arrayBuffer()),
+      ]);
     }
     const done = this.stored.length === 9 << 20;
-    return new Response(null, { status: method === "PATCH" ? 204 : 200, headers: { "Upload-Offset": String(this.stored.length), ...(done ? { "Scan-Id": "scan-1" } : {}) } });
+    return new Response(null, {
+      status: method === "PATCH" ? 204 : 200,
+      headers: {
+        "Upload-Offset": String(this.stored.length),
+        ...(done ? { "Scan-Id": "scan-1" } : {}),
+      },
+    });
   };
 }
 
 const memory = (): Memory & { kept: Map<string, string> } => {
   const kept = new Map<string, string>();
-  return { kept, getItem: (name) => kept.get(name) ?? null, setItem: (name, value) => void kept.set(name, value), removeItem: (name) => void kept.delete(name) };
+  return {
+    kept,
+    getItem: (name) => kept.get(name) ?? null,
+    setItem: (name, value) => void kept.set(name, value),
+    removeItem: (name) => void kept.delete(name),
+  };
 };
 const file = () => new File([new Uint8Array(9 << 20)], "hall ä.ply", { lastModified: 1 });
-const problem = (code: string, status: number) => Response.json({ type: `urn:spicd:problem:${code}`, title: "", detail: code, status }, { status });
+const problem = (code: string, status: number) =>
+  Response.json({ type: `urn:spicd:problem:${code}`, title: "", detail: code, status }, { status });
 
 test("a file goes in pieces and becomes a scan; nothing of it is remembered then", async () => {
   const tus = new Tus();
   const kept = memory();
   const seen: number[] = [];
-  const scan = await sendScan(new Api("http://host/", tus.fetch as typeof fetch), file(), { device_id: "robot-7" }, (sent) => seen.push(sent), kept, new AbortController().signal);
+  const scan = await sendScan(
+    new Api("http://host/", tus.fetch as typeof fetch),
+    file(),
+    { device_id: "robot-7" },
+    (sent) => seen.push(sent),
+    kept,
+    new AbortController().signal,
+  );
   assert.equal(scan, "scan-1");
   assert.deepEqual(seen, [0, 4 << 20, 8 << 20, 9 << 20]);
   assert.equal(tus.metadata, `filename ${base64("hall ä.ply")},device_id ${base64("robot-7")}`);
@@ -77,7 +102,14 @@ test("a service that is away for a moment is waited for", async (context) => {
     if (waiting) setImmediate(() => context.mock.timers.tick(60_000));
     if (waiting) waits.push(waiting);
   };
-  const scan = await sendScan(new Api("http://host/", tus.fetch as typeof fetch), file(), {}, progress, memory(), new AbortController().signal);
+  const scan = await sendScan(
+    new Api("http://host/", tus.fetch as typeof fetch),
+    file(),
+    {},
+    progress,
+    memory(),
+    new AbortController().signal,
+  );
   assert.equal(scan, "scan-1");
   assert.deepEqual(waits, ["unavailable", "unavailable"]);
 });
@@ -85,7 +117,14 @@ test("a service that is away for a moment is waited for", async (context) => {
 test("a refusal is final, and told word by word", async () => {
   const tus = new Tus();
   tus.refuse = (method) => (method === "POST" ? problem("scan_unreadable", 422) : null);
-  const sent = sendScan(new Api("http://host/", tus.fetch as typeof fetch), file(), {}, () => {}, memory(), new AbortController().signal);
+  const sent = sendScan(
+    new Api("http://host/", tus.fetch as typeof fetch),
+    file(),
+    {},
+    () => {},
+    memory(),
+    new AbortController().signal,
+  );
   await assert.rejects(sent, (error: ApiError) => error.code === "scan_unreadable");
 });
 
@@ -99,9 +138,15 @@ test("sidecars go with their scans, and what is no scan is refused with a reason
     new File([], "empty.ply"),
     new File(["{}"], "lost.pose.json"),
   ]);
-  assert.deepEqual(scans.map(({ file: { name }, told }) => [name, told]), [
-    ["hall.ply", { pose: "[1,2,0,0,0,0,1]", captured_at: "2026-03-01T12:00:00Z" }],
-    ["stairs.pcd", { pose: "1 2 0 0 0 0 1" }],
-  ]);
-  assert.deepEqual(refused.map(({ name }) => name), ["notes.docx", "empty.ply", "lost.pose.json"]);
+  assert.deepEqual(
+    scans.map(({ file: { name }, told }) => [name, told]),
+    [
+      ["hall.ply", { pose: "[1,2,0,0,0,0,1]", captured_at: "2026-03-01T12:00:00Z" }],
+      ["stairs.pcd", { pose: "1 2 0 0 0 0 1" }],
+    ],
+  );
+  assert.deepEqual(
+    refused.map(({ name }) => name),
+    ["notes.docx", "empty.ply", "lost.pose.json"],
+  );
 });

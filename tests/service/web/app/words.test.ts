@@ -2,7 +2,14 @@ import assert from "node:assert/strict";
 import { test } from "node:test";
 
 import type { JobDocument } from "../../../../service/web/source/app/documents.ts";
-import { adviceOn, coverage, nothingChanged, objectsOf, progressOf, sayingOf } from "../../../../service/web/source/app/words.ts";
+import {
+  adviceOn,
+  coverage,
+  nothingChanged,
+  objectsOf,
+  progressOf,
+  sayingOf,
+} from "../../../../service/web/source/app/words.ts";
 import { survey } from "./samples.ts";
 
 const QUIET = { tiles: 125, unchanged: 116, changed: 0, inconsistent: 0, unobserved: 9 };
@@ -17,11 +24,19 @@ test("a quiet survey says in how many judged tiles nothing changed, and how many
 test("a survey of half a map does not say that nothing changed in all of it", () => {
   const saying = sayingOf(survey({ counts: { ...QUIET, unchanged: 60, unobserved: 65 }, objects: NONE }));
   assert.equal(saying.short, "nothing changed in part");
-  assert.match(saying.more ?? "", /52 % of the map was not seen \(65 of 125 tiles\): nothing is said about it/);
+  assert.match(
+    saying.more ?? "",
+    /52 % of the map was not seen \(65 of 125 tiles\): nothing is said about it/,
+  );
 });
 
 test("where no tile could be judged nothing is said about change", () => {
-  const saying = sayingOf(survey({ counts: { tiles: 10, unchanged: 0, changed: 0, inconsistent: 0, unobserved: 10 }, objects: NONE }));
+  const saying = sayingOf(
+    survey({
+      counts: { tiles: 10, unchanged: 0, changed: 0, inconsistent: 0, unobserved: 10 },
+      objects: NONE,
+    }),
+  );
   assert.equal(saying.tone, "doubt");
   assert.match(saying.long, /Nothing is said about change/);
   assert.doesNotMatch(saying.long, /^Nothing changed/);
@@ -40,8 +55,20 @@ test("a model that tells tiles alone counts tiles", () => {
 });
 
 test("a survey without a scan that is placed is no quiet one", () => {
-  const problem = { type: "urn:spicd:problem:registration_failed", title: "No scan could be registered", detail: "scan a.pcd: ..." };
-  const saying = sayingOf(survey({ status: "failed", placement: { state: "refused", confidence: null }, problem, counts: {}, objects: null }));
+  const problem = {
+    type: "urn:spicd:problem:registration_failed",
+    title: "No scan could be registered",
+    detail: "scan a.pcd: ...",
+  };
+  const saying = sayingOf(
+    survey({
+      status: "failed",
+      placement: { state: "refused", confidence: null },
+      problem,
+      counts: {},
+      objects: null,
+    }),
+  );
   assert.equal(saying.short, "not registered");
   assert.match(saying.long, /not the same as no change/);
 });
@@ -53,19 +80,33 @@ test("a survey in doubt says nothing about change", () => {
 });
 
 test("inconsistent tiles are neither changed nor unchanged", () => {
-  assert.equal(nothingChanged({ ...QUIET, unchanged: 110, inconsistent: 6 }), "Nothing changed in 110 judged tiles; 9 were not seen; 6 are in doubt.");
+  assert.equal(
+    nothingChanged({ ...QUIET, unchanged: 110, inconsistent: 6 }),
+    "Nothing changed in 110 judged tiles; 9 were not seen; 6 are in doubt.",
+  );
   assert.match(coverage({ ...QUIET, inconsistent: 6 }), /6 tiles in doubt/);
 });
 
 test("a job tells its stage, how far it is, and its place in the queue", () => {
-  const job = { status: "running", message: "registering", progress: 40, queue_position: null } as JobDocument;
+  const job = {
+    status: "running",
+    message: "registering",
+    progress: 40,
+    queue_position: null,
+  } as JobDocument;
   assert.equal(progressOf(job), "Registering, 40 %");
   assert.equal(progressOf({ ...job, message: "waiting", queue_position: 1 }), "Waiting, next in the queue");
-  assert.equal(progressOf({ ...job, message: "waiting", queue_position: 4 }), "Waiting, number 4 in the queue");
+  assert.equal(
+    progressOf({ ...job, message: "waiting", queue_position: 4 }),
+    "Waiting, number 4 in the queue",
+  );
 });
 
 test("objects of a map are told by status, those that count now first", () => {
-  assert.equal(objectsOf({ objects: { new: 2, still_there: 5, gone_again: 1, unknown: 0, accepted: 0 } }), "2 new, 5 still there, 1 gone again");
+  assert.equal(
+    objectsOf({ objects: { new: 2, still_there: 5, gone_again: 1, unknown: 0, accepted: 0 } }),
+    "2 new, 5 still there, 1 gone again",
+  );
 });
 
 test("problems come with what to do", () => {

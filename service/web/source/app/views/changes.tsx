@@ -26,7 +26,11 @@ export function Changes(props: Props) {
             Tiles
           </button>
         </div>
-        <button aria-expanded={state.filtersOpen} aria-controls="filters" onClick={() => app.update({ filtersOpen: !state.filtersOpen })}>
+        <button
+          aria-expanded={state.filtersOpen}
+          aria-controls="filters"
+          onClick={() => app.update({ filtersOpen: !state.filtersOpen })}
+        >
           {set ? `Filters (${set})` : "Filters"}
         </button>
       </div>
@@ -52,7 +56,8 @@ function words(state: State, items: readonly Item[]): string {
 function List({ app, state, items }: Props & { items: readonly Item[] }) {
   const source = sourceOf(state);
   if (source.problem) return <Problem problem={source.problem} again={() => app.jobsChanged()} />;
-  if (!items.length) return source.value ? <NoItems app={app} state={state} /> : <NothingYet app={app} state={state} />;
+  if (!items.length)
+    return source.value ? <NoItems app={app} state={state} /> : <NothingYet app={app} state={state} />;
   return (
     <ul
       class="items"
@@ -63,7 +68,12 @@ function List({ app, state, items }: Props & { items: readonly Item[] }) {
       aria-activedescendant={state.place.item ? rowId(state.place.item) : undefined}
     >
       {items.map((item) => (
-        <Row key={item.id} item={item} chosen={item.id === state.place.item} choose={() => app.go({ item: item.id, view: null })} />
+        <Row
+          key={item.id}
+          item={item}
+          chosen={item.id === state.place.item}
+          choose={() => app.go({ item: item.id, view: null })}
+        />
       ))}
     </ul>
   );
@@ -81,7 +91,13 @@ export function rowId(item: string): string {
 function Row({ item, chosen, choose }: { item: Item; chosen: boolean; choose: () => void }) {
   const faint = item.status === "gone_again" || item.status === "accepted";
   return (
-    <li id={rowId(item.id)} role="option" aria-selected={chosen} class={`item ${faint ? "item-faint" : ""}`} onClick={choose}>
+    <li
+      id={rowId(item.id)}
+      role="option"
+      aria-selected={chosen}
+      class={`item ${faint ? "item-faint" : ""}`}
+      onClick={choose}
+    >
       <Kind kind={item.kind} />
       <span class="item-title">
         <strong>{KINDS[item.kind] ?? item.kind}</strong> {item.title}
@@ -90,7 +106,9 @@ function Row({ item, chosen, choose }: { item: Item; chosen: boolean; choose: ()
         {percent(item.probability)}
       </span>
       <span class="item-more">
-        {item.status && <span class={`status status-${item.status}`}>{STATUSES[item.status]?.[0] ?? item.status}</span>}
+        {item.status && (
+          <span class={`status status-${item.status}`}>{STATUSES[item.status]?.[0] ?? item.status}</span>
+        )}
         {item.history?.transient && <span class="status">comes and goes</span>}
         <span title={ago(item.firstSeen)}>since {instant(item.firstSeen)}</span>
         <span>{whereOf(item)}</span>
@@ -118,7 +136,10 @@ function NothingYet({ app, state }: Pick<Props, "app" | "state">) {
   if (!surveys.value.length) {
     return (
       <Empty title="No survey yet.">
-        <p>Nothing has been compared with this map. Drop the scans of a later visit anywhere on the page, or choose them:</p>
+        <p>
+          Nothing has been compared with this map. Drop the scans of a later visit anywhere on the page, or
+          choose them:
+        </p>
         <button class="primary" onClick={() => app.update({ upload: newUpload(place.map) })}>
           Add a survey
         </button>
@@ -126,10 +147,20 @@ function NothingYet({ app, state }: Pick<Props, "app" | "state">) {
     );
   }
   if (sourceOf(state).busy) return <Waiting>Asking for what changed…</Waiting>;
-  const survey = place.survey ? surveys.value.find(({ survey_id }) => survey_id === place.survey) : focusOf(state);
-  if (!survey) return <Empty title={place.survey ? "There is no such survey of this map." : "No survey has a result yet."} />;
+  const survey = place.survey
+    ? surveys.value.find(({ survey_id }) => survey_id === place.survey)
+    : focusOf(state);
+  if (!survey)
+    return (
+      <Empty title={place.survey ? "There is no such survey of this map." : "No survey has a result yet."} />
+    );
   const { long, more } = sayingOf(survey, jobOf(state, survey.job_id));
-  if (survey.status === "ready" && !survey.objects && place.list === "objects" && survey.placement?.state !== "in_doubt") {
+  if (
+    survey.status === "ready" &&
+    !survey.objects &&
+    place.list === "objects" &&
+    survey.placement?.state !== "in_doubt"
+  ) {
     return (
       <Empty title={`${survey.model} tells tiles, and no objects.`}>
         <button onClick={() => app.go({ list: "tiles" })}>List the changed tiles</button>
@@ -137,9 +168,13 @@ function NothingYet({ app, state }: Pick<Props, "app" | "state">) {
     );
   }
   return (
-    <Empty title={place.survey ? long : `The latest survey with a result, ${instant(survey.captured_at)}: ${long}`}>
+    <Empty
+      title={place.survey ? long : `The latest survey with a result, ${instant(survey.captured_at)}: ${long}`}
+    >
       {more && <p>{more}</p>}
-      {survey.status === "failed" && <button onClick={() => app.go({ survey: survey.survey_id, tab: "survey" })}>Why, scan by scan</button>}
+      {survey.status === "failed" && (
+        <button onClick={() => app.go({ survey: survey.survey_id, tab: "survey" })}>Why, scan by scan</button>
+      )}
     </Empty>
   );
 }
@@ -151,7 +186,13 @@ function FilterForm({ app, state }: Props) {
   const devices = tally((state.surveys.value ?? []).map(({ device_id }) => device_id)).map(([name]) => name);
   return (
     <form id="filters" class="filters" onSubmit={(event) => event.preventDefault()}>
-      <Choices legend="Kind" chosen={filters.kinds} known={tally(all.map(({ kind }) => kind))} word={(kind) => KINDS[kind] ?? kind} pick={(kinds) => set({ kinds })} />
+      <Choices
+        legend="Kind"
+        chosen={filters.kinds}
+        known={tally(all.map(({ kind }) => kind))}
+        word={(kind) => KINDS[kind] ?? kind}
+        pick={(kinds) => set({ kinds })}
+      />
       {state.place.list === "objects" && !state.place.survey && (
         <Choices
           legend="Status"
@@ -163,20 +204,33 @@ function FilterForm({ app, state }: Props) {
       )}
       <label>
         First seen
-        <select value={isDay(filters.since) ? "day" : filters.since} onChange={({ currentTarget }) => set({ since: currentTarget.value === "day" ? today() : currentTarget.value })}>
+        <select
+          value={isDay(filters.since) ? "day" : filters.since}
+          onChange={({ currentTarget }) =>
+            set({ since: currentTarget.value === "day" ? today() : currentTarget.value })
+          }
+        >
           {PERIODS.map(([value, word]) => (
             <option value={value}>{word}</option>
           ))}
           <option value="day">since a day…</option>
         </select>
         {isDay(filters.since) && (
-          <input type="date" aria-label="First seen since" value={filters.since} onChange={({ currentTarget }) => set({ since: currentTarget.value })} />
+          <input
+            type="date"
+            aria-label="First seen since"
+            value={filters.since}
+            onChange={({ currentTarget }) => set({ since: currentTarget.value })}
+          />
         )}
       </label>
       {devices.length > 0 && (
         <label>
           Device
-          <select value={filters.device} onChange={({ currentTarget }) => set({ device: currentTarget.value })}>
+          <select
+            value={filters.device}
+            onChange={({ currentTarget }) => set({ device: currentTarget.value })}
+          >
             <option value="">any</option>
             {devices.map((device) => (
               <option value={device}>{device}</option>
@@ -186,10 +240,21 @@ function FilterForm({ app, state }: Props) {
       )}
       <label>
         Probability at least {percent(filters.minScore)}
-        <input type="range" min={0} max={0.95} step={0.05} value={filters.minScore} onInput={({ currentTarget }) => set({ minScore: Number(currentTarget.value) })} />
+        <input
+          type="range"
+          min={0}
+          max={0.95}
+          step={0.05}
+          value={filters.minScore}
+          onInput={({ currentTarget }) => set({ minScore: Number(currentTarget.value) })}
+        />
       </label>
       <label class="check">
-        <input type="checkbox" checked={filters.inSection} onChange={({ currentTarget }) => set({ inSection: currentTarget.checked })} />
+        <input
+          type="checkbox"
+          checked={filters.inSection}
+          onChange={({ currentTarget }) => set({ inSection: currentTarget.checked })}
+        />
         only at the heights that are shown, such as one floor
       </label>
       {active(filters) > 0 && (
@@ -210,13 +275,19 @@ interface ChoicesProps {
 }
 
 function Choices({ legend, chosen, known, word, pick }: ChoicesProps) {
-  const missing = chosen.filter((value) => !known.some(([name]) => name === value)).map((value): [string, number] => [value, 0]);
+  const missing = chosen
+    .filter((value) => !known.some(([name]) => name === value))
+    .map((value): [string, number] => [value, 0]);
   return (
     <fieldset class="choices">
       <legend>{legend}</legend>
       {[...known, ...missing].map(([value, number]) => (
         <label class="choice">
-          <input type="checkbox" checked={chosen.includes(value)} onChange={() => pick(toggled(chosen, value))} />
+          <input
+            type="checkbox"
+            checked={chosen.includes(value)}
+            onChange={() => pick(toggled(chosen, value))}
+          />
           {word(value)} <span class="number">{number}</span>
         </label>
       ))}
@@ -230,5 +301,7 @@ function isDay(since: string): boolean {
 
 function today(): string {
   const now = new Date();
-  return [now.getFullYear(), now.getMonth() + 1, now.getDate()].map((part) => String(part).padStart(2, "0")).join("-");
+  return [now.getFullYear(), now.getMonth() + 1, now.getDate()]
+    .map((part) => String(part).padStart(2, "0"))
+    .join("-");
 }

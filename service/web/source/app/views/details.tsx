@@ -11,7 +11,8 @@ import { KINDS, STATUSES, TILE_STATES } from "../words.ts";
 import { follow, type Props } from "./page.tsx";
 import { Empty, Fact, Kind, Problem, Share, Waiting } from "./parts.tsx";
 
-const ENOUGH = 0.5; // share of a place that a survey has to see to say that something is gone (service/catalog/tracking.py)
+/** Share of a place that a survey has to see to say that something is gone (service/catalog/tracking.py). */
+const ENOUGH = 0.5;
 
 export function Details(props: Props) {
   const { app, state } = props;
@@ -77,11 +78,18 @@ function About(props: Props & { item: Item }) {
 function Doubts({ item }: { item: Item }) {
   const { history, sighting } = item;
   const words: string[] = [];
-  if (item.probability < 0.7) words.push(`Not sure: the probability that something changed is ${percent(item.probability)}.`);
+  if (item.probability < 0.7)
+    words.push(`Not sure: the probability that something changed is ${percent(item.probability)}.`);
   const share = sighting?.observed_share ?? item.tile?.observed_share;
-  if (share != null && share < ENOUGH) words.push(`Only ${percent(share)} of it could be judged, so its size and shape may be others.`);
-  if (sighting?.scans_seen_through === 0) words.push("No scan of the other visit saw through where it is; it may have been hidden there.");
-  if (history?.status === "unknown") words.push(`The latest survey did not look there. ${lastKnown(history.last_known)} when one looked last, ${instant(history.last_looked)}.`);
+  if (share != null && share < ENOUGH)
+    words.push(`Only ${percent(share)} of it could be judged, so its size and shape may be others.`);
+  if (sighting?.scans_seen_through === 0)
+    words.push("No scan of the other visit saw through where it is; it may have been hidden there.");
+  if (history?.status === "unknown")
+    words.push(
+      `The latest survey did not look there. ${lastKnown(history.last_known)} ` +
+        `when one looked last, ${instant(history.last_looked)}.`,
+    );
   if (history?.transient) words.push("It comes and goes: it was seen, gone, and seen again.");
   if (!words.length) return null;
   return (
@@ -120,16 +128,26 @@ function AboutObject({ app, item }: Props & { item: Item }) {
       {motion && (
         <Fact name="Moved">
           by {metres(Math.hypot(...motion.translation))}
-          {motion.yaw_degrees !== null && Math.abs(motion.yaw_degrees) >= 5 ? `, turned by ${Math.abs(motion.yaw_degrees).toFixed(0)}°` : ""}
+          {motion.yaw_degrees !== null && Math.abs(motion.yaw_degrees) >= 5
+            ? `, turned by ${Math.abs(motion.yaw_degrees).toFixed(0)}°`
+            : ""}
         </Fact>
       )}
       <Fact name="First seen">
         {instant(item.firstSeen)} ({ago(item.firstSeen)})
       </Fact>
-      {history && <Fact name="Last seen">{instant(history.last_seen)}, in {count(history.sightings, "survey")}</Fact>}
+      {history && (
+        <Fact name="Last seen">
+          {instant(history.last_seen)}, in {count(history.sightings, "survey")}
+        </Fact>
+      )}
       {history && <Fact name="Last looked">{instant(history.last_looked)}</Fact>}
-      {history?.accepted_in_version && <Fact name="Taken over">by version {history.accepted_in_version} of the map</Fact>}
-      <Fact name="Volume">{place && `${(place.volume * 1000).toFixed(0)} litres, ${place.points} points`}</Fact>
+      {history?.accepted_in_version && (
+        <Fact name="Taken over">by version {history.accepted_in_version} of the map</Fact>
+      )}
+      <Fact name="Volume">
+        {place && `${(place.volume * 1000).toFixed(0)} litres, ${place.points} points`}
+      </Fact>
       <Fact name="Survey">
         <SurveyLink app={app} id={item.surveyId}>
           {instant(seen.captured_at)}
@@ -160,7 +178,9 @@ function AboutTile({ tile, item }: { tile: TileProperties; item: Item }) {
       <Fact name="Score" hint="probability of change">
         <Share value={tile.score} label="Probability of change" />
       </Fact>
-      <Fact name="Threshold">{tile.threshold === null ? null : `${percent(tile.threshold)}: changed above it`}</Fact>
+      <Fact name="Threshold">
+        {tile.threshold === null ? null : `${percent(tile.threshold)}: changed above it`}
+      </Fact>
       <Fact name="Seen" hint="share of the tile that the survey could judge">
         <Share value={tile.observed_share} label="Share that the survey could judge" />
       </Fact>
@@ -199,7 +219,11 @@ function Tiles({ app, state, item }: Props & { item: Item }) {
         </thead>
         <tbody>
           {value.tiles.map((tile) => (
-            <TileRow key={tile.tile_id} tile={tile} show={() => app.go({ list: "tiles", item: `tile:${tile.tile_id}` })} />
+            <TileRow
+              key={tile.tile_id}
+              tile={tile}
+              show={() => app.go({ list: "tiles", item: `tile:${tile.tile_id}` })}
+            />
           ))}
         </tbody>
       </table>
@@ -235,8 +259,18 @@ function History({ app, state, item }: Props & { item: Item }) {
   if (problem) return <Problem problem={problem} />;
   if (!value || value.id !== item.id) return <Waiting>Asking for its history…</Waiting>;
   const rows = [
-    ...value.history.sightings.map(({ properties: seen }) => ({ at: seen.captured_at, survey: seen.survey_id, seen: true, text: sawIt(seen) })),
-    ...value.looks.map((look) => ({ at: look.survey.captured_at, survey: look.survey.survey_id, seen: false, text: lookedThere(look) })),
+    ...value.history.sightings.map(({ properties: seen }) => ({
+      at: seen.captured_at,
+      survey: seen.survey_id,
+      seen: true,
+      text: sawIt(seen),
+    })),
+    ...value.looks.map((look) => ({
+      at: look.survey.captured_at,
+      survey: look.survey.survey_id,
+      seen: false,
+      text: lookedThere(look),
+    })),
   ].sort((one, other) => Date.parse(one.at) - Date.parse(other.at));
   return (
     <section>
@@ -256,11 +290,13 @@ function History({ app, state, item }: Props & { item: Item }) {
 }
 
 function sawIt(seen: SightingProperties): string {
-  return `${(KINDS[seen.kind] ?? seen.kind).toLowerCase()}, ${percent(seen.probability)}${seen.device_id ? `, ${seen.device_id}` : ""}`;
+  const words = [(KINDS[seen.kind] ?? seen.kind).toLowerCase(), percent(seen.probability), seen.device_id];
+  return words.filter(Boolean).join(", ");
 }
 
 function lookedThere({ share }: Look): string {
   if (share === null) return "did not tell it";
-  return share >= ENOUGH ? `saw ${percent(share)} of its place, and did not find it` : `did not look there: saw ${percent(share)} of its place`;
+  return share >= ENOUGH
+    ? `saw ${percent(share)} of its place, and did not find it`
+    : `did not look there: saw ${percent(share)} of its place`;
 }
-

@@ -14,22 +14,43 @@ export function Dialogs({ app, state }: Props) {
   const close = () => app.update({ dialog: null });
   return (
     <>
-      <dialog ref={(element) => shown(element, dialog === "help")} onClose={() => dialog === "help" && close()} aria-labelledby="help-title">
+      <dialog
+        ref={(element) => shown(element, dialog === "help")}
+        onClose={() => dialog === "help" && close()}
+        aria-labelledby="help-title"
+      >
         <Help app={app} state={state} close={close} />
       </dialog>
-      <dialog ref={(element) => shown(element, dialog === "key")} onClose={() => dialog === "key" && close()} aria-labelledby="key-title">
+      <dialog
+        ref={(element) => shown(element, dialog === "key")}
+        onClose={() => dialog === "key" && close()}
+        aria-labelledby="key-title"
+      >
         {dialog === "key" && <KeyForm app={app} refused={state.asksKey?.detail ?? ""} had={state.hasKey} />}
       </dialog>
-      <dialog ref={(element) => shown(element, dialog === "share")} onClose={() => dialog === "share" && close()} aria-labelledby="share-title">
+      <dialog
+        ref={(element) => shown(element, dialog === "share")}
+        onClose={() => dialog === "share" && close()}
+        aria-labelledby="share-title"
+      >
         <form method="dialog">
           <h2 id="share-title">Link to this view</h2>
-          <input readOnly aria-label="Link" value={location.href} onFocus={({ currentTarget }) => currentTarget.select()} />
+          <input
+            readOnly
+            aria-label="Link"
+            value={location.href}
+            onFocus={({ currentTarget }) => currentTarget.select()}
+          />
           <div class="row end">
             <button class="primary">Close</button>
           </div>
         </form>
       </dialog>
-      <dialog ref={(element) => shown(element, question !== null)} onClose={() => app.update({ question: null })} aria-labelledby="question-title">
+      <dialog
+        ref={(element) => shown(element, question !== null)}
+        onClose={() => app.update({ question: null })}
+        aria-labelledby="question-title"
+      >
         {question && <Ask app={app} question={question} />}
       </dialog>
     </>
@@ -53,8 +74,8 @@ function Help({ app, state, close }: Pick<Props, "app" | "state"> & { close: () 
         ))}
       </dl>
       <p class="faint">
-        In the scene: drag to turn, right-drag or two fingers to shift, wheel or pinch to come nearer. <a href="docs">The API</a> has all that is shown
-        here.
+        In the scene: drag to turn, right-drag or two fingers to shift, wheel or pinch to come nearer.{" "}
+        <a href="docs">The API</a> has all that is shown here.
       </p>
       <div class="row end">
         <ThemeButton app={app} state={state} always />
@@ -77,11 +98,19 @@ function KeyForm({ app, refused, had }: { app: Controller; refused: string; had:
       <h2 id="key-title">This service asks for an API key</h2>
       {had && <p class="warning">{capital(refused)}.</p>}
       <p>
-        Whoever runs the service makes one with <code>spicd keys add</code>. It stays in this tab and goes when the tab is closed.
+        Whoever runs the service makes one with <code>spicd keys add</code>. It stays in this tab and goes
+        when the tab is closed.
       </p>
       <label>
         Key
-        <input name="key" type="password" autocomplete="current-password" placeholder="spicd_…" required autofocus />
+        <input
+          name="key"
+          type="password"
+          autocomplete="current-password"
+          placeholder="spicd_…"
+          required
+          autofocus
+        />
       </label>
       <div class="row end">
         <button class="primary">Use it</button>

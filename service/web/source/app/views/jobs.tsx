@@ -8,7 +8,11 @@ import { isOpen, type State } from "../state.ts";
 import { progressOf } from "../words.ts";
 import { Problem } from "./parts.tsx";
 
-const WORK: Record<string, string> = { map: "Building the map", survey: "Comparing a survey", model: "Training a model" };
+const WORK: Record<string, string> = {
+  map: "Building the map",
+  survey: "Comparing a survey",
+  model: "Training a model",
+};
 
 /** Show the jobs of the map that wait or run. */
 export function OpenJobs({ app, state }: { app: Controller; state: State }) {
@@ -32,7 +36,11 @@ export function JobRow({ app, job }: { app: Controller; job: JobDocument }) {
       </div>
       {isOpen(job) && (
         <div class="job-bar">
-          <progress max={100} value={job.progress} aria-label={`${WORK[job.processID] ?? job.processID}: ${progressOf(job)}`} />
+          <progress
+            max={100}
+            value={job.progress}
+            aria-label={`${WORK[job.processID] ?? job.processID}: ${progressOf(job)}`}
+          />
           <button class="small" onClick={() => stop(app, job)}>
             Stop
           </button>
@@ -57,7 +65,10 @@ export function Retry({ app, jobId }: { app: Controller; jobId: string }) {
       app.jobsChanged();
     });
   return (
-    <button onClick={() => void act()} title="Goes on with the step that failed, once what was wrong is mended">
+    <button
+      onClick={() => void act()}
+      title="Goes on with the step that failed, once what was wrong is mended"
+    >
       Run it again
     </button>
   );
@@ -66,7 +77,9 @@ export function Retry({ app, jobId }: { app: Controller; jobId: string }) {
 function stop(app: Controller, job: JobDocument): void {
   app.ask({
     title: "Stop this job?",
-    text: `${WORK[job.processID] ?? job.processID} is at ${job.progress} %. Stopped, it cannot go on; its scans stay, so it can be asked for again.`,
+    text:
+      `${WORK[job.processID] ?? job.processID} is at ${job.progress} %. ` +
+      "Stopped, it cannot go on; its scans stay, so it can be asked for again.",
     yes: "Stop it",
     act: async () => {
       await app.api.send("DELETE", `jobs/${job.jobID}`);

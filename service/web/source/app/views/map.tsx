@@ -27,7 +27,11 @@ export function MapPage(props: Props) {
   if (!map.value) {
     return (
       <main id="main" class="maps" tabIndex={-1}>
-        {map.problem ? <Problem problem={map.problem} again={() => app.jobsChanged()} /> : <Waiting>Asking for the map…</Waiting>}
+        {map.problem ? (
+          <Problem problem={map.problem} again={() => app.jobsChanged()} />
+        ) : (
+          <Waiting>Asking for the map…</Waiting>
+        )}
         {map.problem && <a href="#">Back to the list of maps</a>}
       </main>
     );
@@ -52,7 +56,11 @@ function Panel(props: Props) {
   const { tab } = state.place;
   return (
     <section class="panel" aria-label="Changes, survey and map">
-      <button class="handle narrow-only" aria-expanded={state.panel !== "low"} onClick={() => app.update({ panel: nextPanel[state.panel] })}>
+      <button
+        class="handle narrow-only"
+        aria-expanded={state.panel !== "low"}
+        onClick={() => app.update({ panel: nextPanel[state.panel] })}
+      >
         <span aria-hidden="true" />
         {state.panel === "full" ? "Less" : state.panel === "low" ? "Show the list" : "More"}
       </button>

@@ -49,7 +49,8 @@ function Versions({ state }: Pick<Props, "state">) {
       <ul class="versions">
         {versions.map(({ version, status, survey_id, created, problem }) => (
           <li>
-            <strong>{version}</strong> {status}, {instant(created)}, {survey_id ? "takes a survey over" : "made of scans"}
+            <strong>{version}</strong> {status}, {instant(created)},{" "}
+            {survey_id ? "takes a survey over" : "made of scans"}
             {problem && <Problem problem={problem} />}
           </li>
         ))}
@@ -61,7 +62,9 @@ function Versions({ state }: Pick<Props, "state">) {
 function remove({ app }: Pick<Props, "app">, map: MapDocument): void {
   app.ask({
     title: "Delete this map?",
-    text: `${map.name ?? map.map_id} goes with its versions, its surveys and what they found. Its scans stay. This cannot be undone.`,
+    text:
+      `${map.name ?? map.map_id} goes with its versions, its surveys and what they found. ` +
+      "Its scans stay. This cannot be undone.",
     yes: "Delete it",
     act: async () => {
       await app.api.send("DELETE", `maps/${map.map_id}`);

@@ -14,7 +14,9 @@ import { Empty, Problem, Waiting } from "./parts.tsx";
 export function MapsPage(props: Props) {
   const { app, state } = props;
   const { maps, jobs } = state;
-  const others = jobs.filter((job) => isOpen(job) && !job.survey_id && !maps.value?.some(({ job_id }) => job_id === job.jobID));
+  const others = jobs.filter(
+    (job) => isOpen(job) && !job.survey_id && !maps.value?.some(({ job_id }) => job_id === job.jobID),
+  );
   return (
     <main id="main" class="maps" tabIndex={-1}>
       <h1>Maps</h1>
@@ -29,7 +31,11 @@ export function MapsPage(props: Props) {
           <p class="faint">Or drop PLY or PCD files anywhere on this page.</p>
         </Empty>
       )}
-      <ul class="map-list">{maps.value?.map((map) => <MapRow key={map.map_id} {...props} map={map} />)}</ul>
+      <ul class="map-list">
+        {maps.value?.map((map) => (
+          <MapRow key={map.map_id} {...props} map={map} />
+        ))}
+      </ul>
       {others.map((job) => (
         <JobRow key={job.jobID} app={app} job={job} />
       ))}
@@ -42,7 +48,11 @@ function MapRow({ app, state, map }: Props & { map: MapSummaryDocument }) {
   const { points = 0, scans = map.scan_count, accepted } = map.counts;
   return (
     <li>
-      <a class="map-row" href={`#${writePlace(placeOf(map.map_id))}`} onClick={(event) => follow(event, () => app.open(map.map_id))}>
+      <a
+        class="map-row"
+        href={`#${writePlace(placeOf(map.map_id))}`}
+        onClick={(event) => follow(event, () => app.open(map.map_id))}
+      >
         <span class="map-name">
           <strong>{map.name ?? map.map_id}</strong>
           <span class={`badge badge-${map.status}`}>{statusOf(state, map)}</span>

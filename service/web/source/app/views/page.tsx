@@ -41,7 +41,10 @@ function focusMain(event: Event): void {
 
 const LINES = {
   live: ["Live", "Changes show by themselves"],
-  polling: ["Live", "Changes show by themselves; something in between holds streams back, so the page asks again and again"],
+  polling: [
+    "Live",
+    "Changes show by themselves; something in between holds streams back, so the page asks again and again",
+  ],
   offline: ["No connection", "The service does not answer; the page tries again by itself"],
 } as const;
 
@@ -74,7 +77,11 @@ function Head({ app, state }: Props) {
         {place.map && <button onClick={() => share(app)}>Share</button>}
         <ThemeButton app={app} state={state} />
         {state.hasKey && <button onClick={() => app.useKey(null)}>Forget key</button>}
-        <button aria-label="Keys and help" title="Keys and help (?)" onClick={() => app.update({ dialog: "help" })}>
+        <button
+          aria-label="Keys and help"
+          title="Keys and help (?)"
+          onClick={() => app.update({ dialog: "help" })}
+        >
           ?
         </button>
       </div>
@@ -85,7 +92,12 @@ function Head({ app, state }: Props) {
 /** Switches between light and dark; on a small screen it is among the keys and help. */
 export function ThemeButton({ app, state, always }: Pick<Props, "app" | "state"> & { always?: boolean }) {
   return (
-    <button type="button" class={always ? "" : "wide-only"} title={themeTitle(state.theme)} onClick={() => app.useTheme(nextTheme(state))}>
+    <button
+      type="button"
+      class={always ? "" : "wide-only"}
+      title={themeTitle(state.theme)}
+      onClick={() => app.useTheme(nextTheme(state))}
+    >
       {shownTheme(state) === "dark" ? "Light" : "Dark"}
     </button>
   );
@@ -117,5 +129,7 @@ export function nextTheme(state: State): Theme {
 }
 
 function themeTitle(theme: Theme): string {
-  return theme === "system" ? "Light or dark as the system has it; press to switch (d)" : `Chosen: ${theme} (d switches)`;
+  return theme === "system"
+    ? "Light or dark as the system has it; press to switch (d)"
+    : `Chosen: ${theme} (d switches)`;
 }

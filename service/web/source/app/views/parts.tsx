@@ -13,7 +13,7 @@ export function Problem({ problem, again }: { problem: ProblemDocument; again?: 
   return (
     <div class="problem" role="alert">
       <strong>{problem.title}</strong>
-      <p>{capital(problem.detail)}</p>
+      <p>{problem.detail}</p>
       {problem.errors?.map(({ place, detail }) => (
         <p>
           <code>{place}</code>: {detail}
@@ -36,7 +36,7 @@ export function Warnings({ warnings }: { warnings: readonly ScanWarning[] }) {
     <>
       {warnings.map(({ reason, detail }) => (
         <p class="warning">
-          <strong>{capital(REASONS[reason]?.[0] ?? reason)}.</strong> {capital(detail)}
+          <strong>{capital(REASONS[reason]?.[0] ?? reason)}.</strong> {detail}
         </p>
       ))}
     </>

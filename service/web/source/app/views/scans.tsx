@@ -42,7 +42,12 @@ export function Scans({ scans, names, placing }: ScansProps) {
           </thead>
           <tbody>
             {accepted.map((scan) => (
-              <Accepted key={scan.scan_id} scan={scan} sure={sure} name={names[scan.scan_id] || scan.scan_id} />
+              <Accepted
+                key={scan.scan_id}
+                scan={scan}
+                sure={sure}
+                name={names[scan.scan_id] || scan.scan_id}
+              />
             ))}
           </tbody>
         </table>
@@ -84,7 +89,7 @@ function Refused({ scan, name }: { scan: ScanOutcome; name: string }) {
       <strong>
         {name}: {what}
       </strong>
-      {scan.detail && <p>{capital(scan.detail)}</p>}
+      {scan.detail && <p>{scan.detail}</p>}
       {numbers.length > 0 && <p class="faint">{capital(numbers.join(", "))}</p>}
       {advice && <p class="advice">{capital(advice)}.</p>}
       <Warnings warnings={scan.warnings} />

@@ -14,16 +14,31 @@ const DAY_MS = 86_400_000;
 export function Timeline({ app, state }: Props) {
   const { surveys, place } = state;
   const list = surveys.value ?? [];
-  if (surveys.problem) return <nav class="timeline"><Problem problem={surveys.problem} /></nav>;
+  if (surveys.problem)
+    return (
+      <nav class="timeline">
+        <Problem problem={surveys.problem} />
+      </nav>
+    );
   return (
     <nav class="timeline" aria-label="Surveys by the time they were captured">
-      <button class="visit visit-all" aria-pressed={place.survey === null} onClick={() => app.go({ survey: null, item: null })}>
+      <button
+        class="visit visit-all"
+        aria-pressed={place.survey === null}
+        onClick={() => app.go({ survey: null, item: null })}
+      >
         <strong>All surveys</strong>
         <span>{surveys.value ? count(list.length, "survey") : "asking…"}</span>
       </button>
       <ol>
         {list.map((survey, n) => (
-          <Visit key={survey.survey_id} state={state} survey={survey} before={list[n - 1]} choose={() => choose(survey)} />
+          <Visit
+            key={survey.survey_id}
+            state={state}
+            survey={survey}
+            before={list[n - 1]}
+            choose={() => choose(survey)}
+          />
         ))}
       </ol>
     </nav>
@@ -79,7 +94,9 @@ function intoSight(element: HTMLElement | null, chosen: boolean): void {
 /** Return the survey before or after the chosen one. */
 export function neighbour(state: State, step: 1 | -1): string | null {
   const list = state.surveys.value ?? [];
-  const at = list.findIndex(({ survey_id }) => survey_id === (state.place.survey ?? focusOf(state)?.survey_id));
+  const at = list.findIndex(
+    ({ survey_id }) => survey_id === (state.place.survey ?? focusOf(state)?.survey_id),
+  );
   if (state.place.survey === null) return list[at]?.survey_id ?? null;
   return list[at + step]?.survey_id ?? state.place.survey;
 }

@@ -32,7 +32,9 @@ export function Over(props: Props) {
             <button
               aria-pressed={showOf(state) === show}
               disabled={none && show !== "reference"}
-              title={none && show !== "reference" ? "There is no survey with a result to show" : `${word} (${key})`}
+              title={
+                none && show !== "reference" ? "There is no survey with a result to show" : `${word} (${key})`
+              }
               onClick={() => app.go({ show })}
             >
               {word}
@@ -42,12 +44,19 @@ export function Over(props: Props) {
         <button title="Look from above (t)" onClick={() => stage.topDown()}>
           Top
         </button>
-        <button aria-expanded={state.sectionOpen} title="Cut by height (c cuts the ceiling)" onClick={() => app.update({ sectionOpen: !state.sectionOpen })}>
+        <button
+          aria-expanded={state.sectionOpen}
+          title="Cut by height (c cuts the ceiling)"
+          onClick={() => app.update({ sectionOpen: !state.sectionOpen })}
+        >
           Section
         </button>
       </div>
       {version !== state.map.value?.version && (
-        <p class="over reference-version">The reference is version {version}, which this survey was compared with; in use is {state.map.value?.version}.</p>
+        <p class="over reference-version">
+          The reference is version {version}, which this survey was compared with; in use is{" "}
+          {state.map.value?.version}.
+        </p>
       )}
       {state.sectionOpen && <Section {...props} />}
       {showOf(state) === "split" && state.stage.survey.loaded && (
@@ -65,7 +74,11 @@ export function Over(props: Props) {
 /** Say what is loaded, and what could not be. */
 function Loading({ state }: Props) {
   const { problem, reference, survey } = state.stage;
-  const words = [problem, layerWords("the map's cloud", reference), layerWords("the survey's cloud", survey)].filter(Boolean);
+  const words = [
+    problem,
+    layerWords("the map's cloud", reference),
+    layerWords("the survey's cloud", survey),
+  ].filter(Boolean);
   if (!words.length) return null;
   return (
     <div class="over over-middle" role="status">
@@ -84,15 +97,24 @@ function layerWords(name: string, { url, share, loaded, problem }: LayerState): 
 function Section({ app, state }: Props) {
   const { extent, ceiling } = state.stage;
   const section = sectionOf(state);
-  if (!extent || !section) return <div class="over section">The heights are known once the cloud is loaded.</div>;
+  if (!extent || !section)
+    return <div class="over section">The heights are known once the cloud is loaded.</div>;
   const [low, high] = [extent.min[2], extent.max[2]];
-  const set = (section: [number, number]) => app.go({ section: section[1] - section[0] < 0.05 ? null : section });
+  const set = (section: [number, number]) =>
+    app.go({ section: section[1] - section[0] < 0.05 ? null : section });
   const slider = (name: string, value: number, change: (value: number) => void) => (
     <label>
       <span>
         {name} <output>{height(value)}</output>
       </span>
-      <input type="range" min={low} max={high} step={0.05} value={value} onInput={({ currentTarget }) => change(Number(currentTarget.value))} />
+      <input
+        type="range"
+        min={low}
+        max={high}
+        step={0.05}
+        value={value}
+        onInput={({ currentTarget }) => change(Number(currentTarget.value))}
+      />
     </label>
   );
   return (
@@ -100,7 +122,12 @@ function Section({ app, state }: Props) {
       {slider("Up to", section[1], (value) => set([Math.min(section[0], value - 0.1), value]))}
       {slider("From", section[0], (value) => set([value, Math.max(section[1], value + 0.1)]))}
       <label class="check">
-        <input type="checkbox" checked={state.place.section === null} disabled={ceiling === null} onChange={() => app.go({ section: state.place.section === null ? [low, high] : null })} />
+        <input
+          type="checkbox"
+          checked={state.place.section === null}
+          disabled={ceiling === null}
+          onChange={() => app.go({ section: state.place.section === null ? [low, high] : null })}
+        />
         {ceiling === null ? "no ceiling was found" : `cut the ceiling, at ${height(ceiling)}`}
       </label>
     </div>
@@ -119,9 +146,17 @@ function Legend({ app, state }: Props) {
           </span>
         ))}
       {STATES.map((name) => (
-        <label class={counts[name] ? "" : "faint"} title={`tiles that are ${TILE_STATES[name]?.toLowerCase()}, as boxes`}>
-          <input type="checkbox" checked={tiles.includes(name)} onChange={() => app.go({ tiles: STATES.filter((one) => toggled(tiles, name).includes(one)) })} />
-          <i class={`swatch state-${name}`} aria-hidden="true" /> {TILE_STATES[name]?.toLowerCase()} {counts[name] !== undefined && whole(counts[name])}
+        <label
+          class={counts[name] ? "" : "faint"}
+          title={`tiles that are ${TILE_STATES[name]?.toLowerCase()}, as boxes`}
+        >
+          <input
+            type="checkbox"
+            checked={tiles.includes(name)}
+            onChange={() => app.go({ tiles: STATES.filter((one) => toggled(tiles, name).includes(one)) })}
+          />
+          <i class={`swatch state-${name}`} aria-hidden="true" /> {TILE_STATES[name]?.toLowerCase()}{" "}
+          {counts[name] !== undefined && whole(counts[name])}
         </label>
       ))}
     </div>

@@ -5,14 +5,18 @@ import { Fragment, h } from "preact";
 import type { Controller } from "../controller.ts";
 import { bytes, count } from "../format.ts";
 import type { Sending, UploadState } from "../state.ts";
-import { addFiles, cancel, submit } from "../submit.ts";
+import { addFiles, cancel, leaveOut, submit } from "../submit.ts";
 import type { Props } from "./page.tsx";
 import { Problem } from "./parts.tsx";
 
 export function UploadDialog({ app, state }: Props) {
   const { upload } = state;
   return (
-    <dialog ref={(element) => shown(element, upload !== null)} onCancel={(event) => cancelled(event, app)} aria-labelledby="upload-title">
+    <dialog
+      ref={(element) => shown(element, upload !== null)}
+      onCancel={(event) => cancelled(event, app)}
+      aria-labelledby="upload-title"
+    >
       {upload && <Form app={app} upload={upload} name={state.map.value?.name ?? upload.map} />}
     </dialog>
   );
@@ -42,9 +46,17 @@ function Form({ app, upload, name }: { app: Controller; upload: UploadState; nam
           : "Scans of a building as it is now; they have to overlap. Later visits are compared with it."}
       </p>
       <label class="drop">
-        <input type="file" multiple disabled={busy} accept=".ply,.pcd,.e57,.las,.laz,.json,.txt" onChange={({ currentTarget }) => void addFiles(app, [...(currentTarget.files ?? [])])} />
+        <input
+          type="file"
+          multiple
+          disabled={busy}
+          accept=".ply,.pcd,.e57,.las,.laz,.json,.txt"
+          onChange={({ currentTarget }) => void addFiles(app, [...(currentTarget.files ?? [])])}
+        />
         <span>{files.length ? "Add more files" : "Choose files, or drop them anywhere on the page"}</span>
-        <small>PLY or PCD in metres, z up. A pose prior as hall.pose.json or hall.pose.txt beside hall.ply.</small>
+        <small>
+          PLY or PCD in metres, z up. A pose prior as hall.pose.json or hall.pose.txt beside hall.ply.
+        </small>
       </label>
       {refused.map(({ name, why }) => (
         <p class="warning">
@@ -53,8 +65,8 @@ function Form({ app, upload, name }: { app: Controller; upload: UploadState; nam
       ))}
       {files.length > 0 && (
         <ul class="files">
-          {files.map((file) => (
-            <FileRow key={file.name} file={file} />
+          {files.map((file, n) => (
+            <FileRow key={file.name} file={file} {...(busy ? {} : { leaveOut: () => leaveOut(app, n) })} />
           ))}
         </ul>
       )}
@@ -69,7 +81,8 @@ function Form({ app, upload, name }: { app: Controller; upload: UploadState; nam
         </button>
       </div>
       <p role="status" aria-live="polite" class="faint">
-        {busy && "What was sent is kept: if the page is closed, choose the same files again and they go on where they were."}
+        {busy &&
+          "What was sent is kept: if the page is closed, choose the same files again and they go on where they were."}
       </p>
     </form>
   );
@@ -93,13 +106,24 @@ function Fields({ upload, disabled }: { upload: UploadState; disabled: boolean }
           </label>
           <label>
             Id in addresses
-            <input name="id" pattern="[A-Za-z0-9_\-]{1,64}" title="letters, digits, - and _" placeholder="left out: chosen" autocomplete="off" />
+            <input
+              name="id"
+              pattern="[A-Za-z0-9_\-]{1,64}"
+              title="letters, digits, - and _"
+              placeholder="left out: chosen"
+              autocomplete="off"
+            />
           </label>
         </>
       )}
       <label>
         Device
-        <input name="device_id" maxLength={64} placeholder="such as robot-7; may be left out" autocomplete="off" />
+        <input
+          name="device_id"
+          maxLength={64}
+          placeholder="such as robot-7; may be left out"
+          autocomplete="off"
+        />
       </label>
       <label>
         Captured at
@@ -109,13 +133,29 @@ function Fields({ upload, disabled }: { upload: UploadState; disabled: boolean }
   );
 }
 
-function FileRow({ file }: { file: Sending }) {
+function FileRow({ file, leaveOut }: { file: Sending; leaveOut?: () => void }) {
   const { name, size, sent, waiting, problem, scan } = file;
-  const state = scan ? "sent" : waiting ? `waits: ${waiting}` : sent ? `${bytes(sent)} of ${bytes(size)}` : bytes(size);
+  const state = scan
+    ? "sent"
+    : waiting
+      ? `waits: ${waiting}`
+      : sent
+        ? `${bytes(sent)} of ${bytes(size)}`
+        : bytes(size);
   return (
     <li>
       <span class="name">{name}</span>
       <span class="faint">{state}</span>
+      <button
+        type="button"
+        class="small"
+        aria-label={`Leave ${name} out`}
+        title="Leave it out"
+        disabled={!leaveOut}
+        onClick={leaveOut}
+      >
+        ✕
+      </button>
       <progress max={size} value={sent} aria-label={`${name}: ${state}`} />
       {problem && <Problem problem={problem} />}
     </li>
