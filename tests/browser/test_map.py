@@ -9,8 +9,9 @@ from tests.support.live import Live
 from tests.support.made_maps import office_points, put_map
 from tests.support.viewer_data import COLOURED, MAP, ViewerData
 from tests.support.viewer_page import Opener, ViewerPage, is_of_kind
+from worker.pipeline.results.objects import ObjectKind
 
-KINDS = ("appeared", "disappeared", "moved")
+KINDS: tuple[ObjectKind, ...] = ("appeared", "disappeared", "moved")
 ABOVE = "view=3.6,2.6,11,3.6,2.61,0"  #: of the camera: over the middle of the room, looking down
 SMALL = {"viewport": {"width": 900, "height": 640}}
 

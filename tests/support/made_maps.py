@@ -10,9 +10,9 @@ import numpy as np
 
 from service.catalog import blob_keys
 from service.catalog.catalog import Catalog
-from service.catalog.records import Bounds, Tileset
+from service.catalog.records import Bounds, ScanOutcome, Tileset
 from service.catalog.tilesets import address
-from tests.support.samples import IDENTITY, ScanOutcome, add_scan
+from tests.support.samples import IDENTITY, add_scan
 from worker.cloud.formats.ply import write_ply
 from worker.cloud.tilesets.writer import pieces_of, write_tileset
 from worker.cloud.types import Points
