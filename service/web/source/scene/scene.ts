@@ -357,7 +357,6 @@ export class Scene {
     gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4));
     this.#frameMs = performance.now() - began;
     this.#share = MathUtils.clamp(SMOOTH_MS / Math.max(this.#frameMs, 1), 0.05, 1);
-    performance.mark("spicd-drawn"); // for whoever measures (User Timing)
     this.#emit("drawn", null);
   }
 

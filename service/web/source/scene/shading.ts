@@ -118,53 +118,53 @@ const PASS_FRAGMENT = /* glsl */ `
 precision highp float;
 uniform sampler2D colours;
 uniform highp sampler2D depths;
-uniform vec2 planes;
-uniform vec4 area;
+uniform vec2 nearness;
+uniform ivec4 area;
 uniform vec3 backLow, backHigh;
-uniform float radius, strength, grain;
+uniform float strength, grain;
+uniform int radius;
 out vec4 painted;
 
-float logDistance(ivec2 pixel) {
-  float depth = texelFetch(depths, clamp(pixel, ivec2(area.xy), ivec2(area.zw) - 1), 0).r;
-  return depth == 1.0 ? 100.0 : log2(planes.x * planes.y / (planes.y - depth * (planes.y - planes.x)));
-}
+const ivec2 AROUND[8] = ivec2[8](
+  ivec2(1, 0), ivec2(-1, 0), ivec2(0, 1), ivec2(0, -1), ivec2(1, 1), ivec2(-1, -1), ivec2(1, -1), ivec2(-1, 1));
+
+float depthAt(ivec2 pixel) { return texelFetch(depths, clamp(pixel, area.xy, area.zw), 0).r; }
 
 /* Return a neighbour in whose stead a pixel is painted that is a hole in a surface: most around it are not empty. */
 ivec2 filled(ivec2 pixel) {
+  ivec2 best = pixel;
   for (int reach = 1; reach <= 2; reach++) {
     int taken = 0;
     float nearest = 1.0;
-    ivec2 best = pixel;
     for (int i = 0; i < 8; i++) {
-      ivec2 next = pixel + reach * ivec2((i < 3 ? -1 : i < 5 ? 0 : 1), (i == 0 || i == 3 || i == 5 ? -1 : i == 1 || i == 6 ? 0 : 1));
-      float depth = texelFetch(depths, clamp(next, ivec2(area.xy), ivec2(area.zw) - 1), 0).r;
-      if (depth == 1.0) continue;
-      taken++;
-      if (depth < nearest) { nearest = depth; best = next; }
+      if (i == 4 && taken == 0) return pixel;
+      float depth = depthAt(pixel + reach * AROUND[i]);
+      if (depth < 1.0) taken++;
+      if (depth < nearest) { nearest = depth; best = pixel + reach * AROUND[i]; }
     }
-    if (taken == 0) return pixel;
-    if (taken >= 5) return best;
+    if (taken >= 5) return clamp(best, area.xy, area.zw);
   }
   return pixel;
 }
 
+/* One over a distance is linear in depth; steps are so small that the logarithm of their ratio is what it is above 1. */
 void main() {
   ivec2 pixel = ivec2(gl_FragCoord.xy);
   float depth = texelFetch(depths, pixel, 0).r;
-  vec3 back = mix(backLow, backHigh, gl_FragCoord.y / area.w);
-  if (depth == 1.0) { pixel = filled(pixel); depth = texelFetch(depths, pixel, 0).r; }
+  if (depth == 1.0) { pixel = filled(pixel); depth = depthAt(pixel); }
   gl_FragDepth = depth;
-  if (depth == 1.0) { painted = vec4(back, 1.0); return; }
-  float here = logDistance(pixel);
-  float even = log2(1.0 + grain / exp2(here)); // neighbours on one surface differ by that
+  if (depth == 1.0) {
+    painted = vec4(mix(backLow, backHigh, gl_FragCoord.y / float(area.w)), 1.0);
+    return;
+  }
+  float here = nearness.x - nearness.y * depth;
+  float even = 1.4427 * grain * here; // neighbours on one surface differ by that
   float sum = 0.0;
   for (int i = 0; i < 8; i++) {
-    float angle = 0.785398 * float(i);
-    ivec2 next = pixel + ivec2(round(radius * vec2(cos(angle), sin(angle))));
-    sum += clamp(here - logDistance(next) - even, 0.0, 0.1);
+    float next = nearness.x - nearness.y * depthAt(pixel + radius * AROUND[i]);
+    sum += clamp(1.4427 * (next / here - 1.0) - even, 0.0, 0.1);
   }
-  float shade = exp(-strength * sum / 8.0);
-  painted = vec4(texelFetch(colours, pixel, 0).rgb * shade, 1.0);
+  painted = vec4(texelFetch(colours, pixel, 0).rgb * exp(-strength * sum / 8.0), 1.0);
 }`;
 
 /** Colours of heights and of the ground behind, by theme: quiet ones, so that what changed stands out. */
@@ -215,11 +215,11 @@ export class EyeDome {
     uniforms: {
       colours: { value: this.target.texture },
       depths: { value: this.target.depthTexture },
-      planes: { value: new Vector2() },
+      nearness: { value: new Vector2() },
       area: { value: new Vector4() },
       backLow: { value: new Color() },
       backHigh: { value: new Color() },
-      radius: { value: 1.4 },
+      radius: { value: 1 },
       strength: { value: 16 },
       grain: { value: 0 },
     },
@@ -235,10 +235,10 @@ export class EyeDome {
 
   /** Paint the rectangle `area` (left, bottom, right, top; pixels) of the target onto the canvas. */
   paint(renderer: WebGLRenderer, camera: PerspectiveCamera, area: Vector4, pixelRatio: number): void {
-    const { planes, area: shown, radius } = this.#material.uniforms as Record<string, { value: never }>;
-    (planes as { value: Vector2 }).value.set(camera.near, camera.far);
-    (shown as { value: Vector4 }).value.copy(area);
-    (radius as { value: number }).value = 1.4 * pixelRatio;
+    const { nearness, area: shown, radius } = this.#material.uniforms as Record<string, { value: never }>;
+    (nearness as { value: Vector2 }).value.set(1 / camera.near, 1 / camera.near - 1 / camera.far);
+    (shown as { value: Vector4 }).value.set(area.x, area.y, area.z - 1, area.w - 1);
+    (radius as { value: number }).value = Math.max(1, Math.round(1.2 * pixelRatio));
     renderer.render(this.#pass, this.#camera);
   }
 
