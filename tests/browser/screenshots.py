@@ -100,6 +100,10 @@ def _draw(browser: Browser, url: str, address: str, shot: Shot, to: Path) -> Non
             page.locator("#items li").nth(shot.item).click()
             viewer.until("() => location.hash.includes('view=')")  # the camera is there
             viewer.drawn()
+        if "tab=survey" in shot.words:
+            viewer.until(
+                "() => document.querySelector('.about')?.textContent.includes('.ply')"
+            )  # the scans' names
         viewer.rests()
         _save(page.screenshot(), to / f"{shot.name}.webp")
 

@@ -5,10 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tests.support.viewer_data import MAP, ViewerData
+from tests.support.live import Live
+from tests.support.made_maps import office_points, put_map
+from tests.support.viewer_data import COLOURED, MAP, ViewerData
 from tests.support.viewer_page import Opener, ViewerPage, is_of_kind
+from worker.pipeline.results.objects import ObjectKind
 
-KINDS = ("appeared", "disappeared", "moved")
+KINDS: tuple[ObjectKind, ...] = ("appeared", "disappeared", "moved")
 ABOVE = "view=3.6,2.6,11,3.6,2.61,0"  #: of the camera: over the middle of the room, looking down
 SMALL = {"viewport": {"width": 900, "height": 640}}
 
@@ -67,3 +70,38 @@ def test_the_ceiling_is_cut_until_somebody_asks_for_it(
     viewer.until("() => !location.hash.includes('section=')")
     assert hidden < 0.05
     assert viewer.share("appeared", came) > 0.15
+
+
+def test_a_filter_by_kind_takes_the_boxes_of_the_others_away(
+    opened: Opener, survey: str, viewer_data: ViewerData
+) -> None:
+    (came,) = viewer_data.changes["appeared"]
+    viewer = from_above(opened, survey, "reference")
+    outlined = viewer.share("appeared", came)
+    viewer.page.get_by_role("button", name="Filters").click()
+    viewer.page.get_by_label("Disappeared").check()
+    viewer.page.locator("#items li").nth(1).wait_for(state="detached")
+    assert viewer.page.locator("#items li").count() == 1
+    assert viewer.share("appeared", came) < 0.01
+    assert outlined > 0.02
+
+
+def test_a_map_of_more_than_a_million_points_is_read_a_piece_at_a_time(opened: Opener, served: Live) -> None:
+    points = office_points(150_000)
+    put_map(served.services.catalog, "tower", points, tileset=True, ply=False, counted=1_500_000)
+    viewer = opened("#map=tower", **SMALL).drawn()
+    viewer.rests()
+    drawn = viewer.pixels()
+    assert (np.abs(drawn.astype(int) - drawn[2, 2]).sum(axis=-1) > 60).mean() > 0.1
+    pieces = [url for url in viewer.watch.requests if ".glb" in url]
+    assert len(pieces) >= 1
+    assert not any("cloud.ply" in url for url in viewer.watch.requests)
+
+
+def test_a_map_with_colours_is_shown_in_them(opened: Opener) -> None:
+    """The den's walls bear colours that heights are never painted in."""
+    plain, coloured = (opened(f"#map={name}&{ABOVE}", **SMALL).drawn().pixels() for name in (MAP, COLOURED))
+    spread = [
+        float(np.ptp(image[200:440, 300:600].astype(int), axis=-1).mean()) for image in (plain, coloured)
+    ]
+    assert spread[1] > 2 * spread[0]

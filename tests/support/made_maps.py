@@ -10,9 +10,9 @@ import numpy as np
 
 from service.catalog import blob_keys
 from service.catalog.catalog import Catalog
-from service.catalog.records import Bounds, Tileset
+from service.catalog.records import Bounds, ScanOutcome, Tileset
 from service.catalog.tilesets import address
-from tests.support.samples import IDENTITY, ScanOutcome, add_scan
+from tests.support.samples import IDENTITY, add_scan
 from worker.cloud.formats.ply import write_ply
 from worker.cloud.tilesets.writer import pieces_of, write_tileset
 from worker.cloud.types import Points
@@ -46,8 +46,19 @@ def sampled(scene: Scene, count: int, rng: np.random.Generator) -> Points:
     return points
 
 
-def put_map(catalog: Catalog, map_id: str, points: Points, *, tileset: bool, ply: bool = True) -> None:
-    """Put a map that is ready: its cloud as PLY, and where asked for as a tileset too."""
+def put_map(
+    catalog: Catalog,
+    map_id: str,
+    points: Points,
+    *,
+    tileset: bool,
+    ply: bool = True,
+    counted: int | None = None,
+) -> None:
+    """Put a map that is ready: its cloud as PLY, and where asked for as a tileset too.
+
+    Its document says that it has `counted` points, which is what the viewer chooses by; left out: those that it has.
+    """
     scan = add_scan(catalog, f"map-{map_id}")
     _, job = catalog.maps.create(scan_ids=[scan.scan_id], model="voxel-net/1", map_id=map_id, name=map_id)
     with TemporaryDirectory() as name:
@@ -63,7 +74,7 @@ def put_map(catalog: Catalog, map_id: str, points: Points, *, tileset: bool, ply
             ScanOutcome(scan_id=scan.scan_id, accepted=True, fitness=1.0, rmse=0.01, map_from_scan=IDENTITY)
         ],
         bounds=Bounds(min=tuple(low), max=tuple(high)),
-        counts={"points": len(points), "tiles": 0, "scans": 1, "accepted": 1},
+        counts={"points": counted or len(points), "tiles": 0, "scans": 1, "accepted": 1},
         tileset=kept,
     )
     catalog.jobs.succeed(job.job_id)

@@ -14,6 +14,7 @@ from playwright.sync_api import Page
 
 from tests.support.browser import WAITS_S, Watch
 from worker.pipeline.results.object_marks import color_of_kind
+from worker.pipeline.results.objects import ObjectKind
 
 _GREY = 0.45  #: saturation; that of the heights' colours is below it
 
@@ -59,6 +60,14 @@ class ViewerPage:
         self.until(_DRAWN)
         return self
 
+    def answered(self) -> None:
+        """Wait until no request is under way, and none follows for a while."""
+        quiet, end = 0, time.monotonic() + WAITS_S
+        while quiet < 5:
+            assert time.monotonic() < end, f"no end of requests: {self.watch.pending}"
+            self.page.wait_for_timeout(100)
+            quiet = 0 if self.watch.pending else quiet + 1
+
     def rests(self) -> None:
         """Wait until all is answered and two pictures, one after the other, are the same: nothing loads or moves more."""
         before = self.pixels()
@@ -89,7 +98,7 @@ class ViewerPage:
         (left, top), (right, bottom) = np.floor(places.min(axis=0)), np.ceil(places.max(axis=0))
         return slice(max(int(top), 0), int(bottom) + 1), slice(max(int(left), 0), int(right) + 1)
 
-    def share(self, kind: str, box: Sequence[Sequence[float]], pixels: Pixels | None = None) -> float:
+    def share(self, kind: ObjectKind, box: Sequence[Sequence[float]], pixels: Pixels | None = None) -> float:
         """Return which share of the pixels within the outline of a box (2, 3) has the colour of a kind.
 
         The pixels are those of now, where none are given.
@@ -99,9 +108,9 @@ class ViewerPage:
         return float(is_of_kind(shown[rows, columns], kind).mean())
 
 
-def is_of_kind(pixels: Pixels, kind: str) -> NDArray[np.bool_]:
+def is_of_kind(pixels: Pixels, kind: ObjectKind) -> NDArray[np.bool_]:
     """Tell of pixels (..., 3) which have the hue of a kind, however light or dark the shading made them."""
-    wanted = _hue(np.array(color_of_kind(kind)) * 255)[0]
+    wanted = _hue(np.array([*color_of_kind(kind)], np.float64) * 255)[0]
     hue, saturation = _hue(pixels.astype(np.float64))
     away = np.abs((hue - wanted + 180) % 360 - 180)
     strong: NDArray[np.bool_] = (away < 12) & (saturation > _GREY)

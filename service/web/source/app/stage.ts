@@ -113,11 +113,14 @@ export class Stage {
     const item = chosenItem(state);
     this.#once("item", item?.id ?? null, () => scene.select(item?.id ?? null));
     if (!state.stage.reference.loaded) return;
-    const { view } = state.place;
-    if (view && view !== this.#told)
+    const { view, item: id } = state.place;
+    if (view && view !== this.#told) {
       scene.view = this.#told = view; // a link says where to look from
-    else if (!view && item && this.#flown !== item.id) scene.flyTo(around(item.box, item.from));
-    this.#flown = item?.id ?? null;
+      this.#flown = id;
+    } else if (item && this.#flown !== id) {
+      scene.flyTo(around(item.box, item.from));
+      this.#flown = id;
+    } else if (!id) this.#flown = null;
   }
 
   #once(name: string, value: unknown, act: (value: unknown) => void): void {

@@ -39,7 +39,7 @@ def test_chunks_and_columns_begin_at_multiples_of_four(count: int) -> None:
     extra = np.arange(3 * count, dtype=np.uint8).reshape(count, 3)
     points = np.random.default_rng(0).normal(size=(count, 3)).astype(np.float32)
     for extra_is in ("color", "normal"):
-        glb = encode_points(points, extra, extra_is=extra_is)  # type: ignore[arg-type]
+        glb = encode_points(points, extra, extra_is=extra_is)
         assert len(glb) % 4 == 0
         (buffer,) = decoded(glb).document["buffers"]
         assert buffer["byteLength"] == 12 * count
