@@ -34,7 +34,7 @@ def files(tmp_path: Path) -> Path:
     score = np.linspace(0, 1, 1000, dtype=np.float32)
     write_ply(tmp_path / "map.ply", points)
     write_ply(tmp_path / "coloured.ply", points, colors=colors)
-    by_kind = {
+    by_kind: dict[str, Any] = {
         "change_score": score,
         "tile_state": states,
         "kind": kinds,
