@@ -27,7 +27,7 @@ from worker.detectors.card import MODEL_STORE
 
 SIZES = (10_000, 100_000, 300_000, 1_000_000, 5_000_000, 20_000_000)
 WHOLE = 1_000_000  #: points; a larger map is a tileset
-FRAMES = 30  #: of a turn of the camera
+FRAMES = 12  #: of a turn of the camera
 
 #: Notes when the scene says that it has drawn points; a scene is there a while before its first cloud has come.
 _NOTE = """
@@ -114,7 +114,7 @@ def measure(browser: Browser, service: Live, points: int, *, runs: int) -> Measu
         viewer = ViewerPage(page, watch)
         firsts.append((float(viewer.until("() => window.firstPicture")) / 1000, loaded.bytes))
         if run == 0:
-            viewer.rests()
+            viewer.answered()
             frames = page.evaluate(_TURN, FRAMES)
         context.close()
     middle = sorted(firsts)[len(firsts) // 2]

@@ -60,6 +60,14 @@ class ViewerPage:
         self.until(_DRAWN)
         return self
 
+    def answered(self) -> None:
+        """Wait until no request is under way, and none follows for a while."""
+        quiet, end = 0, time.monotonic() + WAITS_S
+        while quiet < 5:
+            assert time.monotonic() < end, f"no end of requests: {self.watch.pending}"
+            self.page.wait_for_timeout(100)
+            quiet = 0 if self.watch.pending else quiet + 1
+
     def rests(self) -> None:
         """Wait until all is answered and two pictures, one after the other, are the same: nothing loads or moves more."""
         before = self.pixels()

@@ -35,7 +35,7 @@ def built(tmp_path: Path) -> Path:
 @pytest.fixture
 def client(tmp_path: Path, built: Path) -> Iterator[TestClient]:
     with running(settings_in(tmp_path), RememberingQueue()) as opened:
-        opened.app.state.viewer = built
+        opened.app.state.viewer = built  # type: ignore[attr-defined]
         yield opened
 
 

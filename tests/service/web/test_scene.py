@@ -34,7 +34,7 @@ def files(tmp_path: Path) -> Path:
     score = np.linspace(0, 1, 1000, dtype=np.float32)
     write_ply(tmp_path / "map.ply", points)
     write_ply(tmp_path / "coloured.ply", points, colors=colors)
-    by_kind = {
+    by_kind: dict[str, Any] = {
         "change_score": score,
         "tile_state": states,
         "kind": kinds,
@@ -43,9 +43,8 @@ def files(tmp_path: Path) -> Path:
     write_ply(
         tmp_path / "survey.ply", points, colors=colors, scalars=by_kind, quality=score, comments=["one"]
     )
-    write_ply(
-        tmp_path / "tiles.ply", points, colors=colors, scalars={"change_score": score, "tile_state": states}
-    )
+    by_tile: dict[str, Any] = {"change_score": score, "tile_state": states}
+    write_ply(tmp_path / "tiles.ply", points, colors=colors, scalars=by_tile)
     (tmp_path / "tile.glb").write_bytes(glb())
     told = {
         "map": {"n": 1000, "first": [float(value) for value in points[:2].ravel()]},

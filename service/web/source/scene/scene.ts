@@ -19,6 +19,7 @@ const CLICK = 5; // CSS pixels that a pointer may go for it to be a click
 const AROUND = 1; // metres around what is flown to
 const REST_MS = 180; // without a change: the camera has come to rest
 const SMOOTH_MS = 40; // of a frame, aimed at while the camera moves
+const SPARED = 4; // times as long as a frame takes, between frames while tiles come
 const MOST_PIXEL_RATIO = 2;
 
 /** Draws on demand: a frame is drawn where something has changed, and none while nothing does. */
@@ -46,6 +47,9 @@ export class Scene {
   #frameMs = 0; // of a frame with all points
   #share = 1; // of the points, while the camera moves
   #announced = false;
+  #drawnAt = 0;
+  #refreshing: ReturnType<typeof setTimeout> | undefined;
+  #late: ReturnType<typeof setTimeout> | undefined;
 
   /** Put a canvas into `container`, which it fills and follows in size. Throws an Error where there is no WebGL 2. */
   constructor(container: HTMLElement, options: SceneOptions) {
@@ -209,7 +213,7 @@ export class Scene {
 
   dispose(): void {
     cancelAnimationFrame(this.#frame);
-    clearTimeout(this.#rest);
+    for (const timer of [this.#rest, this.#refreshing, this.#late]) clearTimeout(timer);
     this.#resized.disconnect();
     for (const layer of [...this.#layers.keys()]) this.unload(layer);
     for (const part of [this.#rig, this.#marks, this.#eyeDome, this.#renderer]) part.dispose();
@@ -230,7 +234,7 @@ export class Scene {
   ): Promise<LoadedLayer> {
     if (source.kind === "tileset") {
       const { openTileset } = await import("./tileset.ts");
-      return openTileset(source, layer, this.#fetch, this.#uniforms, () => this.#invalidate(), signal);
+      return openTileset(source, layer, this.#fetch, this.#uniforms, () => this.#refresh(), signal);
     }
     const file = await fetchWhole(source, this.#fetch, progress, signal);
     return new FileLayer(file, source, this.#uniforms);
@@ -282,6 +286,18 @@ export class Scene {
     if (this.#frame === 0) this.#frame = requestAnimationFrame((now) => this.#step(now));
   }
 
+  /** Ask for further tiles, and draw those that came: not each by itself where a frame takes long. */
+  #refresh(): void {
+    this.#refreshing ??= setTimeout(() => {
+      this.#refreshing = undefined;
+      for (const layer of this.#layers.values()) layer.update(this.#rig.camera, this.#renderer);
+      clearTimeout(this.#late);
+      const wait = this.#drawnAt + SPARED * this.#frameMs - performance.now();
+      if (wait > 0) this.#late = setTimeout(() => this.#invalidate(), wait);
+      else this.#invalidate();
+    }, 10);
+  }
+
   /** Take note that the camera moves; a while later it has come to rest. */
   #moved(): void {
     this.#moving = true;
@@ -321,6 +337,7 @@ export class Scene {
       layer.update(camera, this.#renderer);
     }
     this.#eyeDome.grain = Math.max(0, ...[...this.#layers.values()].map(({ spacing }) => spacing));
+    this.#drawnAt = performance.now();
     for (const half of this.#shown === "split" ? (["before", "after"] as const) : [null]) this.#drawHalf(half);
   }
 
