@@ -207,7 +207,7 @@ export function focusOf(state: State): SurveySummaryDocument | null {
 
 /** Return which clouds are asked for. */
 export function showOf(state: State): Show {
-  return state.place.show ?? (state.place.item ? "split" : "reference");
+  return state.place.show ?? (state.place.item ? "split" : state.place.survey ? "both" : "reference");
 }
 
 /** Return the heights between which points are shown; null before a cloud is there. */

@@ -170,7 +170,7 @@ export async function batchOf(files: readonly File[]): Promise<Batch> {
   for (const file of files.filter(({ name }) => !SIDECAR.test(name))) {
     const stem = file.name.replace(/\.[^.]*$/, "");
     if (!SCAN.test(file.name))
-      batch.refused.push({ name: file.name, why: "no scan by its name; send PLY or PCD" });
+      batch.refused.push({ name: file.name, why: "no scan by its name; send PLY, PCD, E57, LAS or LAZ" });
     else if (!file.size) batch.refused.push({ name: file.name, why: "the file is empty" });
     else batch.scans.push({ file, told: await toldBy(sidecars.get(stem), batch) });
     sidecars.delete(stem);

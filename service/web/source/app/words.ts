@@ -219,6 +219,8 @@ export const REASONS: Record<string, [string, string]> = {
   odd_density: ["points on each other, or on a grid", "send each point once"],
   odd_size: ["an odd size for rooms", "write metres, with z up"],
   little_coverage: ["shows few surfaces or directions", "scan for longer, in more directions"],
+  offset_taken_off: ["coordinates of a country's grid", "nothing: a round offset was taken off"],
+  no_sensor_place: ["nothing tells where the sensor stood", "write the sensor's place into the file, or send PLY or PCD"],
   clock: ["its time cannot be right", "set the device's clock"],
 };
 
@@ -227,7 +229,7 @@ const ADVICE: Record<string, string> = {
     "See that the service runs and the network reaches it. What was sent is kept; it goes on by itself.",
   unauthorized: "Enter an API key; whoever runs the service makes one with `spicd keys add`.",
   forbidden: "Ask whoever runs the service for a key that may do this, or for this map.",
-  scan_unreadable: "Write the file again as PLY or PCD and send that.",
+  scan_unreadable: "Write the file again as PLY, PCD, E57, LAS or LAZ and send that.",
   too_large: "Send fewer or smaller files, or have SPICD_MAX_UPLOAD_BYTES raised.",
   disk_full: "Delete surveys or maps that nobody needs, or have the disk enlarged; then send it again.",
   queue_full: "Wait until some jobs are done, then send it again.",

@@ -88,14 +88,15 @@ void main() {
   }
   float height = clamp((world.z - ramp.x) / max(ramp.y - ramp.x, 0.1), 0.0, 1.0);
   colour = height < 0.5 ? mix(low, middle, 2.0 * height) : mix(middle, high, 2.0 * height - 1.0);
-  float size = 1.55;
+  float size = 1.55, nearer = 0.0; /* painted points win where the map has grey ones in the same place */
 #ifdef TINTED
   if (tint.a > 0.75) colour = tint.rgb;
-  else if (tint.a > 0.4) { colour = tint.rgb; size = 1.9; }
+  else if (tint.a > 0.4) { colour = tint.rgb; size = 1.9; nearer = 0.002; }
   else if (tint.a > 0.1) colour = mix(colour, back, 0.5);
 #endif
   if (other) colour = mix(colour, back, 0.45 * dim);
   vec4 eye = viewMatrix * world;
+  eye.xyz *= 1.0 - nearer;
   gl_Position = projectionMatrix * eye;
   gl_PointSize = clamp(size * spacing * scale * inversesqrt(share) / -eye.z, 1.5, cap);
 }`;

@@ -28,7 +28,7 @@ export function MapsPage(props: Props) {
           <button class="primary" onClick={() => app.update({ upload: newUpload(null) })}>
             Make one from scans
           </button>
-          <p class="faint">Or drop PLY or PCD files anywhere on this page.</p>
+          <p class="faint">Or drop scans (PLY, PCD, E57, LAS, LAZ) anywhere on this page.</p>
         </Empty>
       )}
       <ul class="map-list">

@@ -93,6 +93,7 @@ function Files({ app, survey }: { app: Props["app"]; survey: SurveySummaryDocume
   const here = `surveys/${survey.survey_id}`;
   const files: [string, string][] = [
     ["cloud.ply", "PLY"],
+    ["cloud.laz", "LAZ"],
     ["picture.png", "picture"],
     ["tiles", "tiles (GeoJSON)"],
   ];

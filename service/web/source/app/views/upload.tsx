@@ -55,7 +55,7 @@ function Form({ app, upload, name }: { app: Controller; upload: UploadState; nam
         />
         <span>{files.length ? "Add more files" : "Choose files, or drop them anywhere on the page"}</span>
         <small>
-          PLY or PCD in metres, z up. A pose prior as hall.pose.json or hall.pose.txt beside hall.ply.
+          PLY, PCD, E57, LAS or LAZ in metres, z up. A pose prior as hall.pose.json or hall.pose.txt beside hall.ply.
         </small>
       </label>
       {refused.map(({ name, why }) => (
