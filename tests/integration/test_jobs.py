@@ -345,7 +345,9 @@ def test_a_survey_of_another_place_fails_and_lists_each_scans_numbers(house: Hou
     job = house.survey_of(house.add("foreign.pcd", house.material.foreign, pose=False))
     with pytest.raises(NoScanAccepted):
         run(job)
-    assert "foreign.pcd: of the surfaces that it shares with the map " in failed(house, job, "registration_failed")
+    assert "foreign.pcd: of the surfaces that it shares with the map " in failed(
+        house, job, "registration_failed"
+    )
     survey = house.survey(job)
     assert survey.status == "failed"
     (outcome,) = survey.scans
