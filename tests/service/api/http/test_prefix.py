@@ -46,9 +46,11 @@ def fill(catalog: Catalog) -> None:
     jobs = [add_map(catalog), add_version(catalog)]
     for job_id in jobs:
         catalog.blobs.put_bytes(blob_keys.map_cloud(job_id), ply())
+        catalog.blobs.put_bytes(blob_keys.map_laz(job_id), b"LASF")
         catalog.blobs.put_bytes(blob_keys.map_manifest(job_id), b"{}")
     told, _ = add_survey(catalog, [tile(i, 0) for i in range(3)], objects=[thing(1, now=place(1, 1))])
     catalog.blobs.put_bytes(blob_keys.survey_cloud(told), ply())
+    catalog.blobs.put_bytes(blob_keys.survey_laz(told), b"LASF")
     catalog.blobs.put_bytes(blob_keys.survey_picture(told), b"\x89PNG")
     add_version(catalog, ready=False)
     for number in range(3):
