@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -77,7 +78,7 @@ def run(
     except ClientError as error:
         raise DemoFailed(str(error)) from error
     if not look:
-        _say(out_console, "look", f"spicd up --data-dir {fresh[0]}, then http://127.0.0.1:8000{view}")
+        _say(out_console, "look", f"{_program()} up --data-dir {fresh[0]}, then http://127.0.0.1:8000{view}")
     return result
 
 
@@ -95,6 +96,14 @@ def _show(result: DemoResult, story: Story, console: Console) -> None:
         console.print(placement_line(visit, outcomes, scans), highlight=False)
     for what, path in result.files.items():
         _say(console, what, str(path))
+
+
+def _program() -> str:
+    """Return how `spicd` is called from here: by its path where it lies in an environment of its own."""
+    beside = Path(sys.executable).with_name("spicd")
+    if sys.prefix == sys.base_prefix or not beside.exists():
+        return "spicd"
+    return str(beside.relative_to(Path.cwd())) if beside.is_relative_to(Path.cwd()) else str(beside)
 
 
 def _say(console: Console, what: str, text: str) -> None:
