@@ -69,7 +69,7 @@ def test_the_keyboard_alone_leads_from_the_maps_to_the_evidence_of_an_object(
     keys.press("j")
     expect(page.locator("#items [aria-selected=true]")).to_have_count(1)
     details = page.locator(".details")
-    for said in ("Probability", "Judged", "Seen", "First seen"):
+    for said in ("Probability", "Judged", "Seen", "Change first seen"):
         expect(details).to_contain_text(said)
     viewer.drawn()
     expect(page.locator(".split-words")).to_be_visible()

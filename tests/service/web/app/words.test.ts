@@ -9,6 +9,8 @@ import {
   objectsOf,
   progressOf,
   sayingOf,
+  statusOf,
+  whyStatus,
 } from "../../../../service/web/source/app/words.ts";
 import { survey } from "./samples.ts";
 
@@ -105,8 +107,20 @@ test("a job tells its stage, how far it is, and its place in the queue", () => {
 test("objects of a map are told by status, those that count now first", () => {
   assert.equal(
     objectsOf({ objects: { new: 2, still_there: 5, gone_again: 1, unknown: 0, accepted: 0 } }),
-    "2 new, 5 still there, 1 gone again",
+    "2 new, 5 still changed, 1 as in the map again",
   );
+});
+
+test("a status is told in the words of the kind: what disappeared is not still there", () => {
+  const looked = "2026-03-04T12:00:00Z";
+  assert.equal(statusOf("still_there", "disappeared"), "Still missing");
+  assert.match(whyStatus("still_there", "disappeared", looked), /^Wed.*4 Mar.* looked and it was gone$/);
+  assert.equal(statusOf("still_there", "moved"), "Still in its new place");
+  assert.equal(statusOf("still_there", "appeared"), "Still there");
+  assert.equal(statusOf("gone_again", "disappeared"), "Back again");
+  for (const kind of ["appeared", "disappeared", "moved"])
+    assert.equal(statusOf("unknown", kind), "Not looked at since");
+  assert.match(whyStatus("unknown", "moved", looked), /latest survey that could be compared did not$/);
 });
 
 test("problems come with what to do", () => {

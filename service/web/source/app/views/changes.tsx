@@ -6,7 +6,7 @@ import { active, NO_FILTERS, PERIODS, tally, toggled, type Filters } from "../fi
 import { ago, count, instant, percent } from "../format.ts";
 import { whereOf, type Item } from "../items.ts";
 import { allItems, focusOf, jobOf, shownItems, type State } from "../state.ts";
-import { KINDS, sayingOf, STATUSES } from "../words.ts";
+import { KINDS, sayingOf, STATUSES, statusOf } from "../words.ts";
 import { newUpload, type Props } from "./page.tsx";
 import { Empty, Kind, Problem, Waiting } from "./parts.tsx";
 
@@ -107,10 +107,10 @@ function Row({ item, chosen, choose }: { item: Item; chosen: boolean; choose: ()
       </span>
       <span class="item-more">
         {item.status && (
-          <span class={`status status-${item.status}`}>{STATUSES[item.status]?.[0] ?? item.status}</span>
+          <span class={`status status-${item.status}`}>{statusOf(item.status, item.kind)}</span>
         )}
         {item.history?.transient && <span class="status">comes and goes</span>}
-        <span title={ago(item.firstSeen)}>since {instant(item.firstSeen)}</span>
+        <span title={`change first seen ${ago(item.firstSeen)}`}>since {instant(item.firstSeen)}</span>
         <span>{whereOf(item)}</span>
         {item.device && <span>{item.device}</span>}
       </span>
@@ -198,12 +198,12 @@ function FilterForm({ app, state }: Props) {
           legend="Status"
           chosen={filters.statuses}
           known={tally(all.map(({ status }) => status))}
-          word={(status) => STATUSES[status]?.[0] ?? status}
+          word={(status) => STATUSES[status] ?? status}
           pick={(statuses) => set({ statuses })}
         />
       )}
       <label>
-        First seen
+        Change first seen
         <select
           value={isDay(filters.since) ? "day" : filters.since}
           onChange={({ currentTarget }) =>
@@ -218,7 +218,7 @@ function FilterForm({ app, state }: Props) {
         {isDay(filters.since) && (
           <input
             type="date"
-            aria-label="First seen since"
+            aria-label="Change first seen since"
             value={filters.since}
             onChange={({ currentTarget }) => set({ since: currentTarget.value })}
           />
