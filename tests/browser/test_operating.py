@@ -106,6 +106,19 @@ def test_a_link_opens_the_same_view_and_another_link_in_the_address_changes_it(
     expect(other.page.locator(".details")).to_have_count(0)
 
 
+def test_a_day_is_typed_with_its_zeros_and_the_field_keeps_the_focus(opened: Opener) -> None:
+    viewer = opened(f"#map={MAP}&show=both").drawn()
+    page, field = viewer.page, viewer.page.get_by_label("Change first seen since")
+    page.get_by_role("button", name="Filters").click()
+    page.locator("#filters select").first.select_option("day")
+    field.focus()
+    for digit in "03042026":  # month, day, year: as the browser's own language has it
+        page.keyboard.press(digit)
+        expect(field).to_be_focused()
+    assert "since=2026-03-04" in page.url
+    assert "show=both" in page.url  # no digit was taken for a shortcut
+
+
 def rounded(value: object) -> object:
     """Return what a page told with its numbers to the centimetre, as links have them."""
     return json.loads(json.dumps(value), parse_float=lambda text: round(float(text), 1))

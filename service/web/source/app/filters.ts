@@ -39,6 +39,12 @@ export function beginOf(since: string, now = new Date()): Date | null {
   return date ? new Date(Number(date[1]), Number(date[2]) - 1, Number(date[3])) : null;
 }
 
+/** Return the day that a date field holds once it is typed to its end, from 1900 on; null before that. */
+export function wholeDay(typed: string): string | null {
+  const day = /^(\d{4})-\d\d-\d\d$/.exec(typed);
+  return day && Number(day[1]) >= 1900 ? typed : null;
+}
+
 function daysBefore(day: Date, days: number): Date {
   return new Date(day.getFullYear(), day.getMonth(), day.getDate() - days);
 }

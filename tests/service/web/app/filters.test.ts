@@ -8,6 +8,7 @@ import {
   NO_FILTERS,
   tally,
   toggled,
+  wholeDay,
 } from "../../../../service/web/source/app/filters.ts";
 import { itemOfObject, itemOfTile } from "../../../../service/web/source/app/items.ts";
 import { box, object, tile } from "./samples.ts";
@@ -77,6 +78,11 @@ test("periods begin where they say, and one that cannot be read has no beginning
   assert.deepEqual(beginOf("2026-03-01", THURSDAY), new Date(2026, 2, 1));
   assert.equal(beginOf("", THURSDAY), null);
   assert.equal(beginOf("yesterday", THURSDAY), null);
+});
+
+test("a day that is half typed is none", () => {
+  assert.equal(wholeDay("2026-03-04"), "2026-03-04");
+  for (const typed of ["", "0202-03-04", "0020-03-04", "2026-03"]) assert.equal(wholeDay(typed), null);
 });
 
 test("the second floor is what the section shows", () => {

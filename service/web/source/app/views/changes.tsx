@@ -2,7 +2,7 @@
 
 import { Fragment, h } from "preact";
 
-import { active, NO_FILTERS, PERIODS, tally, toggled, type Filters } from "../filters.ts";
+import { active, NO_FILTERS, PERIODS, tally, toggled, wholeDay, type Filters } from "../filters.ts";
 import { ago, count, instant, percent } from "../format.ts";
 import { whereOf, type Item } from "../items.ts";
 import { allItems, focusOf, jobOf, shownItems, type State } from "../state.ts";
@@ -216,12 +216,7 @@ function FilterForm({ app, state }: Props) {
           <option value="day">since a day…</option>
         </select>
         {isDay(filters.since) && (
-          <input
-            type="date"
-            aria-label="Change first seen since"
-            value={filters.since}
-            onChange={({ currentTarget }) => set({ since: currentTarget.value })}
-          />
+          <DayField name="Change first seen since" value={filters.since} set={(since) => set({ since })} />
         )}
       </label>
       {devices.length > 0 && (
@@ -264,6 +259,21 @@ function FilterForm({ app, state }: Props) {
       )}
     </form>
   );
+}
+
+/** A field for a day, which nobody writes into while it has the focus: a day that is half typed is an empty value. */
+function DayField({ name, value, set }: { name: string; value: string; set: (day: string) => void }) {
+  const shown = (field: HTMLInputElement | null) => {
+    if (field && field !== document.activeElement) field.value = value;
+  };
+  const take = ({ currentTarget }: { currentTarget: HTMLInputElement }) => {
+    const day = wholeDay(currentTarget.value);
+    if (day && day !== value) set(day);
+  };
+  const leave = ({ currentTarget }: { currentTarget: HTMLInputElement }) => {
+    currentTarget.value = wholeDay(currentTarget.value) ?? value;
+  };
+  return <input type="date" min="1900-01-01" aria-label={name} ref={shown} onChange={take} onBlur={leave} />;
 }
 
 interface ChoicesProps {
