@@ -4,7 +4,7 @@ import { Api, ApiError, problemOf } from "./api.ts";
 import type { CloudEvent, Counts } from "./documents.ts";
 import { follow, type Line } from "./follow.ts";
 import { count } from "./format.ts";
-import { NOWHERE, readPlace, writePlace, type Place } from "./link.ts";
+import { NOWHERE, readPlace, TILES_OF, writePlace, type Place } from "./link.ts";
 import * as loads from "./loads.ts";
 import {
   firstState,
@@ -63,9 +63,11 @@ export class Controller {
 
   /** Go elsewhere in the page; the browser's way back leads over maps, surveys and the first object of a row. */
   go(change: Partial<Place>): void {
-    const place = { ...this.state.place, ...change };
+    const before = this.state.place;
+    const place = { ...before, ...change };
+    if (!change.tiles && before.tiles.join() === TILES_OF[before.list].join()) place.tiles = TILES_OF[place.list];
     const address = `#${writePlace(place)}`;
-    if (!isStep(this.state.place, place)) history.replaceState(null, "", address);
+    if (!isStep(before, place)) history.replaceState(null, "", address);
     else history.pushState(null, "", address);
     this.#arrive(place);
   }

@@ -11,7 +11,7 @@ import { listenForDrops } from "./drops.ts";
 import { drawing, shownTheme, Stage } from "./stage.ts";
 import { Page } from "./views/page.tsx";
 
-import { KIND_COLOURS, STATE_COLOURS } from "../scene/colours.ts";
+import { KIND_COLOURS, STATE_COLOURS, TILE_COLOURS } from "../scene/colours.ts";
 import type { Scene } from "../scene/scene.ts";
 
 declare global {
@@ -20,7 +20,7 @@ declare global {
   }
 }
 
-for (const [name, colour] of Object.entries({ ...STATE_COLOURS, ...KIND_COLOURS })) {
+for (const [name, colour] of Object.entries({ ...STATE_COLOURS, ...TILE_COLOURS, ...KIND_COLOURS })) {
   document.documentElement.style.setProperty(`--${name}`, colour);
 }
 

@@ -2,10 +2,10 @@
 
 import { Fragment, h } from "preact";
 
-import { active, NO_FILTERS, PERIODS, tally, toggled, wholeDay, type Filters } from "../filters.ts";
+import { active, filtered, NO_FILTERS, PERIODS, tally, toggled, wholeDay, type Filters } from "../filters.ts";
 import { ago, count, instant, percent } from "../format.ts";
 import { whereOf, type Item } from "../items.ts";
-import { allItems, focusOf, jobOf, shownItems, type State } from "../state.ts";
+import { allItems, focusOf, jobOf, sectionOf, shownItems, type State } from "../state.ts";
 import { KINDS, sayingOf, STATUSES, statusOf } from "../words.ts";
 import { newUpload, type Props } from "./page.tsx";
 import { Empty, Kind, Problem, Waiting } from "./parts.tsx";
@@ -183,13 +183,21 @@ function FilterForm({ app, state }: Props) {
   const { filters } = state.place;
   const all = allItems(state);
   const set = (change: Partial<Filters>) => app.go({ filters: { ...filters, ...change } });
+  /** Count the values of all items among those that the other filters let through. */
+  const counted = (name: "kind" | "status", open: Partial<Filters>) => {
+    const rest = tally(filtered(all, { ...filters, ...open }, sectionOf(state)).map((item) => item[name]));
+    return tally(all.map((item) => item[name])).map(([value]): [string, number] => [
+      value,
+      rest.find(([one]) => one === value)?.[1] ?? 0,
+    ]);
+  };
   const devices = tally((state.surveys.value ?? []).map(({ device_id }) => device_id)).map(([name]) => name);
   return (
     <form id="filters" class="filters" onSubmit={(event) => event.preventDefault()}>
       <Choices
         legend="Kind"
         chosen={filters.kinds}
-        known={tally(all.map(({ kind }) => kind))}
+        known={counted("kind", { kinds: [] })}
         word={(kind) => KINDS[kind] ?? kind}
         pick={(kinds) => set({ kinds })}
       />
@@ -197,7 +205,7 @@ function FilterForm({ app, state }: Props) {
         <Choices
           legend="Status"
           chosen={filters.statuses}
-          known={tally(all.map(({ status }) => status))}
+          known={counted("status", { statuses: [] })}
           word={(status) => STATUSES[status] ?? status}
           pick={(statuses) => set({ statuses })}
         />

@@ -88,7 +88,8 @@ function Doubts({ item }: { item: Item }) {
   if (history?.status === "unknown")
     words.push(
       "The latest survey that could be compared did not look there. " +
-        `It was ${statusOf(history.last_known, item.kind).toLowerCase()} when one looked last, ${instant(history.last_looked)}.`,
+        `It was ${statusOf(history.last_known, item.kind).toLowerCase()} ` +
+        `when one looked last, ${instant(history.last_looked)}.`,
     );
   if (history?.transient) words.push("It comes and goes: it was seen, gone, and seen again.");
   if (!words.length) return null;
