@@ -106,6 +106,21 @@ def test_a_link_opens_the_same_view_and_another_link_in_the_address_changes_it(
     expect(other.page.locator(".details")).to_have_count(0)
 
 
+def test_closing_the_details_returns_to_the_clouds_that_were_chosen(
+    opened: Opener, viewer_data: ViewerData
+) -> None:
+    viewer = opened(f"#map={MAP}&survey={viewer_data.surveys['objects']}").drawn()
+    page = viewer.page
+    pressed = page.locator(".over-top button[aria-pressed=true]")
+    page.keyboard.press("2")
+    expect(pressed).to_have_text("Survey")
+    page.keyboard.press("j")
+    page.get_by_role("button", name="Before | after").click()
+    expect(pressed).to_have_text("Split")
+    page.keyboard.press("Escape")
+    expect(pressed).to_have_text("Survey")
+
+
 def test_a_day_is_typed_with_its_zeros_and_the_field_keeps_the_focus(opened: Opener) -> None:
     viewer = opened(f"#map={MAP}&show=both").drawn()
     page, field = viewer.page, viewer.page.get_by_label("Change first seen since")

@@ -18,7 +18,7 @@ export function Details(props: Props) {
   const { app, state } = props;
   const item = chosenItem(state);
   const known = state.objects.value ?? state.changes.value;
-  const close = () => app.go({ item: null, show: null });
+  const close = () => app.go({ item: null });
   return (
     <aside class="details" aria-label="Details of what is chosen">
       <div class="details-head">
