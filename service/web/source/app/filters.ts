@@ -1,6 +1,8 @@
 /** Which items the list and the scene show. */
 
+import { percent } from "./format.ts";
 import type { Item } from "./items.ts";
+import { KINDS, STATUSES } from "./words.ts";
 
 export interface Filters {
   kinds: string[]; // empty: all
@@ -27,6 +29,47 @@ export const PERIODS: readonly (readonly [string, string])[] = [
   ["7d", "last 7 days"],
   ["30d", "last 30 days"],
 ];
+
+/** Write a day: `Mon 16 Nov`, with its year where that is not this one. */
+export function dayWords(day: Date, now = new Date()): string {
+  const year = day.getFullYear() === now.getFullYear() ? undefined : "numeric";
+  const words = day.toLocaleDateString("en-GB", { weekday: "short", day: "numeric", month: "short", year });
+  return words.replace(",", "");
+}
+
+/** Say from when on something was first seen, with its day: `since Mon 16 Nov`. */
+export function periodWords(since: string, now = new Date()): string {
+  const begin = beginOf(since, now);
+  if (begin && (since === "monday" || !PERIODS.some(([value]) => value === since)))
+    return `since ${dayWords(begin, now)}`;
+  return PERIODS.find(([value]) => value === since)?.[1] ?? "any time";
+}
+
+/** Return the days of instants in local time as filters have them, each once, the latest first. */
+export function daysOf(instants: readonly string[]): string[] {
+  const days = instants.map((text) => {
+    const at = new Date(text);
+    return [at.getFullYear(), at.getMonth() + 1, at.getDate()]
+      .map((part) => String(part).padStart(2, "0"))
+      .join("-");
+  });
+  return [...new Set(days)].sort().reverse();
+}
+
+/** Say what is filtered by, for people: `moved, since Mon 16 Nov`; empty where nothing is. */
+export function filterWords(filters: Filters, now = new Date()): string {
+  const { kinds, statuses, device, since, minScore, inSection } = filters;
+  return [
+    kinds.map((kind) => (KINDS[kind] ?? kind).toLowerCase()).join(" or "),
+    statuses.map((status) => (STATUSES[status] ?? status).toLowerCase()).join(" or "),
+    since && `first seen ${since === "today" || beginOf(since) ? periodWords(since, now) : "at any time"}`,
+    device && `by ${device}`,
+    minScore > 0 && `at least ${percent(minScore)}`,
+    inSection && "at the heights that are shown",
+  ]
+    .filter(Boolean)
+    .join(", ");
+}
 
 /** Return the instant at which a period begins, in local time; null where it has no beginning. */
 export function beginOf(since: string, now = new Date()): Date | null {

@@ -4,8 +4,11 @@ import { test } from "node:test";
 import {
   active,
   beginOf,
+  daysOf,
   filtered,
+  filterWords,
   NO_FILTERS,
+  periodWords,
   tally,
   toggled,
   wholeDay,
@@ -78,6 +81,27 @@ test("periods begin where they say, and one that cannot be read has no beginning
   assert.deepEqual(beginOf("2026-03-01", THURSDAY), new Date(2026, 2, 1));
   assert.equal(beginOf("", THURSDAY), null);
   assert.equal(beginOf("yesterday", THURSDAY), null);
+});
+
+test("a period is told with its day, and a day of another year with its year", () => {
+  assert.equal(periodWords("monday", THURSDAY), "since Mon 2 Mar");
+  assert.equal(periodWords("2026-03-03", THURSDAY), "since Tue 3 Mar");
+  assert.equal(periodWords("2025-03-03", THURSDAY), "since Mon 3 Mar 2025");
+  assert.equal(periodWords("7d", THURSDAY), "last 7 days");
+});
+
+test("the days of visits are local, each once, the latest first", () => {
+  const visits = ["2026-03-02T10:00:00Z", "2026-03-03T23:30:00Z", "2026-03-04T08:00:00Z"];
+  assert.deepEqual(daysOf(visits), ["2026-03-04", "2026-03-02"]);
+});
+
+test("what is filtered by is said", () => {
+  assert.equal(filterWords(NO_FILTERS), "");
+  const filters = { ...NO_FILTERS, kinds: ["moved", "appeared"], since: "monday", minScore: 0.5 };
+  assert.equal(
+    filterWords({ ...filters, device: "robot-7" }, THURSDAY),
+    "moved or appeared, first seen since Mon 2 Mar, by robot-7, at least 50 %",
+  );
 });
 
 test("a day that is half typed is none", () => {

@@ -2,13 +2,15 @@
 
 import { Fragment, h } from "preact";
 
-import { active, filtered, NO_FILTERS, PERIODS, tally, toggled, wholeDay, type Filters } from "../filters.ts";
+import { active, daysOf, filtered, filterWords, NO_FILTERS, PERIODS, periodWords, tally, toggled, wholeDay, type Filters } from "../filters.ts";
 import { ago, count, instant, percent } from "../format.ts";
 import { whereOf, type Item } from "../items.ts";
 import { allItems, focusOf, jobOf, sectionOf, shownItems, type State } from "../state.ts";
 import { KINDS, sayingOf, STATUSES, statusOf } from "../words.ts";
 import { newUpload, type Props } from "./page.tsx";
 import { Empty, Kind, Problem, Waiting } from "./parts.tsx";
+
+const MOST_DAYS = 12; // of visits that are offered to filter by
 
 export function Changes(props: Props) {
   const { app, state } = props;
@@ -50,7 +52,8 @@ function words(state: State, items: readonly Item[]): string {
   const noun = place.list === "tiles" ? "changed tile" : "object";
   const number = items.length === all ? count(all, noun) : `${items.length} of ${count(all, noun)}`;
   const chosen = place.survey && state.surveys.value?.find(({ survey_id }) => survey_id === place.survey);
-  return `${number} ${chosen ? `in the survey of ${instant(chosen.captured_at)}` : "over all surveys"}`;
+  const of = chosen ? `in the survey of ${instant(chosen.captured_at)}` : "over all surveys";
+  return [`${number} ${of}`, filterWords(place.filters)].filter(Boolean).join(": ");
 }
 
 function List({ app, state, items }: Props & { items: readonly Item[] }) {
@@ -191,6 +194,7 @@ function FilterForm({ app, state }: Props) {
       rest.find(([one]) => one === value)?.[1] ?? 0,
     ]);
   };
+  const visits = daysOf((state.surveys.value ?? []).map(({ captured_at }) => captured_at)).slice(0, MOST_DAYS);
   const devices = tally((state.surveys.value ?? []).map(({ device_id }) => device_id)).map(([name]) => name);
   return (
     <form id="filters" class="filters" onSubmit={(event) => event.preventDefault()}>
@@ -213,13 +217,16 @@ function FilterForm({ app, state }: Props) {
       <label>
         Change first seen
         <select
-          value={isDay(filters.since) ? "day" : filters.since}
+          value={isDay(filters.since) && !visits.includes(filters.since) ? "day" : filters.since}
           onChange={({ currentTarget }) =>
-            set({ since: currentTarget.value === "day" ? today() : currentTarget.value })
+            set({ since: currentTarget.value === "day" ? otherDay(visits) : currentTarget.value })
           }
         >
-          {PERIODS.map(([value, word]) => (
-            <option value={value}>{word}</option>
+          {PERIODS.map(([value]) => (
+            <option value={value}>{periodWords(value)}</option>
+          ))}
+          {visits.map((day) => (
+            <option value={day}>{periodWords(day)}, a visit</option>
           ))}
           <option value="day">since a day…</option>
         </select>
@@ -317,9 +324,8 @@ function isDay(since: string): boolean {
   return /^\d{4}-/.test(since);
 }
 
-function today(): string {
-  const now = new Date();
-  return [now.getFullYear(), now.getMonth() + 1, now.getDate()]
-    .map((part) => String(part).padStart(2, "0"))
-    .join("-");
+/** Return the day that a day field begins with: today, or the day before where today is a visit's. */
+function otherDay(visits: readonly string[]): string {
+  const days = [0, 1].map((back) => new Date(Date.now() - back * 86_400_000).toISOString());
+  return daysOf(days).find((day) => !visits.includes(day)) ?? daysOf(days)[0]!;
 }
