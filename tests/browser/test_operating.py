@@ -106,6 +106,13 @@ def test_a_link_opens_the_same_view_and_another_link_in_the_address_changes_it(
     expect(other.page.locator(".details")).to_have_count(0)
 
 
+def test_of_a_survey_that_failed_nothing_is_counted(opened: Opener, viewer_data: ViewerData) -> None:
+    viewer = opened(f"#map={MAP}&survey={viewer_data.surveys['failed']}")
+    expect(viewer.page.locator("#tab-changes .number")).to_have_text("–")
+    expect(viewer.page.locator(".list-count")).to_contain_text("Nothing was compared")
+    expect(viewer.page.locator(".list-count")).not_to_contain_text("0 objects")
+
+
 def test_closing_the_details_returns_to_the_clouds_that_were_chosen(
     opened: Opener, viewer_data: ViewerData
 ) -> None:

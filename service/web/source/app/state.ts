@@ -173,6 +173,11 @@ export function allItems(state: State): Item[] {
   return (place.survey ? sightings.value : objects.value) ?? [];
 }
 
+/** Return the survey that the list is of; null where it is of all surveys. */
+export function listedSurvey({ place, surveys }: State): SurveySummaryDocument | null {
+  return surveys.value?.find(({ survey_id }) => survey_id === place.survey) ?? null;
+}
+
 /** Return a function that gives the same answer for as long as its parts are the same. */
 function remembered<T>(): (parts: unknown[], make: () => T) => T {
   let kept: { parts: unknown[]; value: T } | null = null;

@@ -178,6 +178,11 @@ function judged(counts: Counts): number {
   return (counts["unchanged"] ?? 0) + (counts["changed"] ?? 0);
 }
 
+/** Tell whether a survey was compared with the map, so that a count of what changed says something. */
+export function isCompared({ status, placement }: Pick<SurveySummaryDocument, "status" | "placement">): boolean {
+  return status === "ready" && placement?.state !== "in_doubt";
+}
+
 /** List counts by kind: `2 appeared, 1 moved`. */
 export function kinds(counts: Counts): string {
   const told = Object.entries(counts).filter(([, number]) => number);

@@ -5,6 +5,7 @@ import type { JobDocument } from "../../../../service/web/source/app/documents.t
 import {
   adviceOn,
   coverage,
+  isCompared,
   nothingChanged,
   objectsOf,
   progressOf,
@@ -73,6 +74,13 @@ test("a survey without a scan that is placed is no quiet one", () => {
   );
   assert.equal(saying.short, "not registered");
   assert.match(saying.long, /not the same as no change/);
+});
+
+test("only a survey that is ready and not in doubt was compared", () => {
+  assert.equal(isCompared(survey()), true);
+  assert.equal(isCompared(survey({ status: "failed" })), false);
+  assert.equal(isCompared(survey({ status: "running", placement: null })), false);
+  assert.equal(isCompared(survey({ placement: { state: "in_doubt", confidence: 0.4 } })), false);
 });
 
 test("a survey in doubt says nothing about change", () => {

@@ -3,10 +3,11 @@
 import { Fragment, h } from "preact";
 
 import { active, daysOf, filtered, filterWords, NO_FILTERS, PERIODS, periodWords, tally, toggled, wholeDay, type Filters } from "../filters.ts";
+import type { SurveySummaryDocument } from "../documents.ts";
 import { ago, count, instant, percent } from "../format.ts";
 import { whereOf, type Item } from "../items.ts";
-import { allItems, focusOf, jobOf, sectionOf, shownItems, type State } from "../state.ts";
-import { KINDS, sayingOf, STATUSES, statusOf } from "../words.ts";
+import { allItems, focusOf, jobOf, listedSurvey, sectionOf, shownItems, type State } from "../state.ts";
+import { isCompared, KINDS, sayingOf, STATUSES, statusOf } from "../words.ts";
 import { newUpload, type Props } from "./page.tsx";
 import { Empty, Kind, Problem, Waiting } from "./parts.tsx";
 
@@ -48,12 +49,19 @@ export function Changes(props: Props) {
 /** Say how many are listed, of which survey. */
 function words(state: State, items: readonly Item[]): string {
   const { place } = state;
+  const chosen = listedSurvey(state);
+  if (chosen && !isCompared(chosen) && !items.length)
+    return `${notCompared(chosen)}: the survey of ${instant(chosen.captured_at)}`;
   const all = allItems(state).length;
   const noun = place.list === "tiles" ? "changed tile" : "object";
   const number = items.length === all ? count(all, noun) : `${items.length} of ${count(all, noun)}`;
-  const chosen = place.survey && state.surveys.value?.find(({ survey_id }) => survey_id === place.survey);
   const of = chosen ? `in the survey of ${instant(chosen.captured_at)}` : "over all surveys";
   return [`${number} ${of}`, filterWords(place.filters)].filter(Boolean).join(": ");
+}
+
+function notCompared({ status }: SurveySummaryDocument): string {
+  if (status === "running") return "Not compared yet";
+  return status === "failed" ? "Nothing was compared" : "Nothing is said about change";
 }
 
 function List({ app, state, items }: Props & { items: readonly Item[] }) {
