@@ -113,6 +113,18 @@ def test_of_a_survey_that_failed_nothing_is_counted(opened: Opener, viewer_data:
     expect(viewer.page.locator(".list-count")).not_to_contain_text("0 objects")
 
 
+def test_the_heights_are_typed_where_they_are_filtered_by(opened: Opener) -> None:
+    viewer = opened(f"#map={MAP}").drawn()
+    page = viewer.page
+    page.get_by_role("button", name="Filters").click()
+    page.get_by_text("only at the heights that are shown").click()
+    page.get_by_label("Heights from, metres").fill("50")
+    page.keyboard.press("Enter")
+    viewer.until("() => location.hash.includes('section=50,50.1')")
+    expect(page.locator(".list-count")).to_contain_text("0 of")
+    expect(page.locator(".list-count")).to_contain_text("at the heights that are shown")
+
+
 def test_closing_the_details_returns_to_the_clouds_that_were_chosen(
     opened: Opener, viewer_data: ViewerData
 ) -> None:

@@ -111,6 +111,18 @@ export function filtered(
   );
 }
 
+const LEAST_SECTION = 0.1; // metres
+
+/** Return a section from another height; its end goes along where it would be lower. Metres, map frame. */
+export function withLow([, high]: readonly [number, number], low: number): [number, number] {
+  return [low, Math.max(high, low + LEAST_SECTION)];
+}
+
+/** Return a section to another height; its beginning goes along where it would be higher. Metres, map frame. */
+export function withHigh([low]: readonly [number, number], high: number): [number, number] {
+  return [Math.min(low, high - LEAST_SECTION), high];
+}
+
 /** Tell whether an item is of a kind; a tile where things appeared and disappeared is of both. */
 function isKind({ kind }: Item, wanted: string): boolean {
   return kind === wanted || (kind === "both" && (wanted === "appeared" || wanted === "disappeared"));

@@ -12,6 +12,8 @@ import {
   tally,
   toggled,
   wholeDay,
+  withHigh,
+  withLow,
 } from "../../../../service/web/source/app/filters.ts";
 import { itemOfObject, itemOfTile } from "../../../../service/web/source/app/items.ts";
 import { box, object, tile } from "./samples.ts";
@@ -113,6 +115,13 @@ test("the second floor is what the section shows", () => {
   assert.deepEqual(ids({ inSection: true }, [3, 6]), ["upstairs"]);
   assert.deepEqual(ids({ inSection: true }, [0, 2.5]), ["old", "late"]);
   assert.deepEqual(ids({ inSection: false }, [3, 6]), ["old", "late", "upstairs"]);
+});
+
+test("one end of a section takes the other along where they would cross", () => {
+  assert.deepEqual(withLow([0, 2], 1), [1, 2]);
+  assert.deepEqual(withLow([0, 2], 3), [3, 3.1]);
+  assert.deepEqual(withHigh([0, 2], 1), [0, 1]);
+  assert.deepEqual(withHigh([1, 2], 0.5), [0.4, 0.5]);
 });
 
 test("filters that are set are counted", () => {

@@ -2,7 +2,7 @@
 
 import { Fragment, h } from "preact";
 
-import { active, daysOf, filtered, filterWords, NO_FILTERS, PERIODS, periodWords, tally, toggled, wholeDay, type Filters } from "../filters.ts";
+import { active, daysOf, filtered, filterWords, NO_FILTERS, PERIODS, periodWords, tally, toggled, wholeDay, withHigh, withLow, type Filters } from "../filters.ts";
 import type { SurveySummaryDocument } from "../documents.ts";
 import { ago, count, instant, percent } from "../format.ts";
 import { whereOf, type Item } from "../items.ts";
@@ -275,6 +275,7 @@ function FilterForm({ app, state }: Props) {
         />
         only at the heights that are shown, such as one floor
       </label>
+      {filters.inSection && <Heights app={app} state={state} />}
       {active(filters) > 0 && (
         <button type="button" onClick={() => set(NO_FILTERS)}>
           Clear
@@ -282,6 +283,32 @@ function FilterForm({ app, state }: Props) {
       )}
     </form>
   );
+}
+
+/** Fields for the heights that are shown; they are those of the section. */
+function Heights({ app, state }: Pick<Props, "app" | "state">) {
+  const section = sectionOf(state);
+  if (!section) return <p class="faint">The heights are known once the cloud is loaded.</p>;
+  const [low, high] = section;
+  return (
+    <span class="row">
+      from
+      <Height name="Heights from, metres" value={low} set={(to) => app.go({ section: withLow(section, to) })} />
+      to
+      <Height name="Heights to, metres" value={high} set={(to) => app.go({ section: withHigh(section, to) })} />m
+    </span>
+  );
+}
+
+/** A field for a height in metres, which counts once it is left or Enter is pressed. */
+function Height({ name, value, set }: { name: string; value: number; set: (height: number) => void }) {
+  const shown = (field: HTMLInputElement | null) => {
+    if (field && field !== document.activeElement) field.value = value.toFixed(2);
+  };
+  const take = ({ currentTarget }: { currentTarget: HTMLInputElement }) => {
+    if (Number.isFinite(currentTarget.valueAsNumber)) set(currentTarget.valueAsNumber);
+  };
+  return <input type="number" step="any" aria-label={name} ref={shown} onChange={take} />;
 }
 
 /** A field for a day, which nobody writes into while it has the focus: a day that is half typed is an empty value. */
