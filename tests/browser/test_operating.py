@@ -57,6 +57,7 @@ def test_the_keyboard_alone_leads_from_the_maps_to_the_evidence_of_an_object(
     tabbed_to(viewer, f"a[href='#map={MAP}']")
     keys.press("Enter")
     viewer.drawn()
+    expect(page.locator("#main")).to_be_focused()
     survey = viewer_data.surveys["objects"]
     for _ in range(6):
         if f"survey={survey}" in page.url:
@@ -75,6 +76,10 @@ def test_the_keyboard_alone_leads_from_the_maps_to_the_evidence_of_an_object(
     expect(page.locator(".split-words")).to_be_visible()
     keys.press("Escape")
     expect(details).to_have_count(0)
+    keys.press("j")
+    page.get_by_label("Close the details").focus()
+    keys.press("Escape")
+    expect(page.locator("#items")).to_be_focused()
 
 
 def test_what_has_the_focus_is_seen(opened: Opener) -> None:
