@@ -57,6 +57,7 @@ def test_the_keyboard_alone_leads_from_the_maps_to_the_evidence_of_an_object(
     tabbed_to(viewer, f"a[href='#map={MAP}']")
     keys.press("Enter")
     viewer.drawn()
+    expect(page.locator("#main")).to_be_focused()
     survey = viewer_data.surveys["objects"]
     for _ in range(6):
         if f"survey={survey}" in page.url:
@@ -69,12 +70,16 @@ def test_the_keyboard_alone_leads_from_the_maps_to_the_evidence_of_an_object(
     keys.press("j")
     expect(page.locator("#items [aria-selected=true]")).to_have_count(1)
     details = page.locator(".details")
-    for said in ("Probability", "Judged", "Seen", "First seen"):
+    for said in ("Probability", "Judged", "Seen", "Change first seen"):
         expect(details).to_contain_text(said)
     viewer.drawn()
     expect(page.locator(".split-words")).to_be_visible()
     keys.press("Escape")
     expect(details).to_have_count(0)
+    keys.press("j")
+    page.get_by_label("Close the details").focus()
+    keys.press("Escape")
+    expect(page.locator("#items")).to_be_focused()
 
 
 def test_what_has_the_focus_is_seen(opened: Opener) -> None:
@@ -104,6 +109,53 @@ def test_a_link_opens_the_same_view_and_another_link_in_the_address_changes_it(
     other.page.evaluate("(hash) => { location.hash = hash; }", f"#map={MAP}&survey={quiet}")
     expect(other.page.locator(f"#visit-{quiet}")).to_have_attribute("aria-pressed", "true")
     expect(other.page.locator(".details")).to_have_count(0)
+
+
+def test_of_a_survey_that_failed_nothing_is_counted(opened: Opener, viewer_data: ViewerData) -> None:
+    viewer = opened(f"#map={MAP}&survey={viewer_data.surveys['failed']}")
+    expect(viewer.page.locator("#tab-changes .number")).to_have_text("–")
+    expect(viewer.page.locator(".list-count")).to_contain_text("Nothing was compared")
+    expect(viewer.page.locator(".list-count")).not_to_contain_text("0 objects")
+
+
+def test_the_heights_are_typed_where_they_are_filtered_by(opened: Opener) -> None:
+    viewer = opened(f"#map={MAP}").drawn()
+    page = viewer.page
+    page.get_by_role("button", name="Filters").click()
+    page.get_by_text("only at the heights that are shown").click()
+    page.get_by_label("Heights from, metres").fill("50")
+    page.keyboard.press("Enter")
+    viewer.until("() => location.hash.includes('section=50,50.1')")
+    expect(page.locator(".list-count")).to_contain_text("0 of")
+    expect(page.locator(".list-count")).to_contain_text("at the heights that are shown")
+
+
+def test_closing_the_details_returns_to_the_clouds_that_were_chosen(
+    opened: Opener, viewer_data: ViewerData
+) -> None:
+    viewer = opened(f"#map={MAP}&survey={viewer_data.surveys['objects']}").drawn()
+    page = viewer.page
+    pressed = page.locator(".over-top button[aria-pressed=true]")
+    page.keyboard.press("2")
+    expect(pressed).to_have_text("Survey")
+    page.keyboard.press("j")
+    page.get_by_role("button", name="Before | after").click()
+    expect(pressed).to_have_text("Split")
+    page.keyboard.press("Escape")
+    expect(pressed).to_have_text("Survey")
+
+
+def test_a_day_is_typed_with_its_zeros_and_the_field_keeps_the_focus(opened: Opener) -> None:
+    viewer = opened(f"#map={MAP}&show=both").drawn()
+    page, field = viewer.page, viewer.page.get_by_label("Change first seen since")
+    page.get_by_role("button", name="Filters").click()
+    page.locator("#filters select").first.select_option("day")
+    field.focus()
+    for digit in "03042026":  # month, day, year: as the browser's own language has it
+        page.keyboard.press(digit)
+        expect(field).to_be_focused()
+    assert "since=2026-03-04" in page.url
+    assert "show=both" in page.url  # no digit was taken for a shortcut
 
 
 def rounded(value: object) -> object:

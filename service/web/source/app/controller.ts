@@ -4,7 +4,7 @@ import { Api, ApiError, problemOf } from "./api.ts";
 import type { CloudEvent, Counts } from "./documents.ts";
 import { follow, type Line } from "./follow.ts";
 import { count } from "./format.ts";
-import { NOWHERE, readPlace, writePlace, type Place } from "./link.ts";
+import { NOWHERE, readPlace, TILES_OF, writePlace, type Place, type Show } from "./link.ts";
 import * as loads from "./loads.ts";
 import {
   firstState,
@@ -28,6 +28,7 @@ export class Controller {
   readonly api: Api;
   readonly #render: (state: State) => void;
   #planned = false;
+  #showBefore: Show | null = null; // which clouds were chosen when the first object of a row was opened
   #followed: AbortController | null = null;
   #refresh: ReturnType<typeof setTimeout> | undefined;
   #jobs: ReturnType<typeof setTimeout> | undefined;
@@ -63,9 +64,14 @@ export class Controller {
 
   /** Go elsewhere in the page; the browser's way back leads over maps, surveys and the first object of a row. */
   go(change: Partial<Place>): void {
-    const place = { ...this.state.place, ...change };
+    const before = this.state.place;
+    const place = { ...before, ...change };
+    if (!change.tiles && before.tiles.join() === TILES_OF[before.list].join()) place.tiles = TILES_OF[place.list];
+    if (before.item === null && place.item !== null) this.#showBefore = before.show;
+    else if (before.item !== null && place.item === null && change.show === undefined)
+      place.show = this.#showBefore;
     const address = `#${writePlace(place)}`;
-    if (!isStep(this.state.place, place)) history.replaceState(null, "", address);
+    if (!isStep(before, place)) history.replaceState(null, "", address);
     else history.pushState(null, "", address);
     this.#arrive(place);
   }
@@ -80,6 +86,7 @@ export class Controller {
     if (writePlace(before) === writePlace(place)) return;
     this.update({ place });
     if (place.map !== before.map) {
+      this.#showBefore = null;
       this.update(nothingOfAMap());
       this.#begin();
     } else if (place.map) {

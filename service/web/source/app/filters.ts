@@ -1,6 +1,8 @@
 /** Which items the list and the scene show. */
 
+import { percent } from "./format.ts";
 import type { Item } from "./items.ts";
+import { KINDS, STATUSES } from "./words.ts";
 
 export interface Filters {
   kinds: string[]; // empty: all
@@ -28,6 +30,47 @@ export const PERIODS: readonly (readonly [string, string])[] = [
   ["30d", "last 30 days"],
 ];
 
+/** Write a day: `Mon 16 Nov`, with its year where that is not this one. */
+export function dayWords(day: Date, now = new Date()): string {
+  const year = day.getFullYear() === now.getFullYear() ? undefined : "numeric";
+  const words = day.toLocaleDateString("en-GB", { weekday: "short", day: "numeric", month: "short", year });
+  return words.replace(",", "");
+}
+
+/** Say from when on something was first seen, with its day: `since Mon 16 Nov`. */
+export function periodWords(since: string, now = new Date()): string {
+  const begin = beginOf(since, now);
+  if (begin && (since === "monday" || !PERIODS.some(([value]) => value === since)))
+    return `since ${dayWords(begin, now)}`;
+  return PERIODS.find(([value]) => value === since)?.[1] ?? "any time";
+}
+
+/** Return the days of instants in local time as filters have them, each once, the latest first. */
+export function daysOf(instants: readonly string[]): string[] {
+  const days = instants.map((text) => {
+    const at = new Date(text);
+    return [at.getFullYear(), at.getMonth() + 1, at.getDate()]
+      .map((part) => String(part).padStart(2, "0"))
+      .join("-");
+  });
+  return [...new Set(days)].sort().reverse();
+}
+
+/** Say what is filtered by, for people: `moved, since Mon 16 Nov`; empty where nothing is. */
+export function filterWords(filters: Filters, now = new Date()): string {
+  const { kinds, statuses, device, since, minScore, inSection } = filters;
+  return [
+    kinds.map((kind) => (KINDS[kind] ?? kind).toLowerCase()).join(" or "),
+    statuses.map((status) => (STATUSES[status] ?? status).toLowerCase()).join(" or "),
+    since && `first seen ${since === "today" || beginOf(since) ? periodWords(since, now) : "at any time"}`,
+    device && `by ${device}`,
+    minScore > 0 && `at least ${percent(minScore)}`,
+    inSection && "at the heights that are shown",
+  ]
+    .filter(Boolean)
+    .join(", ");
+}
+
 /** Return the instant at which a period begins, in local time; null where it has no beginning. */
 export function beginOf(since: string, now = new Date()): Date | null {
   const day = new Date(now.getFullYear(), now.getMonth(), now.getDate());
@@ -37,6 +80,12 @@ export function beginOf(since: string, now = new Date()): Date | null {
   if (days) return new Date(now.getTime() - Number(days[1]) * 86_400_000);
   const date = /^(\d{4})-(\d\d)-(\d\d)$/.exec(since);
   return date ? new Date(Number(date[1]), Number(date[2]) - 1, Number(date[3])) : null;
+}
+
+/** Return the day that a date field holds once it is typed to its end, from 1900 on; null before that. */
+export function wholeDay(typed: string): string | null {
+  const day = /^(\d{4})-\d\d-\d\d$/.exec(typed);
+  return day && Number(day[1]) >= 1900 ? typed : null;
 }
 
 function daysBefore(day: Date, days: number): Date {
@@ -60,6 +109,18 @@ export function filtered(
       item.probability >= filters.minScore &&
       (!filters.inSection || !section || (item.box.max[2] > section[0] && item.box.min[2] < section[1])),
   );
+}
+
+const LEAST_SECTION = 0.1; // metres
+
+/** Return a section from another height; its end goes along where it would be lower. Metres, map frame. */
+export function withLow([, high]: readonly [number, number], low: number): [number, number] {
+  return [low, Math.max(high, low + LEAST_SECTION)];
+}
+
+/** Return a section to another height; its beginning goes along where it would be higher. Metres, map frame. */
+export function withHigh([low]: readonly [number, number], high: number): [number, number] {
+  return [Math.min(low, high - LEAST_SECTION), high];
 }
 
 /** Tell whether an item is of a kind; a tile where things appeared and disappeared is of both. */

@@ -85,7 +85,7 @@ function step(app: Controller, by: 1 | -1): void {
 
 function back(app: Controller): void {
   const { item, survey } = app.state.place;
-  if (item) app.go({ item: null, show: null });
+  if (item) app.go({ item: null });
   else if (survey) app.go({ survey: null });
 }
 

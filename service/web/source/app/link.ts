@@ -27,12 +27,15 @@ export const NOWHERE: Place = {
   show: null,
   view: null,
   section: null,
-  tiles: ["changed"],
+  tiles: [],
   tab: "changes",
   list: "objects",
   filters: NO_FILTERS,
   embed: false,
 };
+
+/** States of the tiles that are boxes where nobody chose: the changed ones, where tiles are listed. */
+export const TILES_OF: Readonly<Record<Place["list"], string[]>> = { objects: [], tiles: ["changed"] };
 
 const ID = /^[\w-]{1,64}$/; // of anything, as the API takes it: nothing else becomes part of a path
 const SHOWS = ["reference", "survey", "both", "split"];
@@ -47,6 +50,7 @@ export function readPlace(fragment: string): Place {
     known.includes(said.get(name) ?? "") ? (said.get(name) as T) : null;
   const list = (name: string) => (said.get(name) ?? "").split(",").filter(Boolean);
   const tile = id("tile");
+  const listed = said.get("list") === "tiles" ? "tiles" : "objects";
   return {
     map: id("map"),
     survey: id("survey"),
@@ -54,9 +58,9 @@ export function readPlace(fragment: string): Place {
     show: oneOf<Show>("show", SHOWS),
     view: readView(said.get("view")),
     section: readSection(said.get("section")),
-    tiles: said.has("tiles") ? list("tiles").filter((state) => STATES.includes(state)) : NOWHERE.tiles,
+    tiles: said.has("tiles") ? list("tiles").filter((state) => STATES.includes(state)) : TILES_OF[listed],
     tab: oneOf<Tab>("tab", TABS) ?? "changes",
-    list: said.get("list") === "tiles" ? "tiles" : "objects",
+    list: listed,
     filters: {
       kinds: list("kind"),
       statuses: list("status"),
@@ -92,7 +96,7 @@ export function writePlace(place: Place): string {
     ["embed", place.embed ? "1" : null],
   ];
   const said = words.filter(([, value]) => value).map(([name, value]) => `${name}=${plain(value as string)}`);
-  if (place.map && place.tiles.join() !== NOWHERE.tiles.join()) said.push(`tiles=${place.tiles.join(",")}`);
+  if (place.map && place.tiles.join() !== TILES_OF[place.list].join()) said.push(`tiles=${place.tiles.join(",")}`);
   return said.join("&");
 }
 

@@ -11,7 +11,7 @@ import { listenForDrops } from "./drops.ts";
 import { drawing, shownTheme, Stage } from "./stage.ts";
 import { Page } from "./views/page.tsx";
 
-import { KIND_COLOURS, STATE_COLOURS } from "../scene/colours.ts";
+import { KIND_COLOURS, STATE_COLOURS, TILE_COLOURS } from "../scene/colours.ts";
 import type { Scene } from "../scene/scene.ts";
 
 declare global {
@@ -20,7 +20,7 @@ declare global {
   }
 }
 
-for (const [name, colour] of Object.entries({ ...STATE_COLOURS, ...KIND_COLOURS })) {
+for (const [name, colour] of Object.entries({ ...STATE_COLOURS, ...TILE_COLOURS, ...KIND_COLOURS })) {
   document.documentElement.style.setProperty(`--${name}`, colour);
 }
 
@@ -32,10 +32,18 @@ const app = new Controller(new Api(document.baseURI), (state) => {
   document.documentElement.dataset["theme"] = shownTheme(state);
   const name = state.map.value?.name ?? state.place.map;
   document.title = name ? `${name} · SPICD` : "SPICD";
+  const focused = document.activeElement !== document.body;
   render(h(Page, { app, stage, state }), root);
+  if (focused && document.activeElement === document.body) keepFocus();
   stage.sync(state);
 });
 const stage = new Stage(app);
+
+/** Give the focus to the list, else to what the page is about, where what had it is there no more. */
+function keepFocus(): void {
+  const next = document.getElementById("items") ?? document.getElementById("main");
+  next?.focus({ preventScroll: true });
+}
 
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => app.update({}));
 listen(app, stage);

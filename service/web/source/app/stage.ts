@@ -4,7 +4,7 @@ import type { Scene } from "../scene/scene.ts";
 import type { Box, CloudSource, Layer, View } from "../scene/types.ts";
 import type { Controller } from "./controller.ts";
 import type { MapDocument } from "./documents.ts";
-import { markOf, tileMarkOf } from "./items.ts";
+import { markOf } from "./items.ts";
 import {
   chosenItem,
   focusOf,
@@ -12,6 +12,7 @@ import {
   sectionOf,
   showOf,
   shownItems,
+  shownTiles,
   type LayerState,
   type State,
 } from "./state.ts";
@@ -104,9 +105,8 @@ export class Stage {
   }
 
   #syncTiles(scene: Scene, state: State): void {
-    const features = state.place.tiles.flatMap((name) => state.tiles[name] ?? []);
-    const key = `${state.place.tiles.join()} ${features.length} ${features[0]?.id}`;
-    this.#once("tiles", key, () => scene.setTiles(features.map(tileMarkOf)));
+    const tiles = shownTiles(state);
+    this.#once("tiles", tiles, () => scene.setTiles(tiles));
   }
 
   #syncCamera(scene: Scene, state: State): void {

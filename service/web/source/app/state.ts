@@ -1,6 +1,6 @@
 /** What the page knows: everything that is shown follows from it. */
 
-import type { Box } from "../scene/types.ts";
+import type { Box, TileMark } from "../scene/types.ts";
 import type {
   FgTileFeature,
   JobDocument,
@@ -13,9 +13,9 @@ import type {
   TileProperties,
   VersionSummaryDocument,
 } from "./documents.ts";
-import { filtered } from "./filters.ts";
+import { filtered, type Filters } from "./filters.ts";
 import type { Line } from "./follow.ts";
-import type { Item } from "./items.ts";
+import { itemOfTile, tileMarkOf, type Item } from "./items.ts";
 import { NOWHERE, type Place, type Show } from "./link.ts";
 
 /** Something that is asked of the service; an older value stays while it is asked for again. */
@@ -173,16 +173,58 @@ export function allItems(state: State): Item[] {
   return (place.survey ? sightings.value : objects.value) ?? [];
 }
 
-let memo: { parts: unknown[]; items: Item[] } = { parts: [], items: [] };
+/** Return the survey that the list is of; null where it is of all surveys. */
+export function listedSurvey({ place, surveys }: State): SurveySummaryDocument | null {
+  return surveys.value?.find(({ survey_id }) => survey_id === place.survey) ?? null;
+}
+
+/** Return a function that gives the same answer for as long as its parts are the same. */
+function remembered<T>(): (parts: unknown[], make: () => T) => T {
+  let kept: { parts: unknown[]; value: T } | null = null;
+  return (parts, make) => {
+    const same = kept?.parts.length === parts.length && kept.parts.every((part, n) => part === parts[n]);
+    if (!kept || !same) kept = { parts, value: make() };
+    return kept.value;
+  };
+}
+
+const keptItems = remembered<Item[]>();
+const keptTiles = remembered<TileMark[]>();
 
 /** Return the items that the filters let through; the same array for as long as nothing of it changed. */
 export function shownItems(state: State): Item[] {
   const section = sectionOf(state);
-  const parts = [allItems(state), state.place.filters, ...(section ?? [])];
-  if (parts.length !== memo.parts.length || parts.some((part, n) => part !== memo.parts[n])) {
-    memo = { parts, items: filtered(allItems(state), state.place.filters, section) };
-  }
-  return memo.items;
+  const { filters } = state.place;
+  return keptItems([allItems(state), filters, ...(section ?? [])], () =>
+    filtered(allItems(state), filters, section),
+  );
+}
+
+/** Return the tiles that are boxes, filtered as the list is and cut by the section; the same array as above. */
+export function shownTiles(state: State): TileMark[] {
+  const section = sectionOf(state);
+  const { filters, tiles } = state.place;
+  return keptTiles([state.tiles, filters, ...tiles, ...(section ?? [])], () =>
+    tiles
+      .flatMap((name) => state.tiles[name] ?? [])
+      .filter((one) => isThrough(one, filters))
+      .map(tileMarkOf)
+      .flatMap((mark) => cut(mark, section)),
+  );
+}
+
+/** Tell whether the filters let a tile through; they are for what changed alone. */
+function isThrough(tile: FgTileFeature, filters: Filters): boolean {
+  return tile.properties.state !== "changed" || filtered([itemOfTile(tile)], filters).length > 0;
+}
+
+/** Return the part of a tile that lies between two heights, if there is one. */
+function cut(mark: TileMark, section: readonly [number, number] | null): TileMark[] {
+  if (!section) return [mark];
+  const { min, max } = mark.box;
+  const [low, high] = [Math.max(min[2], section[0]), Math.min(max[2], section[1])];
+  if (low >= high) return [];
+  return [{ ...mark, box: { min: [min[0], min[1], low], max: [max[0], max[1], high] } }];
 }
 
 /** Return the chosen item, also where a filter hides it. */

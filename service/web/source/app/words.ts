@@ -1,6 +1,6 @@
 /** What is said of surveys, objects, scans and errors. Nothing found is never said where nothing was judged. */
 
-import { count, ordinal, percent, whole } from "./format.ts";
+import { count, instant, ordinal, percent, whole } from "./format.ts";
 import type {
   Counts,
   JobDocument,
@@ -26,13 +26,47 @@ export const KINDS: Record<string, string> = {
   changed: "Changed",
 };
 
-export const STATUSES: Record<string, [string, string]> = {
-  new: ["New", "the latest survey saw it for the first time"],
-  still_there: ["Still there", "the latest survey saw it, and an earlier one too"],
-  gone_again: ["Gone again", "the latest survey looked, and it is as in the map"],
-  unknown: ["Unknown", "the latest survey did not look there"],
-  accepted: ["Accepted", "a version of the map has taken it over"],
+/** What a status means of objects of any kind. */
+export const STATUSES: Record<string, string> = {
+  new: "New",
+  still_there: "Still changed",
+  gone_again: "As in the map again",
+  unknown: "Not looked at since",
+  accepted: "Accepted",
 };
+
+/** What a status means of an object of that kind, and what the survey which looked last found. */
+const STATUSES_BY_KIND: Record<string, Record<string, [string, string]>> = {
+  appeared: {
+    new: ["New", "was the first that saw it"],
+    still_there: ["Still there", "looked and saw it again"],
+    gone_again: ["Gone again", "looked and it was not there, as in the map"],
+  },
+  disappeared: {
+    new: ["New", "was the first that found it gone"],
+    still_there: ["Still missing", "looked and it was gone"],
+    gone_again: ["Back again", "looked and it was there, as in the map"],
+  },
+  moved: {
+    new: ["New", "was the first that found it elsewhere"],
+    still_there: ["Still in its new place", "looked and saw it there again"],
+    gone_again: ["Back in its old place", "looked and it was as in the map"],
+  },
+};
+
+/** Say in short how it stands with an object, in the words of its kind. */
+export function statusOf(status: string, kind: string): string {
+  return STATUSES_BY_KIND[kind]?.[status]?.[0] ?? STATUSES[status] ?? status;
+}
+
+/** Say who found it so; `looked` is when a survey looked there last. */
+export function whyStatus(status: string, kind: string, looked: string): string {
+  if (status === "accepted") return "a version of the map has taken it over";
+  if (status === "unknown")
+    return `${instant(looked)} looked last; the latest survey that could be compared did not`;
+  const found = STATUSES_BY_KIND[kind]?.[status]?.[1];
+  return found ? `${instant(looked)} ${found}` : `${instant(looked)} looked there last`;
+}
 
 export const TILE_STATES: Record<string, string> = {
   changed: "Changed",
@@ -144,6 +178,11 @@ function judged(counts: Counts): number {
   return (counts["unchanged"] ?? 0) + (counts["changed"] ?? 0);
 }
 
+/** Tell whether a survey was compared with the map, so that a count of what changed says something. */
+export function isCompared({ status, placement }: Pick<SurveySummaryDocument, "status" | "placement">): boolean {
+  return status === "ready" && placement?.state !== "in_doubt";
+}
+
 /** List counts by kind: `2 appeared, 1 moved`. */
 export function kinds(counts: Counts): string {
   const told = Object.entries(counts).filter(([, number]) => number);
@@ -156,17 +195,9 @@ export function sum(counts: Counts): number {
 
 /** Say what the objects of a map are in short, those that count now first. */
 export function objectsOf({ objects }: Pick<MapSummaryDocument, "objects">): string {
-  const words: [string, string][] = [
-    ["new", "new"],
-    ["still_there", "still there"],
-    ["unknown", "not looked at lately"],
-    ["gone_again", "gone again"],
-    ["accepted", "accepted"],
-  ];
-  const told = words
-    .filter(([name]) => objects[name])
-    .map(([name, word]) => `${whole(objects[name]!)} ${word}`);
-  return told.join(", ");
+  const order = ["new", "still_there", "unknown", "gone_again", "accepted"];
+  const told = order.filter((name) => objects[name]);
+  return told.map((name) => `${whole(objects[name]!)} ${STATUSES[name]!.toLowerCase()}`).join(", ");
 }
 
 function runningWords(job?: JobDocument): string {

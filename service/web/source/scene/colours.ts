@@ -17,6 +17,9 @@ export const STATE_COLOURS: Readonly<Record<string, string>> = {
   unobserved: "#56b4e9",
 };
 
+/** Of a tile as a box: that of a changed one is no object's, so that it is not taken for what appeared. */
+export const TILE_COLOURS: Readonly<Record<string, string>> = { changed: "#808080" };
+
 /** Of a kind or state that this release does not know. */
 export const OTHER_COLOUR = "#999999";
 
@@ -25,9 +28,9 @@ export function colourOfKind(kind: Kind): string {
   return KIND_COLOURS[kind] ?? OTHER_COLOUR;
 }
 
-/** Return the colour of a tile's state, as CSS has it. */
+/** Return the colour of the box of a tile in that state, as CSS has it. */
 export function colourOfState(state: string): string {
-  return STATE_COLOURS[state] ?? OTHER_COLOUR;
+  return TILE_COLOURS[state] ?? STATE_COLOURS[state] ?? OTHER_COLOUR;
 }
 
 /** Of points that moved while the visit lasted: `PointKind.MOVING` in `worker/pipeline/results/export.py`. */

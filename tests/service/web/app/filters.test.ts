@@ -4,10 +4,16 @@ import { test } from "node:test";
 import {
   active,
   beginOf,
+  daysOf,
   filtered,
+  filterWords,
   NO_FILTERS,
+  periodWords,
   tally,
   toggled,
+  wholeDay,
+  withHigh,
+  withLow,
 } from "../../../../service/web/source/app/filters.ts";
 import { itemOfObject, itemOfTile } from "../../../../service/web/source/app/items.ts";
 import { box, object, tile } from "./samples.ts";
@@ -79,10 +85,43 @@ test("periods begin where they say, and one that cannot be read has no beginning
   assert.equal(beginOf("yesterday", THURSDAY), null);
 });
 
+test("a period is told with its day, and a day of another year with its year", () => {
+  assert.equal(periodWords("monday", THURSDAY), "since Mon 2 Mar");
+  assert.equal(periodWords("2026-03-03", THURSDAY), "since Tue 3 Mar");
+  assert.equal(periodWords("2025-03-03", THURSDAY), "since Mon 3 Mar 2025");
+  assert.equal(periodWords("7d", THURSDAY), "last 7 days");
+});
+
+test("the days of visits are local, each once, the latest first", () => {
+  const visits = ["2026-03-02T10:00:00Z", "2026-03-03T23:30:00Z", "2026-03-04T08:00:00Z"];
+  assert.deepEqual(daysOf(visits), ["2026-03-04", "2026-03-02"]);
+});
+
+test("what is filtered by is said", () => {
+  assert.equal(filterWords(NO_FILTERS), "");
+  const filters = { ...NO_FILTERS, kinds: ["moved", "appeared"], since: "monday", minScore: 0.5 };
+  assert.equal(
+    filterWords({ ...filters, device: "robot-7" }, THURSDAY),
+    "moved or appeared, first seen since Mon 2 Mar, by robot-7, at least 50 %",
+  );
+});
+
+test("a day that is half typed is none", () => {
+  assert.equal(wholeDay("2026-03-04"), "2026-03-04");
+  for (const typed of ["", "0202-03-04", "0020-03-04", "2026-03"]) assert.equal(wholeDay(typed), null);
+});
+
 test("the second floor is what the section shows", () => {
   assert.deepEqual(ids({ inSection: true }, [3, 6]), ["upstairs"]);
   assert.deepEqual(ids({ inSection: true }, [0, 2.5]), ["old", "late"]);
   assert.deepEqual(ids({ inSection: false }, [3, 6]), ["old", "late", "upstairs"]);
+});
+
+test("one end of a section takes the other along where they would cross", () => {
+  assert.deepEqual(withLow([0, 2], 1), [1, 2]);
+  assert.deepEqual(withLow([0, 2], 3), [3, 3.1]);
+  assert.deepEqual(withHigh([0, 2], 1), [0, 1]);
+  assert.deepEqual(withHigh([1, 2], 0.5), [0.4, 0.5]);
 });
 
 test("filters that are set are counted", () => {

@@ -39,16 +39,22 @@ test("a tile is linked by its own name", () => {
 });
 
 test("no tiles at all is not the same as left out", () => {
-  assert.deepEqual(readPlace("#map=lobby").tiles, ["changed"]);
-  assert.deepEqual(readPlace("#map=lobby&tiles=").tiles, []);
-  assert.equal(writePlace({ ...NOWHERE, map: "lobby", tiles: [] }), "map=lobby&tiles=");
+  assert.deepEqual(readPlace("#map=lobby&list=tiles").tiles, ["changed"]);
+  assert.deepEqual(readPlace("#map=lobby&list=tiles&tiles=").tiles, []);
+  const none = { ...NOWHERE, map: "lobby", list: "tiles", tiles: [] } as Place;
+  assert.equal(writePlace(none), "map=lobby&list=tiles&tiles=");
+});
+
+test("changed tiles are no boxes where objects are listed, unless they are asked for", () => {
+  assert.deepEqual(readPlace("#map=lobby").tiles, []);
+  assert.equal(writePlace({ ...NOWHERE, map: "lobby", tiles: ["changed"] }), "map=lobby&tiles=changed");
 });
 
 test("what cannot be read counts as left out", () => {
   const place = readPlace(
     "#map=lobby&show=upside&view=1,2,x&section=3,1&tiles=changed,purple&tab=9&min_score=7",
   );
-  assert.deepEqual(place, { ...NOWHERE, map: "lobby" });
+  assert.deepEqual(place, { ...NOWHERE, map: "lobby", tiles: ["changed"] });
 });
 
 test("an id that is none does not become part of a path", () => {

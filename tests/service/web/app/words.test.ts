@@ -5,10 +5,13 @@ import type { JobDocument } from "../../../../service/web/source/app/documents.t
 import {
   adviceOn,
   coverage,
+  isCompared,
   nothingChanged,
   objectsOf,
   progressOf,
   sayingOf,
+  statusOf,
+  whyStatus,
 } from "../../../../service/web/source/app/words.ts";
 import { survey } from "./samples.ts";
 
@@ -73,6 +76,13 @@ test("a survey without a scan that is placed is no quiet one", () => {
   assert.match(saying.long, /not the same as no change/);
 });
 
+test("only a survey that is ready and not in doubt was compared", () => {
+  assert.equal(isCompared(survey()), true);
+  assert.equal(isCompared(survey({ status: "failed" })), false);
+  assert.equal(isCompared(survey({ status: "running", placement: null })), false);
+  assert.equal(isCompared(survey({ placement: { state: "in_doubt", confidence: 0.4 } })), false);
+});
+
 test("a survey in doubt says nothing about change", () => {
   const saying = sayingOf(survey({ placement: { state: "in_doubt", confidence: 0.42 }, objects: null }));
   assert.equal(saying.tone, "doubt");
@@ -105,8 +115,20 @@ test("a job tells its stage, how far it is, and its place in the queue", () => {
 test("objects of a map are told by status, those that count now first", () => {
   assert.equal(
     objectsOf({ objects: { new: 2, still_there: 5, gone_again: 1, unknown: 0, accepted: 0 } }),
-    "2 new, 5 still there, 1 gone again",
+    "2 new, 5 still changed, 1 as in the map again",
   );
+});
+
+test("a status is told in the words of the kind: what disappeared is not still there", () => {
+  const looked = "2026-03-04T12:00:00Z";
+  assert.equal(statusOf("still_there", "disappeared"), "Still missing");
+  assert.match(whyStatus("still_there", "disappeared", looked), /^Wed.*4 Mar.* looked and it was gone$/);
+  assert.equal(statusOf("still_there", "moved"), "Still in its new place");
+  assert.equal(statusOf("still_there", "appeared"), "Still there");
+  assert.equal(statusOf("gone_again", "disappeared"), "Back again");
+  for (const kind of ["appeared", "disappeared", "moved"])
+    assert.equal(statusOf("unknown", kind), "Not looked at since");
+  assert.match(whyStatus("unknown", "moved", looked), /latest survey that could be compared did not$/);
 });
 
 test("problems come with what to do", () => {

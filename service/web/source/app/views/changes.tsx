@@ -2,13 +2,16 @@
 
 import { Fragment, h } from "preact";
 
-import { active, NO_FILTERS, PERIODS, tally, toggled, type Filters } from "../filters.ts";
+import { active, daysOf, filtered, filterWords, NO_FILTERS, PERIODS, periodWords, tally, toggled, wholeDay, withHigh, withLow, type Filters } from "../filters.ts";
+import type { SurveySummaryDocument } from "../documents.ts";
 import { ago, count, instant, percent } from "../format.ts";
 import { whereOf, type Item } from "../items.ts";
-import { allItems, focusOf, jobOf, shownItems, type State } from "../state.ts";
-import { KINDS, sayingOf, STATUSES } from "../words.ts";
+import { allItems, focusOf, jobOf, listedSurvey, sectionOf, shownItems, type State } from "../state.ts";
+import { isCompared, KINDS, sayingOf, STATUSES, statusOf } from "../words.ts";
 import { newUpload, type Props } from "./page.tsx";
 import { Empty, Kind, Problem, Waiting } from "./parts.tsx";
+
+const MOST_DAYS = 12; // of visits that are offered to filter by
 
 export function Changes(props: Props) {
   const { app, state } = props;
@@ -46,11 +49,19 @@ export function Changes(props: Props) {
 /** Say how many are listed, of which survey. */
 function words(state: State, items: readonly Item[]): string {
   const { place } = state;
+  const chosen = listedSurvey(state);
+  if (chosen && !isCompared(chosen) && !items.length)
+    return `${notCompared(chosen)}: the survey of ${instant(chosen.captured_at)}`;
   const all = allItems(state).length;
   const noun = place.list === "tiles" ? "changed tile" : "object";
   const number = items.length === all ? count(all, noun) : `${items.length} of ${count(all, noun)}`;
-  const chosen = place.survey && state.surveys.value?.find(({ survey_id }) => survey_id === place.survey);
-  return `${number} ${chosen ? `in the survey of ${instant(chosen.captured_at)}` : "over all surveys"}`;
+  const of = chosen ? `in the survey of ${instant(chosen.captured_at)}` : "over all surveys";
+  return [`${number} ${of}`, filterWords(place.filters)].filter(Boolean).join(": ");
+}
+
+function notCompared({ status }: SurveySummaryDocument): string {
+  if (status === "running") return "Not compared yet";
+  return status === "failed" ? "Nothing was compared" : "Nothing is said about change";
 }
 
 function List({ app, state, items }: Props & { items: readonly Item[] }) {
@@ -107,10 +118,10 @@ function Row({ item, chosen, choose }: { item: Item; chosen: boolean; choose: ()
       </span>
       <span class="item-more">
         {item.status && (
-          <span class={`status status-${item.status}`}>{STATUSES[item.status]?.[0] ?? item.status}</span>
+          <span class={`status status-${item.status}`}>{statusOf(item.status, item.kind)}</span>
         )}
         {item.history?.transient && <span class="status">comes and goes</span>}
-        <span title={ago(item.firstSeen)}>since {instant(item.firstSeen)}</span>
+        <span title={`change first seen ${ago(item.firstSeen)}`}>since {instant(item.firstSeen)}</span>
         <span>{whereOf(item)}</span>
         {item.device && <span>{item.device}</span>}
       </span>
@@ -183,13 +194,22 @@ function FilterForm({ app, state }: Props) {
   const { filters } = state.place;
   const all = allItems(state);
   const set = (change: Partial<Filters>) => app.go({ filters: { ...filters, ...change } });
+  /** Count the values of all items among those that the other filters let through. */
+  const counted = (name: "kind" | "status", open: Partial<Filters>) => {
+    const rest = tally(filtered(all, { ...filters, ...open }, sectionOf(state)).map((item) => item[name]));
+    return tally(all.map((item) => item[name])).map(([value]): [string, number] => [
+      value,
+      rest.find(([one]) => one === value)?.[1] ?? 0,
+    ]);
+  };
+  const visits = daysOf((state.surveys.value ?? []).map(({ captured_at }) => captured_at)).slice(0, MOST_DAYS);
   const devices = tally((state.surveys.value ?? []).map(({ device_id }) => device_id)).map(([name]) => name);
   return (
     <form id="filters" class="filters" onSubmit={(event) => event.preventDefault()}>
       <Choices
         legend="Kind"
         chosen={filters.kinds}
-        known={tally(all.map(({ kind }) => kind))}
+        known={counted("kind", { kinds: [] })}
         word={(kind) => KINDS[kind] ?? kind}
         pick={(kinds) => set({ kinds })}
       />
@@ -197,31 +217,29 @@ function FilterForm({ app, state }: Props) {
         <Choices
           legend="Status"
           chosen={filters.statuses}
-          known={tally(all.map(({ status }) => status))}
-          word={(status) => STATUSES[status]?.[0] ?? status}
+          known={counted("status", { statuses: [] })}
+          word={(status) => STATUSES[status] ?? status}
           pick={(statuses) => set({ statuses })}
         />
       )}
       <label>
-        First seen
+        Change first seen
         <select
-          value={isDay(filters.since) ? "day" : filters.since}
+          value={isDay(filters.since) && !visits.includes(filters.since) ? "day" : filters.since}
           onChange={({ currentTarget }) =>
-            set({ since: currentTarget.value === "day" ? today() : currentTarget.value })
+            set({ since: currentTarget.value === "day" ? otherDay(visits) : currentTarget.value })
           }
         >
-          {PERIODS.map(([value, word]) => (
-            <option value={value}>{word}</option>
+          {PERIODS.map(([value]) => (
+            <option value={value}>{periodWords(value)}</option>
+          ))}
+          {visits.map((day) => (
+            <option value={day}>{periodWords(day)}, a visit</option>
           ))}
           <option value="day">since a day…</option>
         </select>
         {isDay(filters.since) && (
-          <input
-            type="date"
-            aria-label="First seen since"
-            value={filters.since}
-            onChange={({ currentTarget }) => set({ since: currentTarget.value })}
-          />
+          <DayField name="Change first seen since" value={filters.since} set={(since) => set({ since })} />
         )}
       </label>
       {devices.length > 0 && (
@@ -257,6 +275,7 @@ function FilterForm({ app, state }: Props) {
         />
         only at the heights that are shown, such as one floor
       </label>
+      {filters.inSection && <Heights app={app} state={state} />}
       {active(filters) > 0 && (
         <button type="button" onClick={() => set(NO_FILTERS)}>
           Clear
@@ -264,6 +283,47 @@ function FilterForm({ app, state }: Props) {
       )}
     </form>
   );
+}
+
+/** Fields for the heights that are shown; they are those of the section. */
+function Heights({ app, state }: Pick<Props, "app" | "state">) {
+  const section = sectionOf(state);
+  if (!section) return <p class="faint">The heights are known once the cloud is loaded.</p>;
+  const [low, high] = section;
+  return (
+    <span class="row">
+      from
+      <Height name="Heights from, metres" value={low} set={(to) => app.go({ section: withLow(section, to) })} />
+      to
+      <Height name="Heights to, metres" value={high} set={(to) => app.go({ section: withHigh(section, to) })} />m
+    </span>
+  );
+}
+
+/** A field for a height in metres, which counts once it is left or Enter is pressed. */
+function Height({ name, value, set }: { name: string; value: number; set: (height: number) => void }) {
+  const shown = (field: HTMLInputElement | null) => {
+    if (field && field !== document.activeElement) field.value = value.toFixed(2);
+  };
+  const take = ({ currentTarget }: { currentTarget: HTMLInputElement }) => {
+    if (Number.isFinite(currentTarget.valueAsNumber)) set(currentTarget.valueAsNumber);
+  };
+  return <input type="number" step="any" aria-label={name} ref={shown} onChange={take} />;
+}
+
+/** A field for a day, which nobody writes into while it has the focus: a day that is half typed is an empty value. */
+function DayField({ name, value, set }: { name: string; value: string; set: (day: string) => void }) {
+  const shown = (field: HTMLInputElement | null) => {
+    if (field && field !== document.activeElement) field.value = value;
+  };
+  const take = ({ currentTarget }: { currentTarget: HTMLInputElement }) => {
+    const day = wholeDay(currentTarget.value);
+    if (day && day !== value) set(day);
+  };
+  const leave = ({ currentTarget }: { currentTarget: HTMLInputElement }) => {
+    currentTarget.value = wholeDay(currentTarget.value) ?? value;
+  };
+  return <input type="date" min="1900-01-01" aria-label={name} ref={shown} onChange={take} onBlur={leave} />;
 }
 
 interface ChoicesProps {
@@ -299,9 +359,8 @@ function isDay(since: string): boolean {
   return /^\d{4}-/.test(since);
 }
 
-function today(): string {
-  const now = new Date();
-  return [now.getFullYear(), now.getMonth() + 1, now.getDate()]
-    .map((part) => String(part).padStart(2, "0"))
-    .join("-");
+/** Return the day that a day field begins with: today, or the day before where today is a visit's. */
+function otherDay(visits: readonly string[]): string {
+  const days = [0, 1].map((back) => new Date(Date.now() - back * 86_400_000).toISOString());
+  return daysOf(days).find((day) => !visits.includes(day)) ?? daysOf(days)[0]!;
 }

@@ -7,7 +7,7 @@ import { ago, count, instant, metres, percent } from "../format.ts";
 import { whereOf, type Item } from "../items.ts";
 import type { Show } from "../link.ts";
 import { chosenItem, focusOf, showOf, type Look } from "../state.ts";
-import { KINDS, STATUSES, TILE_STATES } from "../words.ts";
+import { KINDS, statusOf, TILE_STATES, whyStatus } from "../words.ts";
 import { follow, type Props } from "./page.tsx";
 import { Empty, Fact, Kind, Problem, Share, Waiting } from "./parts.tsx";
 
@@ -18,7 +18,7 @@ export function Details(props: Props) {
   const { app, state } = props;
   const item = chosenItem(state);
   const known = state.objects.value ?? state.changes.value;
-  const close = () => app.go({ item: null, show: null });
+  const close = () => app.go({ item: null });
   return (
     <aside class="details" aria-label="Details of what is chosen">
       <div class="details-head">
@@ -87,7 +87,8 @@ function Doubts({ item }: { item: Item }) {
     words.push("No scan of the other visit saw through where it is; it may have been hidden there.");
   if (history?.status === "unknown")
     words.push(
-      `The latest survey did not look there. ${lastKnown(history.last_known)} ` +
+      "The latest survey that could be compared did not look there. " +
+        `It was ${statusOf(history.last_known, item.kind).toLowerCase()} ` +
         `when one looked last, ${instant(history.last_looked)}.`,
     );
   if (history?.transient) words.push("It comes and goes: it was seen, gone, and seen again.");
@@ -101,10 +102,6 @@ function Doubts({ item }: { item: Item }) {
   );
 }
 
-function lastKnown(status: string): string {
-  return `It was ${(STATUSES[status]?.[0] ?? status).toLowerCase()}`;
-}
-
 function AboutObject({ app, item }: Props & { item: Item }) {
   const { history, sighting, place } = item;
   const seen = sighting as SightingProperties;
@@ -113,7 +110,8 @@ function AboutObject({ app, item }: Props & { item: Item }) {
     <dl class="facts">
       {item.status && (
         <Fact name="Status">
-          <strong>{STATUSES[item.status]?.[0] ?? item.status}</strong>: {STATUSES[item.status]?.[1]}
+          <strong>{statusOf(item.status, item.kind)}</strong>:{" "}
+          {whyStatus(item.status, item.kind, history?.last_looked ?? item.lastSeen)}
         </Fact>
       )}
       <Fact name="Probability" hint="of change, mean over its voxels">
@@ -133,15 +131,15 @@ function AboutObject({ app, item }: Props & { item: Item }) {
             : ""}
         </Fact>
       )}
-      <Fact name="First seen">
+      <Fact name="Change first seen">
         {instant(item.firstSeen)} ({ago(item.firstSeen)})
       </Fact>
       {history && (
-        <Fact name="Last seen">
+        <Fact name="Change last seen">
           {instant(history.last_seen)}, in {count(history.sightings, "survey")}
         </Fact>
       )}
-      {history && <Fact name="Last looked">{instant(history.last_looked)}</Fact>}
+      {history && <Fact name="Looked at last">{instant(history.last_looked)}</Fact>}
       {history?.accepted_in_version && (
         <Fact name="Taken over">by version {history.accepted_in_version} of the map</Fact>
       )}
@@ -190,10 +188,10 @@ function AboutTile({ tile, item }: { tile: TileProperties; item: Item }) {
       <Fact name="Points">
         {tile.n_reference} of the map, {tile.n_current} of the survey
       </Fact>
-      <Fact name="First seen">
+      <Fact name="Change first seen">
         {instant(item.firstSeen)} ({ago(item.firstSeen)})
       </Fact>
-      <Fact name="Last seen">{tile.last_seen && instant(tile.last_seen)}</Fact>
+      <Fact name="Change last seen">{tile.last_seen && instant(tile.last_seen)}</Fact>
       <Fact name="Device">{tile.device_id}</Fact>
       <Fact name="Tile">{tile.tile_id}</Fact>
     </dl>
@@ -269,7 +267,7 @@ function History({ app, state, item }: Props & { item: Item }) {
       at: look.survey.captured_at,
       survey: look.survey.survey_id,
       seen: false,
-      text: lookedThere(look),
+      text: lookedThere(look, item.kind),
     })),
   ].sort((one, other) => Date.parse(one.at) - Date.parse(other.at));
   return (
@@ -294,9 +292,10 @@ function sawIt(seen: SightingProperties): string {
   return words.filter(Boolean).join(", ");
 }
 
-function lookedThere({ share }: Look): string {
+function lookedThere({ share }: Look, kind: string): string {
   if (share === null) return "did not tell it";
+  const found = kind === "appeared" ? "it was not there" : "it was as in the map";
   return share >= ENOUGH
-    ? `saw ${percent(share)} of its place, and did not find it`
+    ? `saw ${percent(share)} of its place: ${found}`
     : `did not look there: saw ${percent(share)} of its place`;
 }

@@ -3,8 +3,8 @@
 import { h } from "preact";
 
 import type { Tab } from "../link.ts";
-import { chosenItem, shownItems } from "../state.ts";
-import { jobOf } from "../state.ts";
+import { chosenItem, jobOf, listedSurvey, shownItems } from "../state.ts";
+import { isCompared } from "../words.ts";
 import { Changes } from "./changes.tsx";
 import { Details } from "./details.tsx";
 import { OpenJobs, Retry } from "./jobs.tsx";
@@ -54,6 +54,8 @@ export function MapPage(props: Props) {
 function Panel(props: Props) {
   const { app, state } = props;
   const { tab } = state.place;
+  const listed = listedSurvey(state);
+  const told = !listed || isCompared(listed) || shownItems(state).length > 0; // else nothing was counted
   return (
     <section class="panel" aria-label="Changes, survey and map">
       <button
@@ -76,7 +78,7 @@ function Panel(props: Props) {
             onKeyDown={(event) => stepTab(event, name, (to) => app.go({ tab: to }))}
           >
             {word}
-            {name === "changes" && <span class="number">{shownItems(state).length}</span>}
+            {name === "changes" && <span class="number">{told ? shownItems(state).length : "–"}</span>}
           </button>
         ))}
       </div>

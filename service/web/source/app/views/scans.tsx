@@ -89,9 +89,14 @@ function Refused({ scan, name }: { scan: ScanOutcome; name: string }) {
       <strong>
         {name}: {what}
       </strong>
-      {scan.detail && <p>{scan.detail}</p>}
-      {numbers.length > 0 && <p class="faint">{capital(numbers.join(", "))}</p>}
       {advice && <p class="advice">{capital(advice)}.</p>}
+      {(scan.detail || numbers.length > 0) && (
+        <details>
+          <summary>Figures</summary>
+          {scan.detail && <p>{scan.detail}</p>}
+          {numbers.length > 0 && <p class="faint">{capital(numbers.join(", "))}</p>}
+        </details>
+      )}
       <Warnings warnings={scan.warnings} />
     </div>
   );
