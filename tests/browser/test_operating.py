@@ -205,6 +205,18 @@ def test_dropped_scans_become_a_survey_whose_job_is_followed_until_its_result_is
     expect(job_row).to_have_count(0)
 
 
+def test_leaving_the_file_chooser_leaves_the_dialog_as_it_is(opened: Opener) -> None:
+    viewer = opened(f"#map={MAP}").drawn()
+    viewer.page.get_by_role("button", name="Add survey").click()
+    device = viewer.page.get_by_label("Device").last
+    device.fill("robot-9")
+    chooser = viewer.page.locator("dialog input[type=file]")
+    chooser.evaluate("(one) => one.dispatchEvent(new Event('cancel', { bubbles: true }))")
+    expect(device).to_have_value("robot-9")
+    viewer.page.keyboard.press("Escape")
+    expect(device).to_have_count(0)
+
+
 def held_by_a_worker(job: JobRecord) -> QueueState:
     """Return the state of a queue in which a worker has claimed whatever step of a job is due."""
     claims = [

@@ -29,7 +29,9 @@ export function shown(element: HTMLDialogElement | null, open: boolean): void {
   else element.close();
 }
 
+/** Close the dialog; a file chooser inside that is left without files tells `cancel` as well, and closes nothing. */
 function cancelled(event: Event, app: Controller): void {
+  if (event.target !== event.currentTarget) return;
   event.preventDefault();
   cancel(app);
 }
