@@ -128,6 +128,25 @@ def test_surveys_say_what_they_found_and_what_they_cannot_say(
     expect(viewer.page.locator(".about")).not_to_contain_text("Nothing changed")
 
 
+def test_a_tile_that_was_not_seen_says_so_and_the_camera_goes_there(
+    opened: Opener, viewer_data: ViewerData
+) -> None:
+    survey = viewer_data.surveys["half"]
+    link = f"#map={MAP}&survey={survey}&tiles=unobserved"
+    viewer = opened(link)
+    answer = viewer.page.request.get(
+        f"{viewer.page.url.partition('#')[0]}surveys/{survey}/tiles?state=unobserved"
+    )
+    tile = answer.json()["features"][0]["properties"]
+    viewer.drawn().page.evaluate("(hash) => { location.hash = hash; }", f"{link}&tile={tile['tile_id']}")
+    details = viewer.page.locator(".details")
+    expect(details.locator("h2")).to_have_text("Not seen")
+    expect(details).to_contain_text("Survey")
+    expect(details).not_to_contain_text("Not sure")
+    at = "([x, y]) => Math.hypot(window.spicd.scene.view.target[0] - x, window.spicd.scene.view.target[1] - y) < 0.05"
+    viewer.until(at, tile["center"][:2])
+
+
 def test_a_phone_shows_list_and_scene_and_nothing_beside_its_screen(
     opened: Opener, viewer_data: ViewerData
 ) -> None:

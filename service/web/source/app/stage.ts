@@ -4,7 +4,7 @@ import type { Scene } from "../scene/scene.ts";
 import type { Box, CloudSource, Layer, View } from "../scene/types.ts";
 import type { Controller } from "./controller.ts";
 import type { MapDocument } from "./documents.ts";
-import { markOf, tileMarkOf } from "./items.ts";
+import { itemOfTile, markOf, tileMarkOf, type Item } from "./items.ts";
 import {
   chosenItem,
   focusOf,
@@ -110,7 +110,7 @@ export class Stage {
   }
 
   #syncCamera(scene: Scene, state: State): void {
-    const item = chosenItem(state);
+    const item = lookedAt(state);
     this.#once("item", item?.id ?? null, () => scene.select(item?.id ?? null));
     if (!state.stage.reference.loaded) return;
     const { view, item: id } = state.place;
@@ -176,13 +176,26 @@ export class Stage {
 
   /** Look at the chosen item again. */
   lookAtItem(): void {
-    const item = chosenItem(this.#app.state);
+    const item = lookedAt(this.#app.state);
     if (item) this.#scene?.flyTo(around(item.box, item.from));
   }
 
   topDown(): void {
     this.#scene?.topDown();
   }
+}
+
+/** Return the chosen item; also a tile that is no item of a list, but is shown as a box. */
+export function lookedAt(state: State): Item | null {
+  const item = chosenItem(state);
+  const { item: id } = state.place;
+  if (item || !id?.startsWith("tile:")) return item;
+  const found = Object.values(state.tiles)
+    .flat()
+    .find(({ properties }) => `tile:${properties.tile_id}` === id);
+  if (!found) return null;
+  const { state: kind } = found.properties;
+  return { ...itemOfTile(found), ...(kind === "changed" ? {} : { kind }) };
 }
 
 /** Return the theme that is shown, the system's where nobody chose. */
