@@ -183,8 +183,13 @@ function AboutTile({ app, tile }: { app: Props["app"]; tile: TileProperties }) {
         </SurveyLink>
       </Fact>
       {tile.score !== null && (
-        <Fact name="Score" hint="probability of change">
+        <Fact name="Score" hint="probability of change, as this survey has it">
           <Share value={tile.score} label="Probability of change" />
+        </Fact>
+      )}
+      {tile.max_score !== null && tile.max_score !== tile.score && (
+        <Fact name="Highest" hint="score over all surveys, which the list shows">
+          <Share value={tile.max_score} label="Highest probability of change over all surveys" /> over all surveys
         </Fact>
       )}
       <Fact name="Threshold">
