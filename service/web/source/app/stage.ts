@@ -91,9 +91,10 @@ export class Stage {
     if (!scene || !state.map.value) return;
     this.#once("theme", shownTheme(state), (theme) => scene.setTheme(theme as "light" | "dark"));
     this.#load("reference", referenceOf(state));
-    this.#load("survey", showOf(state) === "reference" ? this.#kept(state) : surveyOf(state));
+    this.#load("survey", this.#asksSurvey(state) ? surveyOf(state) : this.#kept(state));
     const show = state.stage.survey.loaded ? showOf(state) : "reference";
-    this.#once("show", show, () => scene.show(show));
+    const lost = isOfSurvey(state) || showOf(state) !== "reference";
+    this.#once("show", `${show} ${lost}`, () => scene.show(show, lost));
     this.#once("marks", shownItems(state), () =>
       scene.setMarks(state.place.list === "tiles" ? [] : shownItems(state).map(markOf)),
     );
@@ -127,6 +128,12 @@ export class Stage {
     if (name in this.#done && this.#done[name] === value) return;
     this.#done[name] = value;
     act(value);
+  }
+
+  /** Whether the survey's cloud is wanted: with the map shown alone for what is gone, which comes after the map. */
+  #asksSurvey(state: State): boolean {
+    if (showOf(state) !== "reference") return true;
+    return isOfSurvey(state) && state.stage.reference.loaded;
   }
 
   /** Return the survey's cloud that is loaded, if it is still that of the survey in focus. */
@@ -206,8 +213,13 @@ export function shownTheme({ theme }: State): "light" | "dark" {
 
 /** Return the version of the map that is looked at: what the survey in focus was compared with, else the one in use. */
 export function referenceVersion(state: State): number {
-  const focus = state.place.survey || state.place.item ? focusOf(state) : null;
+  const focus = isOfSurvey(state) ? focusOf(state) : null;
   return focus?.map_version ?? (state.map.value as MapDocument).version;
+}
+
+/** Whether a survey is looked at, and not all of them together. */
+function isOfSurvey({ place }: State): boolean {
+  return place.survey !== null || place.item !== null;
 }
 
 /** Return the cloud of the map, of the version that is looked at; null until it is known which it is. */

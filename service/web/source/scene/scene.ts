@@ -38,6 +38,7 @@ export class Scene {
   readonly #divider = document.createElement("div");
   readonly #resized: ResizeObserver;
   #shown: Shown = "both";
+  #lost = true;
   #sectionChosen = false;
   #viewChosen = false;
   #frame = 0;
@@ -111,8 +112,9 @@ export class Scene {
     this.#invalidate();
   }
 
-  show(which: Shown): void {
-    this.#shown = which;
+  /** Choose the clouds that are shown; `lost`: with the map also which of its points the survey tells as gone. */
+  show(which: Shown, lost = true): void {
+    [this.#shown, this.#lost] = [which, lost];
     this.#divider.hidden = which !== "split";
     this.#resize();
   }
@@ -363,7 +365,7 @@ export class Scene {
   #showLayers(half: "before" | "after" | null): void {
     const which = half === null ? this.#shown : half === "before" ? "reference" : "survey";
     this.#layers.get("reference")?.show(which !== "survey", false);
-    this.#layers.get("survey")?.show(which !== "reference", which !== "survey");
+    this.#layers.get("survey")?.show(which !== "reference", which !== "survey" && this.#lost);
   }
 
   /** Tell once that the first points are on the screen; reading a pixel back waits for the graphics processor. */
