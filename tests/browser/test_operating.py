@@ -147,6 +147,20 @@ def test_a_tile_that_was_not_seen_says_so_and_the_camera_goes_there(
     viewer.until(at, tile["center"][:2])
 
 
+def test_looking_again_does_not_lead_away_from_what_is_looked_at(opened: Opener) -> None:
+    viewer = opened(f"#map={MAP}").drawn()
+    viewer.page.locator("#items li").first.click()
+    viewer.until("() => location.hash.includes('object=')")
+    viewer.until("() => location.hash.includes('view=')")
+    expect(viewer.drawn().page.locator(".split-words")).to_be_visible()
+    away = """() => { const { position: [a, b, c], target: [x, y, z] } = window.spicd.scene.view;
+      return Math.hypot(a - x, b - y, c - z); }"""
+    before = viewer.page.evaluate(away)
+    viewer.page.get_by_role("button", name="Look", exact=True).click()
+    viewer.rests()
+    assert viewer.page.evaluate(away) <= 1.02 * before
+
+
 def test_a_phone_shows_list_and_scene_and_nothing_beside_its_screen(
     opened: Opener, viewer_data: ViewerData
 ) -> None:

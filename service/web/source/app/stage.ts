@@ -17,7 +17,7 @@ import {
 } from "./state.ts";
 
 const MOST_POINTS = 1_000_000; // of a cloud that is loaded whole, where there is a tileset of it
-const PADDING = 0.6; // metres around an object that the camera flies to
+const PADDING = 0.2; // metres around an object that are never out of the picture
 
 /** Fetch what draws; asked for early, it is there when the map is known. */
 export function drawing(): Promise<typeof import("../scene/scene.ts")> {

@@ -16,7 +16,7 @@ type Event = "pick" | "view" | "drawn";
 type Listener = (id: string | null) => void;
 
 const CLICK = 5; // CSS pixels that a pointer may go for it to be a click
-const AROUND = 1; // metres around what is flown to
+const AROUND = 1.4; // metres around what is flown to
 const REST_MS = 180; // without a change: the camera has come to rest
 const SMOOTH_MS = 40; // of a frame, aimed at while the camera moves
 const SPARED = 4; // times as long as a frame takes, between frames while tiles come
@@ -138,7 +138,7 @@ export class Scene {
 
   flyTo(box: Box): void {
     this.#viewChosen = true;
-    this.#rig.fly(this.#rig.viewOf(grown(box, AROUND), "here"), this.#frameMs);
+    this.#rig.fly(this.#rig.viewAround(box, AROUND), this.#frameMs);
   }
 
   topDown(): void {
