@@ -238,6 +238,18 @@ def test_dropped_scans_become_a_survey_whose_job_is_followed_until_its_result_is
     expect(job_row).to_have_count(0)
 
 
+def test_a_visit_goes_on_without_a_file_that_was_refused(opened: Opener, serve: Callable[..., Live]) -> None:
+    service = serve(queue=RememberingQueue())
+    viewer = opened(f"#map={MAP}", url=service.url).drawn()
+    viewer.watch.expect("status of 4")
+    wrong = ["notes.ply", base64.b64encode(b"these are no points").decode()]
+    viewer.page.evaluate(_DROP, [*scan_and_pose(service, "march-2-0"), wrong])
+    expect(viewer.page.locator("dialog[open]")).to_contain_text("Empty: now")
+    viewer.page.get_by_role("button", name="Compare 2 scans").click()
+    viewer.page.get_by_role("button", name="Compare without notes.ply").click(timeout=20_000)
+    expect(viewer.page.locator(".job")).to_have_count(1, timeout=20_000)
+
+
 def test_leaving_the_file_chooser_leaves_the_dialog_as_it_is(opened: Opener) -> None:
     viewer = opened(f"#map={MAP}").drawn()
     viewer.page.get_by_role("button", name="Add survey").click()
