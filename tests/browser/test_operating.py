@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -175,6 +176,25 @@ def test_a_phone_shows_list_and_scene_and_nothing_beside_its_screen(
     assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
     small = page.evaluate(_SMALL)
     assert small == []  # WCAG 2.2, 2.5.8: targets of 24 CSS pixels
+
+
+def test_on_a_phone_nothing_lies_over_what_it_hides_and_words_open_by_a_tap(
+    opened: Opener, viewer_data: ViewerData
+) -> None:
+    viewer = opened(f"#map={MAP}&survey={viewer_data.surveys['objects']}", **PHONE).drawn()
+    page = viewer.page
+    strip = page.locator(".timeline ol")
+    expect(strip).to_have_class(re.compile("more-"))
+    page.get_by_role("button", name="Section").tap()
+    expect(page.locator(".section")).to_be_visible()
+    expect(page.locator(".legend")).to_be_hidden()
+    page.get_by_role("button", name="Section").tap()
+    expect(page.locator(".legend")).to_be_visible()
+    page.get_by_role("button", name="Dark", exact=True).first.tap()
+    viewer.until("() => document.documentElement.dataset.theme === 'dark'")
+    page.locator("#items li").first.tap()
+    page.locator("summary", has_text="Judged").tap()
+    expect(page.get_by_text("share of it that both visits could judge", exact=True)).to_be_visible()
 
 
 def test_dark_follows_the_system_until_somebody_chooses(opened: Opener) -> None:
