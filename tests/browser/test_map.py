@@ -57,6 +57,20 @@ def test_before_and_after_differ_by_what_came_and_what_went(
     assert viewer.drawn().share("disappeared", went) > 0.15
 
 
+def test_a_link_to_the_map_alone_shows_what_is_gone_as_it_does_after_the_survey_was_shown(
+    opened: Opener, survey: str, viewer_data: ViewerData
+) -> None:
+    (went,) = viewer_data.changes["disappeared"]
+    viewer = from_above(opened, survey, "reference")
+    viewer.rests()
+    linked = viewer.share("disappeared", went)
+    assert linked > 0.15
+    viewer.page.keyboard.press("2")
+    viewer.drawn().page.keyboard.press("1")
+    viewer.drawn().rests()
+    assert viewer.share("disappeared", went) == pytest.approx(linked, abs=0.02)
+
+
 def test_the_ceiling_is_cut_until_somebody_asks_for_it(
     opened: Opener, survey: str, viewer_data: ViewerData
 ) -> None:

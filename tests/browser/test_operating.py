@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -180,6 +181,39 @@ def test_surveys_say_what_they_found_and_what_they_cannot_say(
     expect(viewer.page.locator(".about")).not_to_contain_text("Nothing changed")
 
 
+def test_a_tile_that_was_not_seen_says_so_and_the_camera_goes_there(
+    opened: Opener, viewer_data: ViewerData
+) -> None:
+    survey = viewer_data.surveys["half"]
+    link = f"#map={MAP}&survey={survey}&tiles=unobserved"
+    viewer = opened(link)
+    answer = viewer.page.request.get(
+        f"{viewer.page.url.partition('#')[0]}surveys/{survey}/tiles?state=unobserved"
+    )
+    tile = answer.json()["features"][0]["properties"]
+    viewer.drawn().page.evaluate("(hash) => { location.hash = hash; }", f"{link}&tile={tile['tile_id']}")
+    details = viewer.page.locator(".details")
+    expect(details.locator("h2")).to_have_text("Not seen")
+    expect(details).to_contain_text("Survey")
+    expect(details).not_to_contain_text("Not sure")
+    at = "([x, y]) => Math.hypot(window.spicd.scene.view.target[0] - x, window.spicd.scene.view.target[1] - y) < 0.05"
+    viewer.until(at, tile["center"][:2])
+
+
+def test_looking_again_does_not_lead_away_from_what_is_looked_at(opened: Opener) -> None:
+    viewer = opened(f"#map={MAP}").drawn()
+    viewer.page.locator("#items li").first.click()
+    viewer.until("() => location.hash.includes('object=')")
+    viewer.until("() => location.hash.includes('view=')")
+    expect(viewer.drawn().page.locator(".split-words")).to_be_visible()
+    away = """() => { const { position: [a, b, c], target: [x, y, z] } = window.spicd.scene.view;
+      return Math.hypot(a - x, b - y, c - z); }"""
+    before = viewer.page.evaluate(away)
+    viewer.page.get_by_role("button", name="Look", exact=True).click()
+    viewer.rests()
+    assert viewer.page.evaluate(away) <= 1.02 * before
+
+
 def test_a_phone_shows_list_and_scene_and_nothing_beside_its_screen(
     opened: Opener, viewer_data: ViewerData
 ) -> None:
@@ -194,6 +228,25 @@ def test_a_phone_shows_list_and_scene_and_nothing_beside_its_screen(
     assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
     small = page.evaluate(_SMALL)
     assert small == []  # WCAG 2.2, 2.5.8: targets of 24 CSS pixels
+
+
+def test_on_a_phone_nothing_lies_over_what_it_hides_and_words_open_by_a_tap(
+    opened: Opener, viewer_data: ViewerData
+) -> None:
+    viewer = opened(f"#map={MAP}&survey={viewer_data.surveys['objects']}", **PHONE).drawn()
+    page = viewer.page
+    strip = page.locator(".timeline ol")
+    expect(strip).to_have_class(re.compile("more-"))
+    page.get_by_role("button", name="Section").tap()
+    expect(page.locator(".section")).to_be_visible()
+    expect(page.locator(".legend")).to_be_hidden()
+    page.get_by_role("button", name="Section").tap()
+    expect(page.locator(".legend")).to_be_visible()
+    page.get_by_role("button", name="Dark", exact=True).first.tap()
+    viewer.until("() => document.documentElement.dataset.theme === 'dark'")
+    page.locator("#items li").first.tap()
+    page.locator("summary", has_text="Judged").tap()
+    expect(page.get_by_text("share of it that both visits could judge", exact=True)).to_be_visible()
 
 
 def test_dark_follows_the_system_until_somebody_chooses(opened: Opener) -> None:
@@ -255,6 +308,30 @@ def test_dropped_scans_become_a_survey_whose_job_is_followed_until_its_result_is
     found = viewer.page.locator(f"#visit-{survey.survey_id}")
     expect(found).to_contain_text("nothing changed", timeout=20_000)
     expect(job_row).to_have_count(0)
+
+
+def test_a_visit_goes_on_without_a_file_that_was_refused(opened: Opener, serve: Callable[..., Live]) -> None:
+    service = serve(queue=RememberingQueue())
+    viewer = opened(f"#map={MAP}", url=service.url).drawn()
+    viewer.watch.expect("status of 4")
+    wrong = ["notes.ply", base64.b64encode(b"these are no points").decode()]
+    viewer.page.evaluate(_DROP, [*scan_and_pose(service, "march-2-0"), wrong])
+    expect(viewer.page.locator("dialog[open]")).to_contain_text("Empty: now")
+    viewer.page.get_by_role("button", name="Compare 2 scans").click()
+    viewer.page.get_by_role("button", name="Compare without notes.ply").click(timeout=20_000)
+    expect(viewer.page.locator(".job")).to_have_count(1, timeout=20_000)
+
+
+def test_leaving_the_file_chooser_leaves_the_dialog_as_it_is(opened: Opener) -> None:
+    viewer = opened(f"#map={MAP}").drawn()
+    viewer.page.get_by_role("button", name="Add survey").click()
+    device = viewer.page.get_by_label("Device").last
+    device.fill("robot-9")
+    chooser = viewer.page.locator("dialog input[type=file]")
+    chooser.evaluate("(one) => one.dispatchEvent(new Event('cancel', { bubbles: true }))")
+    expect(device).to_have_value("robot-9")
+    viewer.page.keyboard.press("Escape")
+    expect(device).to_have_count(0)
 
 
 def held_by_a_worker(job: JobRecord) -> QueueState:

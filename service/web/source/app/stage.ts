@@ -4,7 +4,7 @@ import type { Scene } from "../scene/scene.ts";
 import type { Box, CloudSource, Layer, View } from "../scene/types.ts";
 import type { Controller } from "./controller.ts";
 import type { MapDocument } from "./documents.ts";
-import { markOf } from "./items.ts";
+import { itemOfTile, markOf, type Item } from "./items.ts";
 import {
   chosenItem,
   focusOf,
@@ -18,7 +18,7 @@ import {
 } from "./state.ts";
 
 const MOST_POINTS = 1_000_000; // of a cloud that is loaded whole, where there is a tileset of it
-const PADDING = 0.6; // metres around an object that the camera flies to
+const PADDING = 0.2; // metres around an object that are never out of the picture
 
 /** Fetch what draws; asked for early, it is there when the map is known. */
 export function drawing(): Promise<typeof import("../scene/scene.ts")> {
@@ -92,9 +92,10 @@ export class Stage {
     if (!scene || !state.map.value) return;
     this.#once("theme", shownTheme(state), (theme) => scene.setTheme(theme as "light" | "dark"));
     this.#load("reference", referenceOf(state));
-    this.#load("survey", showOf(state) === "reference" ? this.#kept(state) : surveyOf(state));
+    this.#load("survey", this.#asksSurvey(state) ? surveyOf(state) : this.#kept(state));
     const show = state.stage.survey.loaded ? showOf(state) : "reference";
-    this.#once("show", show, () => scene.show(show));
+    const lost = isOfSurvey(state) || showOf(state) !== "reference";
+    this.#once("show", `${show} ${lost}`, () => scene.show(show, lost));
     this.#once("marks", shownItems(state), () =>
       scene.setMarks(state.place.list === "tiles" ? [] : shownItems(state).map(markOf)),
     );
@@ -110,7 +111,7 @@ export class Stage {
   }
 
   #syncCamera(scene: Scene, state: State): void {
-    const item = chosenItem(state);
+    const item = lookedAt(state);
     this.#once("item", item?.id ?? null, () => scene.select(item?.id ?? null));
     if (!state.stage.reference.loaded) return;
     const { view, item: id } = state.place;
@@ -127,6 +128,12 @@ export class Stage {
     if (name in this.#done && this.#done[name] === value) return;
     this.#done[name] = value;
     act(value);
+  }
+
+  /** Whether the survey's cloud is wanted: with the map shown alone for what is gone, which comes after the map. */
+  #asksSurvey(state: State): boolean {
+    if (showOf(state) !== "reference") return true;
+    return isOfSurvey(state) && state.stage.reference.loaded;
   }
 
   /** Return the survey's cloud that is loaded, if it is still that of the survey in focus. */
@@ -176,13 +183,26 @@ export class Stage {
 
   /** Look at the chosen item again. */
   lookAtItem(): void {
-    const item = chosenItem(this.#app.state);
+    const item = lookedAt(this.#app.state);
     if (item) this.#scene?.flyTo(around(item.box, item.from));
   }
 
   topDown(): void {
     this.#scene?.topDown();
   }
+}
+
+/** Return the chosen item; also a tile that is no item of a list, but is shown as a box. */
+export function lookedAt(state: State): Item | null {
+  const item = chosenItem(state);
+  const { item: id } = state.place;
+  if (item || !id?.startsWith("tile:")) return item;
+  const found = Object.values(state.tiles)
+    .flat()
+    .find(({ properties }) => `tile:${properties.tile_id}` === id);
+  if (!found) return null;
+  const { state: kind } = found.properties;
+  return { ...itemOfTile(found), ...(kind === "changed" ? {} : { kind }) };
 }
 
 /** Return the theme that is shown, the system's where nobody chose. */
@@ -193,8 +213,13 @@ export function shownTheme({ theme }: State): "light" | "dark" {
 
 /** Return the version of the map that is looked at: what the survey in focus was compared with, else the one in use. */
 export function referenceVersion(state: State): number {
-  const focus = state.place.survey || state.place.item ? focusOf(state) : null;
+  const focus = isOfSurvey(state) ? focusOf(state) : null;
   return focus?.map_version ?? (state.map.value as MapDocument).version;
+}
+
+/** Whether a survey is looked at, and not all of them together. */
+function isOfSurvey({ place }: State): boolean {
+  return place.survey !== null || place.item !== null;
 }
 
 /** Return the cloud of the map, of the version that is looked at; null until it is known which it is. */

@@ -21,7 +21,7 @@ export async function addFiles(app: Controller, files: File[]): Promise<void> {
   app.update({
     upload: {
       map: before ? before.map : app.state.place.map,
-      files: chosen.map(({ file }) => rowOf(file)),
+      files: chosen.map(({ file }, n) => before?.files[n] ?? rowOf(file)), // what was sent stays sent
       refused,
       phase: "choosing",
       problem: null,
@@ -31,8 +31,20 @@ export async function addFiles(app: Controller, files: File[]): Promise<void> {
 
 /** Leave a file out again. */
 export function leaveOut(app: Controller, n: number): void {
-  chosen.splice(n, 1);
-  change(app, { files: app.state.upload?.files.filter((_, at) => at !== n) ?? [] });
+  keep(app, (_, at) => at !== n);
+}
+
+/** Leave out the files that the service refused, so that the others go without them. */
+export function leaveOutRefused(app: Controller): void {
+  keep(app, ({ problem }) => problem === null);
+}
+
+/** Keep some of the files; what was refused with the others is forgotten. */
+function keep(app: Controller, wanted: (row: Sending, n: number) => boolean): void {
+  const { upload } = app.state;
+  if (!upload) return;
+  chosen = chosen.filter((_, n) => wanted(upload.files[n]!, n));
+  change(app, { files: upload.files.filter(wanted), phase: "choosing", problem: null });
 }
 
 function rowOf({ name, size }: File): Sending {

@@ -3,10 +3,11 @@
 import { MathUtils, PerspectiveCamera, Ray, Vector2, Vector3 } from "three";
 import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
 
-import { across, centreOf, sizeOf } from "./boxes.ts";
+import { across, centreOf, grown, sizeOf } from "./boxes.ts";
 import type { Box, Point, View } from "./types.ts";
 
 const FIELD_OF_VIEW = 45; // degrees, upright
+const CENTRED = 0.05; // metres between the middles of the picture and of a box
 const FLIGHT_MS = 350;
 const TURN = Math.PI / 24; // a key press
 const AZIMUTH = -Math.PI * 0.36; // where the first view stands, from the middle of the map: south, and a bit east
@@ -69,6 +70,20 @@ export class Rig {
     const slope = Math.tan(MathUtils.degToRad(FIELD_OF_VIEW / 2));
     const distance = Math.max(fitted(half, direction, slope, this.camera.aspect) * 1.03, 2);
     return { position: target.clone().addScaledVector(direction, distance).toArray(), target: target.toArray() };
+  }
+
+  /**
+   * Return the view that shows a box with `room` metres around it, fewer where the picture is narrow. Where the camera
+   * looks at its middle already it goes no farther away than it takes to show the box whole.
+   */
+  viewAround(box: Box, room: number): View {
+    const wide = this.viewOf(grown(box, room * Math.min(1, this.camera.aspect)), "here");
+    const target = new Vector3(...wide.target);
+    if (this.#controls.target.distanceTo(target) > CENTRED) return wide;
+    const away = (view: View) => target.distanceTo(new Vector3(...view.position));
+    const reach = Math.max(away(this.viewOf(box, "here")), Math.min(away(wide), away(this.view)));
+    const position = new Vector3(...wide.position).sub(target).setLength(reach).add(target);
+    return { position: position.toArray(), target: wide.target };
   }
 
   /** Go to a view, in a short flight unless the reader wants no motion or frames are slow. */

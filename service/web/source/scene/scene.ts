@@ -16,7 +16,7 @@ type Event = "pick" | "view" | "drawn";
 type Listener = (id: string | null) => void;
 
 const CLICK = 5; // CSS pixels that a pointer may go for it to be a click
-const AROUND = 1; // metres around what is flown to
+const AROUND = 1.4; // metres around what is flown to
 const REST_MS = 180; // without a change: the camera has come to rest
 const SMOOTH_MS = 40; // of a frame, aimed at while the camera moves
 const SPARED = 4; // times as long as a frame takes, between frames while tiles come
@@ -38,6 +38,7 @@ export class Scene {
   readonly #divider = document.createElement("div");
   readonly #resized: ResizeObserver;
   #shown: Shown = "both";
+  #lost = true;
   #sectionChosen = false;
   #viewChosen = false;
   #frame = 0;
@@ -111,8 +112,9 @@ export class Scene {
     this.#invalidate();
   }
 
-  show(which: Shown): void {
-    this.#shown = which;
+  /** Choose the clouds that are shown; `lost`: with the map also which of its points the survey tells as gone. */
+  show(which: Shown, lost = true): void {
+    [this.#shown, this.#lost] = [which, lost];
     this.#divider.hidden = which !== "split";
     this.#resize();
   }
@@ -136,7 +138,7 @@ export class Scene {
 
   flyTo(box: Box): void {
     this.#viewChosen = true;
-    this.#rig.fly(this.#rig.viewOf(grown(box, AROUND), "here"), this.#frameMs);
+    this.#rig.fly(this.#rig.viewAround(box, AROUND), this.#frameMs);
   }
 
   topDown(): void {
@@ -363,7 +365,7 @@ export class Scene {
   #showLayers(half: "before" | "after" | null): void {
     const which = half === null ? this.#shown : half === "before" ? "reference" : "survey";
     this.#layers.get("reference")?.show(which !== "survey", false);
-    this.#layers.get("survey")?.show(which !== "reference", which !== "survey");
+    this.#layers.get("survey")?.show(which !== "reference", which !== "survey" && this.#lost);
   }
 
   /** Tell once that the first points are on the screen; reading a pixel back waits for the graphics processor. */

@@ -6,7 +6,8 @@ import type { SightingProperties, TileProperties } from "../documents.ts";
 import { ago, count, instant, metres, percent } from "../format.ts";
 import { whereOf, type Item } from "../items.ts";
 import type { Show } from "../link.ts";
-import { chosenItem, focusOf, showOf, type Look } from "../state.ts";
+import { lookedAt } from "../stage.ts";
+import { focusOf, showOf, type Look } from "../state.ts";
 import { KINDS, statusOf, TILE_STATES, whyStatus } from "../words.ts";
 import { follow, type Props } from "./page.tsx";
 import { Empty, Fact, Kind, Problem, Share, Waiting } from "./parts.tsx";
@@ -16,14 +17,14 @@ const ENOUGH = 0.5;
 
 export function Details(props: Props) {
   const { app, state } = props;
-  const item = chosenItem(state);
+  const item = lookedAt(state);
   const known = state.objects.value ?? state.changes.value;
   const close = () => app.go({ item: null });
   return (
     <aside class="details" aria-label="Details of what is chosen">
       <div class="details-head">
-        {item && <Kind kind={item.kind} />}
-        <h2>{item ? (KINDS[item.kind] ?? item.kind) : "Details"}</h2>
+        {item && (item.kind in TILE_STATES ? <i class={`swatch state-${item.kind}`} /> : <Kind kind={item.kind} />)}
+        <h2>{item ? (KINDS[item.kind] ?? TILE_STATES[item.kind] ?? item.kind) : "Details"}</h2>
         <button aria-label="Close the details" title="Close (Esc)" onClick={close}>
           ✕
         </button>
@@ -66,8 +67,8 @@ function About(props: Props & { item: Item }) {
           Look
         </button>
       </div>
-      <Doubts item={item} />
-      {item.tile ? <AboutTile tile={item.tile} item={item} /> : <AboutObject {...props} />}
+      {(!item.tile || item.tile.state === "changed") && <Doubts item={item} />}
+      {item.tile ? <AboutTile app={app} tile={item.tile} /> : <AboutObject {...props} />}
       {item.sighting && <Tiles {...props} item={item} />}
       {item.what === "object" && <History {...props} item={item} />}
     </>
@@ -169,13 +170,26 @@ function SurveyLink({ app, id, children }: { app: Props["app"]; id: string; chil
   );
 }
 
-function AboutTile({ tile, item }: { tile: TileProperties; item: Item }) {
+/** What the latest survey that judged a tile says of it; of a changed tile also since when. */
+function AboutTile({ app, tile }: { app: Props["app"]; tile: TileProperties }) {
   return (
     <dl class="facts">
       <Fact name="State">{TILE_STATES[tile.state] ?? tile.state}</Fact>
-      <Fact name="Score" hint="probability of change">
-        <Share value={tile.score} label="Probability of change" />
+      <Fact name="Survey">
+        <SurveyLink app={app} id={tile.survey_id}>
+          {instant(tile.captured_at)}
+        </SurveyLink>
       </Fact>
+      {tile.score !== null && (
+        <Fact name="Score" hint="probability of change, as this survey has it">
+          <Share value={tile.score} label="Probability of change" />
+        </Fact>
+      )}
+      {tile.max_score !== null && tile.max_score !== tile.score && (
+        <Fact name="Highest" hint="score over all surveys, which the list shows">
+          <Share value={tile.max_score} label="Highest probability of change over all surveys" /> over all surveys
+        </Fact>
+      )}
       <Fact name="Threshold">
         {tile.threshold === null ? null : `${percent(tile.threshold)}: changed above it`}
       </Fact>
@@ -189,7 +203,7 @@ function AboutTile({ tile, item }: { tile: TileProperties; item: Item }) {
         {tile.n_reference} of the map, {tile.n_current} of the survey
       </Fact>
       <Fact name="Change first seen">
-        {instant(item.firstSeen)} ({ago(item.firstSeen)})
+        {tile.first_seen && `${instant(tile.first_seen)} (${ago(tile.first_seen)})`}
       </Fact>
       <Fact name="Change last seen">{tile.last_seen && instant(tile.last_seen)}</Fact>
       <Fact name="Device">{tile.device_id}</Fact>

@@ -89,16 +89,22 @@ function Head({ app, state }: Props) {
   );
 }
 
-/** Switches between light and dark; on a small screen it is among the keys and help. */
+/** Switches between light and dark; on a small screen a sign says so in the head. */
 export function ThemeButton({ app, state, always }: Pick<Props, "app" | "state"> & { always?: boolean }) {
+  const word = shownTheme(state) === "dark" ? "Light" : "Dark";
   return (
     <button
       type="button"
-      class={always ? "" : "wide-only"}
+      aria-label={word}
       title={themeTitle(state.theme)}
       onClick={() => app.useTheme(nextTheme(state))}
     >
-      {shownTheme(state) === "dark" ? "Light" : "Dark"}
+      {!always && (
+        <span class="narrow-only" aria-hidden="true">
+          ◐
+        </span>
+      )}
+      <span class={always ? "" : "wide-only"}>{word}</span>
     </button>
   );
 }

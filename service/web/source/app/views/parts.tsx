@@ -54,12 +54,21 @@ export function Share({ value, label }: { value: number | null; label: string })
   );
 }
 
-/** Show a name with its value; nothing where there is no value. */
+/** Show a name with its value; nothing where there is no value. What the name means opens by a click, tap or key. */
 export function Fact({ name, children, hint }: { name: string; children: ComponentChildren; hint?: string }) {
   if (children === null || children === undefined || children === "") return null;
   return (
     <>
-      <dt title={hint}>{name}</dt>
+      <dt title={hint}>
+        {hint ? (
+          <details>
+            <summary>{name}</summary>
+            <span>{hint}</span>
+          </details>
+        ) : (
+          name
+        )}
+      </dt>
       <dd>{children}</dd>
     </>
   );

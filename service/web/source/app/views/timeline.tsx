@@ -30,7 +30,7 @@ export function Timeline({ app, state }: Props) {
         <strong>All surveys</strong>
         <span>{surveys.value ? count(list.length, "survey") : "asking…"}</span>
       </button>
-      <ol>
+      <ol ref={(list) => watchEdges(list)} onScroll={({ currentTarget }) => tellEdges(currentTarget)}>
         {list.map((survey, n) => (
           <Visit
             key={survey.survey_id}
@@ -79,6 +79,23 @@ function Visit({ state, survey, before, choose }: VisitProps) {
       </button>
     </li>
   );
+}
+
+const watched = new WeakSet<Element>();
+
+/** Fade the ends of a list beyond which there is more, now and whenever its size is another. */
+function watchEdges(list: HTMLElement | null): void {
+  if (!list) return;
+  tellEdges(list);
+  if (watched.has(list)) return;
+  watched.add(list);
+  new ResizeObserver(() => tellEdges(list)).observe(list);
+}
+
+function tellEdges(list: HTMLElement): void {
+  const { scrollLeft, scrollWidth, clientWidth } = list;
+  list.classList.toggle("more-before", scrollLeft > 2);
+  list.classList.toggle("more-after", scrollLeft + clientWidth < scrollWidth - 2);
 }
 
 const inSight = new WeakSet<Element>();

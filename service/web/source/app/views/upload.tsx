@@ -5,7 +5,7 @@ import { Fragment, h } from "preact";
 import type { Controller } from "../controller.ts";
 import { bytes, count } from "../format.ts";
 import type { Sending, UploadState } from "../state.ts";
-import { addFiles, cancel, leaveOut, submit } from "../submit.ts";
+import { addFiles, cancel, leaveOut, leaveOutRefused, submit } from "../submit.ts";
 import type { Props } from "./page.tsx";
 import { Problem } from "./parts.tsx";
 
@@ -29,7 +29,9 @@ export function shown(element: HTMLDialogElement | null, open: boolean): void {
   else element.close();
 }
 
+/** Close the dialog; a file chooser inside that is left without files tells `cancel` as well, and closes nothing. */
 function cancelled(event: Event, app: Controller): void {
+  if (event.target !== event.currentTarget) return;
   event.preventDefault();
   cancel(app);
 }
@@ -76,6 +78,11 @@ function Form({ app, upload, name }: { app: Controller; upload: UploadState; nam
         <button type="button" onClick={() => cancel(app)}>
           {busy ? "Stop" : "Cancel"}
         </button>
+        {phase === "failed" && someSent(files) && (
+          <button type="button" onClick={({ currentTarget }) => goWithout(app, currentTarget.form!)}>
+            {`${upload.map ? "Compare" : "Build"} without ${nameOf(files.filter(({ problem }) => problem))}`}
+          </button>
+        )}
         <button class="primary" disabled={busy || !files.length}>
           {label(upload)}
         </button>
@@ -86,6 +93,15 @@ function Form({ app, upload, name }: { app: Controller; upload: UploadState; nam
       </p>
     </form>
   );
+}
+
+/** Whether some files were refused and others became scans. */
+function someSent(files: Sending[]): boolean {
+  return files.some(({ problem }) => problem) && files.some(({ scan }) => scan);
+}
+
+function nameOf(files: Sending[]): string {
+  return files.length === 1 ? files[0]!.name : count(files.length, "file");
 }
 
 function label({ phase, files, map }: UploadState): string {
@@ -128,6 +144,7 @@ function Fields({ upload, disabled }: { upload: UploadState; disabled: boolean }
       <label>
         Captured at
         <input name="captured_at" type="datetime-local" />
+        <small class="faint">Empty: now</small>
       </label>
     </fieldset>
   );
@@ -160,6 +177,11 @@ function FileRow({ file, leaveOut }: { file: Sending; leaveOut?: () => void }) {
       {problem && <Problem problem={problem} />}
     </li>
   );
+}
+
+function goWithout(app: Controller, form: HTMLFormElement): void {
+  leaveOutRefused(app);
+  void submit(app, new FormData(form));
 }
 
 function begin(event: SubmitEvent, app: Controller): void {
