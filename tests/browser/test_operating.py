@@ -137,6 +137,7 @@ def test_closing_the_details_returns_to_the_clouds_that_were_chosen(
     viewer = opened(f"#map={MAP}&survey={viewer_data.surveys['objects']}").drawn()
     page = viewer.page
     pressed = page.locator(".over-top button[aria-pressed=true]")
+    expect(page.locator("#items .item").first).to_be_visible()  # the list comes by itself, and may come later
     page.keyboard.press("2")
     expect(pressed).to_have_text("Survey")
     page.keyboard.press("j")
