@@ -56,8 +56,12 @@ class ViewerPage:
         return value
 
     def drawn(self) -> ViewerPage:
-        """Wait until every cloud that is asked for has come, which the page tells by saying no more that it loads."""
+        """Wait until every cloud that is asked for has come, which the page tells by saying no more that it loads.
+
+        And until its lists have come: of the two either may be first.
+        """
         self.until(_DRAWN)
+        self.answered()
         return self
 
     def answered(self) -> None:
