@@ -15,9 +15,9 @@ from datetime import datetime, timedelta
 from typing import Protocol
 
 from service.catalog.jobs import Jobs, OpenJob
+from service.catalog.sql.tables import now
 from service.catalog.steps import Queue as QueueName
 from service.catalog.steps import Step
-from service.catalog.tables import now
 from service.queue import QUEUES, Claim, Snapshot, step_id, step_of_id
 
 log = logging.getLogger("spicd.dispatch")

@@ -1,4 +1,4 @@
-"""What can go wrong on the service's side, and the stable code of each. HTTP statuses are in api/http/problems.py.
+"""What can go wrong on the service's side, and the stable code of each. HTTP statuses are in api/http/answering/problems.py.
 
 ServiceError
 ├── NotFound             not_found            no such scan, map, survey, job, tile or model

@@ -3,7 +3,7 @@
 A tile is a Prism in the map's own frame: metres, z up. GeoJSON's `geometry` admits WGS 84 alone (RFC 7946, Section 4),
 so it is null where nobody said where the map lies. `geojson_collection` is the profile "rfc7946" of JSON-FG, which
 other programs read; there a footprint may be in the map's frame where somebody asked for that. Plain JSON values: the
-API checks and answers with them (`service.api.features`), `spicd-worker detect` writes them to a file.
+API checks and answers with them (`service.api.gis.features`), `spicd-worker detect` writes them to a file.
 """
 
 from __future__ import annotations

@@ -12,7 +12,7 @@ import pytest
 from pydantic_core import PydanticUndefined
 from rq.timeouts import JobTimeoutException
 
-from service.api.http.problems import PROBLEMS
+from service.api.http.answering.problems import PROBLEMS
 from service.catalog.jobs import WORKER_DIED
 from service.errors import ServiceError
 from service.settings import Settings

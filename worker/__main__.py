@@ -20,10 +20,10 @@ from uuid import uuid4
 from redis import Redis
 from redis.exceptions import RedisError
 
-from service.catalog.database import Database
 from service.catalog.jobs import Jobs
-from service.catalog.patience import SUPERVISION
 from service.catalog.records import Problem
+from service.catalog.sql.database import Database
+from service.catalog.sql.patience import SUPERVISION
 from service.catalog.steps import ALLOWED_FUNCTIONS
 from service.dispatch import Dispatcher
 from service.errors import QueueUnavailable

@@ -18,8 +18,6 @@ from starlette.types import ASGIApp
 
 from service.api import (
     changes,
-    event_documents,
-    events,
     health,
     jobs,
     landing,
@@ -27,39 +25,39 @@ from service.api import (
     models,
     objects,
     processes,
-    receivers,
     scans,
     surveys,
     tiles,
     tilesets,
     tus,
     versions,
-    webhooks,
 )
+from service.api.following import event_documents, events, receivers, webhooks
 from service.api.housekeeping import housekeeping
-from service.api.http import idempotency, problems
-from service.api.http.access import authorize, secured
-from service.api.http.bodies import INCOMING
-from service.api.http.cards import Cards
-from service.api.http.cross_site import add_cross_site_checks
+from service.api.http.answering import problems
+from service.api.http.answering.cards import Cards
+from service.api.http.answering.prefix import PrefixMiddleware
+from service.api.http.answering.representations import RepresentationMiddleware, add_conditions
 from service.api.http.dependencies import Queue, Services
 from service.api.http.description import mended, operation_id
 from service.api.http.docs_pages import add_pages
-from service.api.http.known_query import refuse_unknown
-from service.api.http.lanes import UPLOAD_TURN_S, Lane
-from service.api.http.listeners import Listeners
-from service.api.http.methods import MethodsMiddleware
+from service.api.http.guards.access import authorize, secured
+from service.api.http.guards.cross_site import add_cross_site_checks
+from service.api.http.guards.lanes import UPLOAD_TURN_S, Lane
+from service.api.http.guards.listeners import Listeners
+from service.api.http.guards.methods import MethodsMiddleware
+from service.api.http.guards.security_headers import SecurityHeadersMiddleware
 from service.api.http.metrics import Metrics, MetricsMiddleware
 from service.api.http.monitor import HealthMonitor
-from service.api.http.prefix import PrefixMiddleware
-from service.api.http.representations import RepresentationMiddleware, add_conditions
-from service.api.http.requests import RequestLog
-from service.api.http.security_headers import SecurityHeadersMiddleware
-from service.api.http.submission import Ticker
-from service.api.http.tus import TusHeaders
-from service.api.http.uploads import sweep
+from service.api.http.reading import idempotency
+from service.api.http.reading.bodies import INCOMING
+from service.api.http.reading.known_query import refuse_unknown
+from service.api.http.reading.requests import RequestLog
+from service.api.http.reading.submission import Ticker
+from service.api.http.reading.tus import TusHeaders
+from service.api.http.reading.uploads import sweep
 from service.catalog.catalog import open_catalog
-from service.catalog.patience import REQUESTS
+from service.catalog.sql.patience import REQUESTS
 from service.dispatch import Dispatcher
 from service.queue import JobQueue
 from service.settings import Settings

@@ -10,15 +10,15 @@ from fastapi import Request as HttpRequest
 from fastapi.responses import Response
 from pydantic import Field
 
-from service.api import features
-from service.api.boxes import bounds_of
-from service.api.features import FeatureResponse, FeaturesRequest, Form, collection_response, form_of
-from service.api.feeds import After, feed_response, require_alone
+from service.api.gis import features
+from service.api.gis.boxes import bounds_of
+from service.api.gis.features import FeatureResponse, FeaturesRequest, Form, collection_response, form_of
+from service.api.gis.feeds import After, feed_response, require_alone
+from service.api.http.answering.documents import link
+from service.api.http.answering.paging import Cursor, decoded_values, encoded_values
+from service.api.http.answering.problems import documented
 from service.api.http.dependencies import Provided
-from service.api.http.documents import link
-from service.api.http.fields import DeviceId, Id, instant, readable
-from service.api.http.paging import Cursor, decoded_values, encoded_values
-from service.api.http.problems import documented
+from service.api.http.reading.fields import DeviceId, Id, instant, readable
 from service.api.tiles import (
     TILES,
     Bbox,
@@ -29,8 +29,8 @@ from service.api.tiles import (
     feature,
 )
 from service.catalog.catalog import Catalog
-from service.catalog.changes import ChangeFilter, ChangeSort, change_order
-from service.catalog.events import FeedCursor
+from service.catalog.findings.changes import ChangeFilter, ChangeSort, change_order
+from service.catalog.following.events import FeedCursor
 from service.catalog.records import Anchor, ChangeRecord, TileState
 from service.errors import NotFound
 

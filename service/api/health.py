@@ -9,11 +9,11 @@ from fastapi import APIRouter, Request, Response
 from prometheus_client import CONTENT_TYPE_LATEST
 from pydantic import Field
 
+from service.api.http.answering.documents import Document
+from service.api.http.answering.problems import documented, response
 from service.api.http.dependencies import Provided, Queue, Services
-from service.api.http.documents import Document
 from service.api.http.metrics import Metrics
 from service.api.http.monitor import HealthMonitor, Part
-from service.api.http.problems import documented, response
 from service.errors import QueueUnavailable, Unavailable
 from service.queue import QUEUES
 

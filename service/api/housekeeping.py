@@ -11,8 +11,8 @@ from datetime import timedelta
 from fastapi.concurrency import run_in_threadpool
 
 from service.api.http.dependencies import Services
-from service.catalog import retention
-from service.catalog.tables import now
+from service.catalog.files import retention
+from service.catalog.sql.tables import now
 
 log = logging.getLogger(__name__)
 

@@ -10,21 +10,28 @@ from fastapi import APIRouter, Path, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
 from pydantic import Field
 
-from service.api.http.access import maps_of_key
+from service.api.http.answering.documents import Document, Link, link
+from service.api.http.answering.documents import Request as Asked
+from service.api.http.answering.paging import PageRequest, list_links
+from service.api.http.answering.problems import LISTED, NAMED, JobProblem, documented
 from service.api.http.dependencies import Provided, Services
-from service.api.http.documents import Document, Link, link
-from service.api.http.documents import Request as Asked
-from service.api.http.fields import Id
-from service.api.http.idempotency import KEYED, Keyed
-from service.api.http.paging import PageRequest, list_links
-from service.api.http.problems import LISTED, NAMED, JobProblem, documented
-from service.api.http.submission import LOOK_AGAIN_S, SUBMITTED, accepted, dismiss, job_headers, run_again
+from service.api.http.guards.access import maps_of_key
+from service.api.http.reading.fields import Id
+from service.api.http.reading.idempotency import KEYED, Keyed
+from service.api.http.reading.submission import (
+    LOOK_AGAIN_S,
+    SUBMITTED,
+    accepted,
+    dismiss,
+    job_headers,
+    run_again,
+)
 from service.api.models import model_path
-from service.catalog.events import EventFilter
+from service.catalog.following.events import EventFilter
 from service.catalog.idempotency import Answer
 from service.catalog.records import EventType, JobRecord, JobStatus
+from service.catalog.sql.tables import now
 from service.catalog.steps import JobKind
-from service.catalog.tables import now
 from service.dispatch import queue_positions
 
 RESULTS = "http://www.opengis.net/def/rel/ogc/1.0/results"  #: OGC 18-062r2, Section 7.11

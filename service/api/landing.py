@@ -5,8 +5,8 @@ from __future__ import annotations
 from fastapi import APIRouter, Request, Response
 from pydantic import Field
 
+from service.api.http.answering.documents import Document, Link, link
 from service.api.http.dependencies import Provided
-from service.api.http.documents import Document, Link, link
 from service.tile_features import CONFORMS_TO
 from service.web.pages import viewer_page, wants_page
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from service.api.http.documents import Document
+from service.api.http.answering.documents import Document
 from service.catalog.records import Bounds, Vector3
 
 Cells = tuple[int, int, int]

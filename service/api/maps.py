@@ -9,15 +9,10 @@ from fastapi import Request as HttpRequest
 from fastapi.concurrency import run_in_threadpool
 from pydantic import BeforeValidator, Field
 
-from service.api.http import bodies, files
-from service.api.http.access import maps_of_key, require_map
-from service.api.http.bodies import Body
-from service.api.http.dependencies import Provided, Services
-from service.api.http.documents import Document, Link, Request, checked, link
-from service.api.http.fields import Id, Model, Text, from_text
-from service.api.http.files import blob_response
-from service.api.http.idempotency import KEYED, Keyed
-from service.api.http.paging import (
+from service.api.http.answering import files
+from service.api.http.answering.documents import Document, Link, Request, checked, link
+from service.api.http.answering.files import blob_response
+from service.api.http.answering.paging import (
     Cursor,
     Limit,
     PageRequest,
@@ -28,8 +23,14 @@ from service.api.http.paging import (
     list_links,
     next_link,
 )
-from service.api.http.problems import BODY, LISTED, MADE, NAMED, JobProblem, documented
-from service.api.http.submission import (
+from service.api.http.answering.problems import BODY, LISTED, MADE, NAMED, JobProblem, documented
+from service.api.http.dependencies import Provided, Services
+from service.api.http.guards.access import maps_of_key, require_map
+from service.api.http.reading import bodies
+from service.api.http.reading.bodies import Body
+from service.api.http.reading.fields import Id, Model, Text, from_text
+from service.api.http.reading.idempotency import KEYED, Keyed
+from service.api.http.reading.submission import (
     SUBMITTED,
     ScansRequest,
     accepted,
@@ -43,7 +44,7 @@ from service.api.http.submission import (
     submit,
 )
 from service.api.manifests import Manifest
-from service.catalog import blob_keys
+from service.catalog.files import blob_keys
 from service.catalog.idempotency import Answer, Once
 from service.catalog.records import (
     Anchor,

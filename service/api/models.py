@@ -9,14 +9,14 @@ from fastapi import APIRouter, Path, Query, Response
 from fastapi import Request as HttpRequest
 from pydantic import Field
 
-from service.api.http import bodies
-from service.api.http.access import maps_of_key
+from service.api.http.answering.documents import Document, Link, Request, checked, link
+from service.api.http.answering.problems import BODY, documented
 from service.api.http.dependencies import Provided, Services
-from service.api.http.documents import Document, Link, Request, checked, link
-from service.api.http.fields import Id, Model
-from service.api.http.idempotency import KEYED, Keyed
-from service.api.http.problems import BODY, documented
-from service.api.http.submission import SUBMITTED, accepted, admit, job_headers, monitor, submit
+from service.api.http.guards.access import maps_of_key
+from service.api.http.reading import bodies
+from service.api.http.reading.fields import Id, Model
+from service.api.http.reading.idempotency import KEYED, Keyed
+from service.api.http.reading.submission import SUBMITTED, accepted, admit, job_headers, monitor, submit
 from service.catalog.idempotency import Answer, Once
 from service.catalog.models import name_for
 from service.catalog.records import JobRecord, ModelRecord, ModelStatus

@@ -1,6 +1,6 @@
 """/surveys/{id}/objects and /maps/{id}/objects: the things that appeared, disappeared or moved, and what became of them.
 
-Answers are written as they are built, like those of `service.api.features`; a test holds them against the schema.
+Answers are written as they are built, like those of `service.api.gis.features`; a test holds them against the schema.
 """
 
 from __future__ import annotations
@@ -12,10 +12,10 @@ from fastapi import Request as HttpRequest
 from fastapi.responses import Response
 from pydantic import Field
 
-from service.api import features
-from service.api.boxes import bounds_of
 from service.api.changes import span_of
-from service.api.features import (
+from service.api.gis import features
+from service.api.gis.boxes import bounds_of
+from service.api.gis.features import (
     FeatureResponse,
     FeaturesRequest,
     FgCollection,
@@ -31,7 +31,7 @@ from service.api.features import (
     form_of,
     plain,
 )
-from service.api.feeds import (
+from service.api.gis.feeds import (
     FEED_CURSOR,
     FEED_UPDATED,
     FEED_WITHDRAWN,
@@ -40,14 +40,13 @@ from service.api.feeds import (
     feed_response,
     require_alone,
 )
+from service.api.http.answering.documents import Document, Link, link
+from service.api.http.answering.paging import Cursor, decoded_values, encoded_values
+from service.api.http.answering.problems import MADE, documented
 from service.api.http.dependencies import Provided
-from service.api.http.documents import Document, Link, link
-from service.api.http.fields import DeviceId, Id, readable
-from service.api.http.paging import Cursor, decoded_values, encoded_values
-from service.api.http.problems import MADE, documented
+from service.api.http.reading.fields import DeviceId, Id, readable
 from service.api.tiles import Bbox, BboxCrs
-from service.catalog.events import FeedCursor
-from service.catalog.objects import (
+from service.catalog.findings.objects import (
     ObjectFilter,
     ObjectSort,
     SightingFilter,
@@ -55,6 +54,7 @@ from service.catalog.objects import (
     object_order,
     sighting_order,
 )
+from service.catalog.following.events import FeedCursor
 from service.catalog.records import (
     Anchor,
     MapObjectRecord,

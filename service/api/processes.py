@@ -16,13 +16,14 @@ from fastapi import APIRouter, Path, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
 from pydantic import BaseModel, ConfigDict, Field
 
-from service.api.features import MEDIA_TYPE
-from service.api.http import bodies, problems
+from service.api.gis.features import MEDIA_TYPE
+from service.api.http.answering import problems
+from service.api.http.answering.documents import Document, Link, link
+from service.api.http.answering.documents import Request as AskedFor
+from service.api.http.answering.paging import here
+from service.api.http.answering.problems import documented, job_failed
 from service.api.http.dependencies import Provided, Services
-from service.api.http.documents import Document, Link, link
-from service.api.http.documents import Request as AskedFor
-from service.api.http.paging import here
-from service.api.http.problems import documented, job_failed
+from service.api.http.reading import bodies
 from service.api.jobs import RESULTS, JobId
 from service.api.maps import MapRequest
 from service.api.models import TrainingRequest, model_path

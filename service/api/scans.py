@@ -9,16 +9,16 @@ from fastapi import APIRouter, Path, Query, Response
 from fastapi import Request as HttpRequest
 from pydantic import Field
 
-from service.api.http import bodies
-from service.api.http.bodies import Body
+from service.api.http.answering.documents import Document, Link, Request, checked, link
+from service.api.http.answering.paging import PageRequest, list_links
+from service.api.http.answering.problems import BODY, LISTED, NAMED, documented, located
 from service.api.http.dependencies import Provided
-from service.api.http.documents import Document, Link, Request, checked, link
-from service.api.http.fields import DeviceId, Frame, Id, Instant, Pose, Text
-from service.api.http.idempotency import KEYED, Keyed, answered
-from service.api.http.paging import PageRequest, list_links
-from service.api.http.problems import BODY, LISTED, NAMED, documented, located
-from service.api.http.submission import delete, lane
-from service.api.http.uploads import Upload
+from service.api.http.reading import bodies
+from service.api.http.reading.bodies import Body
+from service.api.http.reading.fields import DeviceId, Frame, Id, Instant, Pose, Text
+from service.api.http.reading.idempotency import KEYED, Keyed, answered
+from service.api.http.reading.submission import delete, lane
+from service.api.http.reading.uploads import Upload
 from service.catalog.catalog import Catalog
 from service.catalog.idempotency import ANY_TIMES, Answer, Once
 from service.catalog.records import ScanRecord

@@ -10,18 +10,19 @@ from fastapi import Request as HttpRequest
 from fastapi.concurrency import run_in_threadpool
 from pydantic import Field
 
-from service.api import features
-from service.api.http import bodies, files
-from service.api.http.access import maps_of_key
-from service.api.http.bodies import Body
+from service.api.gis import features
+from service.api.http.answering import files
+from service.api.http.answering.documents import Document, Link, checked, link
+from service.api.http.answering.files import blob_response
+from service.api.http.answering.paging import PageRequest, list_links
+from service.api.http.answering.problems import BODY, MADE, NAMED, JobProblem, documented
 from service.api.http.dependencies import Provided, Services
-from service.api.http.documents import Document, Link, checked, link
-from service.api.http.fields import DeviceId, Id, Instant, Model
-from service.api.http.files import blob_response
-from service.api.http.idempotency import KEYED, Keyed
-from service.api.http.paging import PageRequest, list_links
-from service.api.http.problems import BODY, MADE, NAMED, JobProblem, documented
-from service.api.http.submission import (
+from service.api.http.guards.access import maps_of_key
+from service.api.http.reading import bodies
+from service.api.http.reading.bodies import Body
+from service.api.http.reading.fields import DeviceId, Id, Instant, Model
+from service.api.http.reading.idempotency import KEYED, Keyed
+from service.api.http.reading.submission import (
     SUBMITTED,
     ScansRequest,
     accepted,
@@ -34,7 +35,7 @@ from service.api.http.submission import (
     stop_if_open,
     submit,
 )
-from service.catalog import blob_keys
+from service.catalog.files import blob_keys
 from service.catalog.idempotency import Answer, Once
 from service.catalog.records import JobRecord, MapSummary, SurveyRecord, SurveyStatus, SurveySummary
 

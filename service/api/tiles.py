@@ -9,8 +9,8 @@ from fastapi import Request as HttpRequest
 from fastapi.responses import Response
 from pydantic import Field
 
-from service.api.boxes import Crs, bounds_of, numbers_of
-from service.api.features import (
+from service.api.gis.boxes import Crs, bounds_of, numbers_of
+from service.api.gis.features import (
     FeatureResponse,
     FeaturesRequest,
     FgCollection,
@@ -25,13 +25,13 @@ from service.api.features import (
     form_of,
     plain,
 )
-from service.api.feeds import FEED_CURSOR, FEED_UPDATED, FEED_WITHDRAWN, WithdrawnDocument
+from service.api.gis.feeds import FEED_CURSOR, FEED_UPDATED, FEED_WITHDRAWN, WithdrawnDocument
+from service.api.http.answering.documents import Document, link
+from service.api.http.answering.paging import Cursor, decoded_values, encoded_values
+from service.api.http.answering.problems import documented as problems
 from service.api.http.dependencies import Provided
-from service.api.http.documents import Document, link
-from service.api.http.fields import Id, readable
-from service.api.http.paging import Cursor, decoded_values, encoded_values
-from service.api.http.problems import documented as problems
-from service.catalog.changes import TileFilter, TileSort, VoxelKind, tile_order
+from service.api.http.reading.fields import Id, readable
+from service.catalog.findings.changes import TileFilter, TileSort, VoxelKind, tile_order
 from service.catalog.records import ChangeRecord, TileState, Vector3
 from service.tile_features import FEATURE_TYPE, footprint, tile_feature
 

@@ -14,15 +14,16 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from pydantic import BaseModel, ConfigDict, Field
 
-from service.api.geodesy import ecef_from_map
-from service.api.http import bodies, files
+from service.api.gis.geodesy import ecef_from_map
+from service.api.http.answering import files
+from service.api.http.answering.files import blob_response, content_response
+from service.api.http.answering.problems import MADE
 from service.api.http.dependencies import Provided
-from service.api.http.fields import Id
-from service.api.http.files import blob_response, content_response
-from service.api.http.problems import MADE
-from service.catalog import blob_keys
+from service.api.http.reading import bodies
+from service.api.http.reading.fields import Id
+from service.catalog.files import blob_keys
+from service.catalog.files.tilesets import ContentName
 from service.catalog.records import Anchor, Bounds, MapSummary, Tileset
-from service.catalog.tilesets import ContentName
 from service.catalog.versions import tileset_of
 from service.errors import NotFound
 from service.tile_features import MAP_FRAME

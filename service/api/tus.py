@@ -16,16 +16,16 @@ from fastapi import Request as HttpRequest
 from fastapi.concurrency import run_in_threadpool
 from pydantic import Field
 
-from service.api.http import tus
+from service.api.http.answering.documents import Document, Link, checked, link
+from service.api.http.answering.problems import JobProblem, documented, located, response
 from service.api.http.dependencies import Provided, Services
-from service.api.http.documents import Document, Link, checked, link
-from service.api.http.problems import JobProblem, documented, located, response
-from service.api.http.turns import Turn, Turns
-from service.api.http.uploads import HEAD_BYTES, Upload, format_of, shown
+from service.api.http.guards.turns import Turn, Turns
+from service.api.http.reading import tus
+from service.api.http.reading.uploads import HEAD_BYTES, Upload, format_of, shown
 from service.api.scans import ScanRequest, keep_scan
-from service.catalog.disk import Disk
+from service.catalog.files.disk import Disk
+from service.catalog.files.uploads import OpenUpload, UploadRecord, Uploads
 from service.catalog.records import Problem
-from service.catalog.uploads import OpenUpload, UploadRecord, Uploads
 from service.errors import (
     BadRequest,
     OffsetMismatch,

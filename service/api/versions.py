@@ -9,15 +9,16 @@ from fastapi import Request as HttpRequest
 from fastapi.concurrency import run_in_threadpool
 from pydantic import Field
 
-from service.api.http import bodies, files
-from service.api.http.bodies import Body
+from service.api.http.answering import files
+from service.api.http.answering.documents import Document, Link, checked, link
+from service.api.http.answering.paging import PageRequest, list_links
+from service.api.http.answering.problems import BODY, MADE, NAMED, JobProblem, documented
 from service.api.http.dependencies import Provided, Services
-from service.api.http.documents import Document, Link, checked, link
-from service.api.http.fields import Id
-from service.api.http.idempotency import KEYED, Keyed
-from service.api.http.paging import PageRequest, list_links
-from service.api.http.problems import BODY, MADE, NAMED, JobProblem, documented
-from service.api.http.submission import (
+from service.api.http.reading import bodies
+from service.api.http.reading.bodies import Body
+from service.api.http.reading.fields import Id
+from service.api.http.reading.idempotency import KEYED, Keyed
+from service.api.http.reading.submission import (
     SUBMITTED,
     ScansRequest,
     accepted,

@@ -4,23 +4,23 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from service.catalog import history
-from service.catalog.blobs import Blobs
-from service.catalog.changes import Changes
-from service.catalog.database import Database
-from service.catalog.deliveries import Deliveries
-from service.catalog.disk import BALLAST_BYTES, Disk
-from service.catalog.events import Events
+from service.catalog.files.blobs import Blobs
+from service.catalog.files.disk import BALLAST_BYTES, Disk
+from service.catalog.findings import history
+from service.catalog.findings.changes import Changes
+from service.catalog.findings.objects import Objects
+from service.catalog.following.deliveries import Deliveries
+from service.catalog.following.events import Events
+from service.catalog.following.webhooks import Webhooks
 from service.catalog.jobs import Jobs
 from service.catalog.keys import Keys
 from service.catalog.maps import Maps
 from service.catalog.models import Models
-from service.catalog.objects import Objects
-from service.catalog.patience import JOBS, REQUESTS, Patience
 from service.catalog.scans import Scans
+from service.catalog.sql.database import Database
+from service.catalog.sql.patience import JOBS, REQUESTS, Patience
 from service.catalog.surveys import Surveys
 from service.catalog.versions import Versions
-from service.catalog.webhooks import Webhooks
 from service.settings import Settings
 
 

@@ -16,8 +16,8 @@ from sqlalchemy import delete
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.orm import Session
 
-from service.catalog.database import Database
-from service.catalog.tables import IdempotencyKey, Job, now
+from service.catalog.sql.database import Database
+from service.catalog.sql.tables import IdempotencyKey, Job, now
 from service.errors import KeyInUse, KeyReused
 
 #: After which a request that is still under way was cut off; it has made its thing and waits for the queue alone.

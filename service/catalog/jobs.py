@@ -20,14 +20,16 @@ from typing import Any, cast
 from sqlalchemy import ColumnElement, CursorResult, func, select, update
 from sqlalchemy.orm import Session
 
-from service.catalog import history, tables, tallies
-from service.catalog.database import Database
+from service.catalog import tallies
+from service.catalog.findings import history
+from service.catalog.following.publication import tell
 from service.catalog.idempotency import ANY_TIMES, Once
-from service.catalog.publication import tell
 from service.catalog.records import EventType, JobRecord, JobStatus, Page, Position, Problem, rfc3339
+from service.catalog.sql import tables
+from service.catalog.sql.database import Database
+from service.catalog.sql.tables import new_id, now
 from service.catalog.steps import STEPS, JobKind, Step, first_step, step_after, step_of
 from service.catalog.steps import Queue as QueueName
-from service.catalog.tables import new_id, now
 from service.errors import Conflict, NotFound
 
 MAX_ATTEMPTS = 3  #: of one step

@@ -17,9 +17,9 @@ from typing import get_args
 from sqlalchemy import ColumnElement, or_, select
 from sqlalchemy.exc import IntegrityError
 
-from service.catalog.database import Database
 from service.catalog.records import KeyRecord, Scope
-from service.catalog.tables import Key, new_id, now
+from service.catalog.sql.database import Database
+from service.catalog.sql.tables import Key, new_id, now
 from service.errors import BadRequest, Conflict, NotFound
 from service.settings import Settings
 

@@ -8,12 +8,11 @@ from typing import Any
 from sqlalchemy import select
 from sqlalchemy.exc import IntegrityError
 
-from service.catalog import blob_keys, tables
-from service.catalog.blobs import Blobs
-from service.catalog.database import Database
+from service.catalog.files import blob_keys
+from service.catalog.files.blobs import Blobs
+from service.catalog.following.publication import tell
 from service.catalog.idempotency import ANY_TIMES, Once
 from service.catalog.jobs import new_job
-from service.catalog.publication import tell
 from service.catalog.records import (
     Anchor,
     Built,
@@ -26,7 +25,9 @@ from service.catalog.records import (
     Position,
 )
 from service.catalog.scans import NO_POSES, checked_scan_ids, new_uses, scans_in_order
-from service.catalog.tables import new_id, now
+from service.catalog.sql import tables
+from service.catalog.sql.database import Database
+from service.catalog.sql.tables import new_id, now
 from service.catalog.versions import (
     check_ready,
     in_use,

@@ -10,12 +10,12 @@ from sqlalchemy import delete, func, select
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
-from service.catalog import tables
-from service.catalog.database import Database
 from service.catalog.idempotency import ANY_TIMES, Once
 from service.catalog.jobs import new_job
 from service.catalog.records import JobRecord, ModelRecord
-from service.catalog.tables import Model, now
+from service.catalog.sql import tables
+from service.catalog.sql.database import Database
+from service.catalog.sql.tables import Model, now
 from service.catalog.versions import map_row, version_in_use
 from service.errors import Conflict, NotFound
 

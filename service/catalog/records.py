@@ -129,7 +129,7 @@ def problem_urn(code: str) -> str:
 
 
 class Problem(Record):
-    """Why a job failed, as data; api/http/problems.py turns it into RFC 9457."""
+    """Why a job failed, as data; api/http/answering/problems.py turns it into RFC 9457."""
 
     code: str  #: stable, from the error trees of service/errors.py and worker/errors.py
     detail: str  #: one sentence with the numbers

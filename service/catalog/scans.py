@@ -15,11 +15,9 @@ from sqlalchemy import ColumnElement, delete, select, update
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
-from service.catalog import blob_keys, tables
-from service.catalog.blobs import Blobs
-from service.catalog.clock import clock_warnings
-from service.catalog.database import Database
-from service.catalog.publication import tell
+from service.catalog.files import blob_keys
+from service.catalog.files.blobs import Blobs
+from service.catalog.following.publication import tell
 from service.catalog.records import (
     Matrix,
     Page,
@@ -30,6 +28,9 @@ from service.catalog.records import (
     ScanRecord,
     ScanWarning,
 )
+from service.catalog.sql import tables
+from service.catalog.sql.clock import clock_warnings
+from service.catalog.sql.database import Database
 from service.errors import BadRequest, Conflict, DiskFull, NotFound
 
 log = logging.getLogger(__name__)

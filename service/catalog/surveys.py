@@ -10,13 +10,13 @@ from typing import get_args
 from sqlalchemy import delete, select
 from sqlalchemy.orm import Session, selectinload, undefer
 
-from service.catalog import blob_keys, history, tables, tallies
-from service.catalog.blobs import Blobs
-from service.catalog.clock import clock_warnings
-from service.catalog.database import Database
+from service.catalog import tallies
+from service.catalog.files import blob_keys
+from service.catalog.files.blobs import Blobs
+from service.catalog.findings import history
+from service.catalog.following.publication import tell
 from service.catalog.idempotency import ANY_TIMES, Once
 from service.catalog.jobs import new_job
-from service.catalog.publication import tell
 from service.catalog.records import (
     JobRecord,
     Matrix,
@@ -43,7 +43,10 @@ from service.catalog.scans import (
     scans_in_order,
     write_outcomes,
 )
-from service.catalog.tables import Survey, SurveyObject, SurveyTile, new_id, now
+from service.catalog.sql import tables
+from service.catalog.sql.clock import clock_warnings
+from service.catalog.sql.database import Database
+from service.catalog.sql.tables import Survey, SurveyObject, SurveyTile, new_id, now
 from service.catalog.versions import map_row, tileset_of, version_in_use
 from service.errors import Conflict, Failed, NotFound, NotReady
 

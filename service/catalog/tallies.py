@@ -20,8 +20,8 @@ from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.orm import Session
 
 from service.catalog.records import ScanOutcome, TileRecord
+from service.catalog.sql.tables import Tally
 from service.catalog.steps import STEPS, JobKind
-from service.catalog.tables import Tally
 
 _NOTED = "tallies"  #: where a session keeps what its transaction has counted so far
 

@@ -9,9 +9,9 @@ from typing import Any
 from sqlalchemy import Select, delete, exists, func, select
 from sqlalchemy.orm import Session, aliased, contains_eager, selectinload, undefer
 
-from service.catalog import blob_keys, tables, tallies
-from service.catalog.blobs import Blobs
-from service.catalog.database import Database
+from service.catalog import tallies
+from service.catalog.files import blob_keys
+from service.catalog.files.blobs import Blobs
 from service.catalog.idempotency import ANY_TIMES, Once
 from service.catalog.jobs import new_job
 from service.catalog.records import (
@@ -35,7 +35,9 @@ from service.catalog.scans import (
     scans_in_order,
     write_outcomes,
 )
-from service.catalog.tables import MapVersion, now
+from service.catalog.sql import tables
+from service.catalog.sql.database import Database
+from service.catalog.sql.tables import MapVersion, now
 from service.errors import BadRequest, Conflict, Failed, Gone, NotFound, NotReady
 
 ScanPosition = tuple[str, int]  #: in a list of scans: the job of their version, and how many came before

@@ -14,7 +14,7 @@ from service.permissions import make_private, private_files
 from service.settings import Settings
 
 if TYPE_CHECKING:
-    from service.catalog.backup import Backup
+    from service.catalog.files.backup import Backup
 
 DataDir = Annotated[Path | None, typer.Option("--data-dir", help="Of the service; else SPICD_DATA_DIR.")]
 
@@ -39,7 +39,7 @@ def restore(
 
 def _run(what: str, ctx: typer.Context, folder: Path, data_dir: Path | None) -> None:
     # SQLAlchemy and obstore take a while to import, and no other command needs them.
-    from service.catalog import backup as backups  # noqa: PLC0415
+    from service.catalog.files import backup as backups  # noqa: PLC0415
     from service.errors import ServiceError  # noqa: PLC0415
 
     terminal: Terminal = ctx.obj

@@ -9,10 +9,10 @@ from typing import Annotated, Literal
 import typer
 from rich.table import Table
 
-from service.bags.recording import BagError, BagOptions, BagScan, Recording, write
 from service.cli.tables import columns
 from service.cli.terminal import Device, Terminal
 from service.client import ClientError, Document
+from service.robots.bags.recording import BagError, BagOptions, BagScan, Recording, write
 
 
 def from_bag(

@@ -14,7 +14,7 @@ from service.settings import Settings
 from service.up.embedded_redis import LaunchFailed
 
 if TYPE_CHECKING:
-    from service.catalog import retention
+    from service.catalog.files import retention
 
 
 def sweep(
@@ -28,9 +28,9 @@ def sweep(
     data_dir: Annotated[Path | None, typer.Option("--data-dir", help="Of the service.")] = None,
 ) -> None:
     """Remove surveys and scans past SPICD_KEEP_..._DAYS, and files whose row is gone. Works on the database itself."""
-    from service.catalog import retention  # noqa: PLC0415 - the other commands start the faster without
     from service.catalog.catalog import open_catalog  # noqa: PLC0415
-    from service.catalog.tables import now  # noqa: PLC0415
+    from service.catalog.files import retention  # noqa: PLC0415 - the other commands start the faster without
+    from service.catalog.sql.tables import now  # noqa: PLC0415
 
     terminal: Terminal = ctx.obj
     settings = read_settings(data_dir=data_dir)

@@ -28,7 +28,7 @@ from rich.progress import (
 from service.cli.tables import stage
 from service.client import Client, ClientError, Document, JobFailed, OnProgress, Pose
 from service.resumable import OnSent, default_memory
-from service.sidecars import SidecarError, read_pose_text, read_sidecar
+from service.robots.sidecars import SidecarError, read_pose_text, read_sidecar
 
 T = TypeVar("T")
 

@@ -19,7 +19,7 @@ import typer
 from service.cli.terminal import Device, Frame, Terminal
 from service.client import ClientError, Document, RequestRefused, Unreachable
 from service.resumable import OnSent, Persistence
-from service.watching import Reporter, SurveyEach, Watcher, WatchOptions
+from service.robots.watching import Reporter, SurveyEach, Watcher, WatchOptions
 
 REFUSED_STATUS = 3  #: of --once where a file was refused
 NOTED_S = 2.0  #: a shorter wait is not worth a line

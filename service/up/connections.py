@@ -34,7 +34,8 @@ from typing import Any, ClassVar
 import h11
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from service.api.http import problems, security_headers
+from service.api.http.answering import problems
+from service.api.http.guards import security_headers
 from service.settings import Settings
 
 log = logging.getLogger("spicd")

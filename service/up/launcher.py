@@ -26,10 +26,10 @@ import uvicorn
 from fastapi import FastAPI
 
 from service.catalog.catalog import disk_of
-from service.catalog.database import Database
 from service.catalog.jobs import Jobs
 from service.catalog.keys import open_keys
-from service.catalog.patience import SUPERVISION
+from service.catalog.sql.database import Database
+from service.catalog.sql.patience import SUPERVISION
 from service.dispatch import Dispatcher
 from service.permissions import make_private, private_files
 from service.queue import QUEUES, JobQueue

@@ -12,8 +12,8 @@ import time
 from collections.abc import Mapping
 from pathlib import Path
 
-from service.catalog.database import Database
 from service.catalog.models import Models
+from service.catalog.sql.database import Database
 from service.errors import DatabaseUnavailable, QueueUnavailable
 from service.queue import JobQueue
 from service.settings import Settings

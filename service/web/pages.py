@@ -15,8 +15,8 @@ from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import HTMLResponse, Response
 from starlette.exceptions import HTTPException
 
-from service.api.http.files import LocalFile
-from service.api.http.negotiation import preferred
+from service.api.http.answering.files import LocalFile
+from service.api.http.answering.negotiation import preferred
 from service.errors import NotAcceptable
 
 BUILT = Path(__file__).parent / "built"

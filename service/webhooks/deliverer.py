@@ -10,7 +10,7 @@ import logging
 import threading
 from typing import Self
 
-from service.catalog.deliveries import Deliveries
+from service.catalog.following.deliveries import Deliveries
 from service.errors import Unavailable
 from service.webhooks.sending import Sender
 

@@ -11,9 +11,9 @@ import httpx
 from pydantic_core import to_json
 from standardwebhooks import Webhook
 
-from service.catalog.deliveries import Outcome, Task
-from service.catalog.tables import now
-from service.catalog.webhooks import PING
+from service.catalog.following.deliveries import Outcome, Task
+from service.catalog.following.webhooks import PING
+from service.catalog.sql.tables import now
 from service.cloud_events import MEDIA_TYPE, cloud_event, document
 from service.webhooks.addresses import AddressRefused, CheckedBackend, Network, Resolve, resolve
 

@@ -30,7 +30,7 @@ from fastapi import FastAPI
 
 from service.api.app import create_app
 from service.catalog.catalog import Catalog
-from service.catalog.objects import ObjectFilter
+from service.catalog.findings.objects import ObjectFilter
 from tests.breaking.requests import Request, Requests
 from tests.support.findings import Deadline, Findings, add_common, show
 from tests.support.footprints import peak_resident

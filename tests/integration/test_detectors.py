@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.catalog import blob_keys
+from service.catalog.files import blob_keys
 from service.catalog.records import JobRecord
 from tests.support import toy
 from tests.support.house import MAP, House, run

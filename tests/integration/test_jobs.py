@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from service.catalog import blob_keys
-from service.catalog.blobs import Blobs
+from service.catalog.files import blob_keys
+from service.catalog.files.blobs import Blobs
 from service.catalog.jobs import Jobs, Run
 from service.catalog.records import JobRecord, Placement, Problem, ScanRecord, Tileset
 from service.catalog.steps import STEPS, JobKind

@@ -12,10 +12,10 @@ import numpy as np
 import open3d as o3d
 import pytest
 
-from service.catalog import blob_keys
-from service.catalog.changes import ChangeFilter
+from service.catalog.files import blob_keys
+from service.catalog.findings.changes import ChangeFilter
+from service.catalog.findings.objects import SightingFilter
 from service.catalog.jobs import Jobs
-from service.catalog.objects import SightingFilter
 from service.catalog.records import JobRecord, ObjectRecord, Placement, ScanRecord, SurveyRecord
 from service.errors import Conflict
 from tests.support.house import MAP, House, run

@@ -13,7 +13,7 @@ from types import SimpleNamespace
 import pytest
 from sqlalchemy import update
 
-from service.catalog import tables
+from service.catalog.sql import tables
 from service.catalog.steps import Queue
 from service.dispatch import Dispatcher
 from service.errors import DatabaseUnavailable

@@ -8,7 +8,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from service.catalog.objects import ObjectFilter
+from service.catalog.findings.objects import ObjectFilter
 from service.catalog.records import MapObjectRecord
 from tests.support.house import SETTINGS, House, run
 from worker.detectors.card import MODEL_STORE

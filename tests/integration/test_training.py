@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.catalog import blob_keys
+from service.catalog.files import blob_keys
 from service.catalog.jobs import Run
 from service.catalog.records import JobRecord, ModelRecord
-from service.catalog.tables import now
+from service.catalog.sql.tables import now
 from tests.support.house import MAP, MODEL, OTHER_CUT, House, run
 from worker.detectors.card import Card
 from worker.detectors.spicd_net.detector import SpicdNet

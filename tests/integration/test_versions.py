@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service.catalog import blob_keys
+from service.catalog.files import blob_keys
 from service.catalog.records import JobRecord, ScanOutcome, ScanRecord, VersionRecord
 from tests.support.house import MAP, House, run
 from worker.cloud.formats.scan import read_scan

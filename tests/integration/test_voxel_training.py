@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from service.catalog import blob_keys
+from service.catalog.files import blob_keys
 from service.catalog.records import JobRecord
 from tests.support.house import SETTINGS, House, run
 from worker.cloud import npz

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from service.api.features import JSON_FG, MEDIA_TYPE, Form
+from service.api.gis.features import JSON_FG, MEDIA_TYPE, Form
 from service.api.tiles import FgTileCollection, TileCollection, feature
 from service.catalog.records import ChangeRecord
 from service.tile_features import CONFORMS_TO, MAP_FRAME, geojson_collection, tile_collection, tile_feature

@@ -12,13 +12,14 @@ from typing import Any
 
 from redis import Redis
 
-from service.api.http.submission import Ticker
-from service.catalog import steps, tables
+from service.api.http.reading.submission import Ticker
+from service.catalog import steps
 from service.catalog.catalog import Catalog, open_catalog
 from service.catalog.jobs import Jobs
 from service.catalog.records import JobRecord
+from service.catalog.sql import tables
+from service.catalog.sql.tables import now
 from service.catalog.steps import JobKind, Queue
-from service.catalog.tables import now
 from service.dispatch import Dispatcher
 from service.queue import JobQueue
 from service.settings import Settings

@@ -16,11 +16,11 @@ import torch
 from safetensors.torch import save
 from sqlalchemy import update
 
-from service.catalog import tables
 from service.catalog.catalog import Catalog, open_catalog
-from service.catalog.database import Database
 from service.catalog.jobs import Jobs, Run
 from service.catalog.records import JobRecord, ScanRecord, SurveyRecord
+from service.catalog.sql import tables
+from service.catalog.sql.database import Database
 from service.catalog.steps import STEPS
 from service.settings import Settings
 from worker.cloud.formats.pcd import write_pcd

@@ -8,10 +8,10 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from service.catalog import blob_keys
 from service.catalog.catalog import Catalog
+from service.catalog.files import blob_keys
+from service.catalog.files.tilesets import address
 from service.catalog.records import Bounds, ScanOutcome, Tileset
-from service.catalog.tilesets import address
 from tests.support.samples import IDENTITY, add_scan
 from worker.cloud.formats.ply import write_ply
 from worker.cloud.tilesets.writer import pieces_of, write_tileset

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 
-from service.catalog import blob_keys
+from service.catalog.files import blob_keys
 from service.catalog.records import Bounds, Tileset, VersionRecord
 from worker.cloud import npz
 from worker.cloud.formats.laz import write_laz

@@ -5,8 +5,8 @@ from __future__ import annotations
 import functools
 from pathlib import Path
 
-from service.catalog import blob_keys
-from service.catalog.blobs import Blobs
+from service.catalog.files import blob_keys
+from service.catalog.files.blobs import Blobs
 from service.catalog.records import ModelRecord, VersionRecord
 from worker.detectors.card import Card
 from worker.detectors.detector import Detector

@@ -8,8 +8,8 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from uuid import uuid4
 
-from service.catalog import blob_keys
-from service.catalog.blobs import Blobs
+from service.catalog.files import blob_keys
+from service.catalog.files.blobs import Blobs
 from worker.pipeline.registration.scan_to_scan import PairResult
 
 _INTERVAL_S = 2.0  #: between two writes, and so about the most work that is lost

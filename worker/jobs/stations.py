@@ -10,7 +10,7 @@ from typing import Protocol
 
 import numpy as np
 
-from service.catalog.blob_keys import safe_name
+from service.catalog.files.blob_keys import safe_name
 from service.catalog.records import Matrix, ScanOutcome, ScanRecord
 from worker.cloud.formats.apart import StationEntry, stations_of
 from worker.cloud.formats.extent import ROUND

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import asdict
 
-from service.catalog import blob_keys
+from service.catalog.files import blob_keys
 from service.catalog.records import (
     Bounds,
     Motion,

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import asdict
 
+from service.catalog.files.tilesets import address
 from service.catalog.records import Tileset
-from service.catalog.tilesets import address
 from worker.cloud.tilesets.writer import Pieces, TilesetSettings, write_tileset
 from worker.jobs.step import Context
 

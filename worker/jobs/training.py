@@ -10,7 +10,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from service.catalog import blob_keys
+from service.catalog.files import blob_keys
 from service.catalog.records import ModelRecord, VersionRecord
 from service.errors import NotFound
 from worker.detectors.card import Card

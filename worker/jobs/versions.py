@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from service.catalog import blob_keys
+from service.catalog.files import blob_keys
 from service.catalog.records import ScanOutcome, VersionRecord
 from worker.cloud import npz
 from worker.cloud.seen import Seen

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from service.catalog import blob_keys
+from service.catalog.files import blob_keys
 from service.catalog.records import ModelRecord, VersionRecord
 from worker.cloud import npz
 from worker.detectors.card import Card, QuietRecord

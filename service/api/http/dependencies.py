@@ -7,9 +7,9 @@ from typing import Annotated, Protocol, cast
 
 from fastapi import Depends, Request
 
-from service.api.http.cards import Cards
-from service.api.http.lanes import Lane
-from service.api.http.listeners import Listeners
+from service.api.http.answering.cards import Cards
+from service.api.http.guards.lanes import Lane
+from service.api.http.guards.listeners import Listeners
 from service.catalog.catalog import Catalog
 from service.catalog.steps import JobKind
 from service.dispatch import Dispatcher, Hands

@@ -18,7 +18,7 @@ from fastapi.openapi.docs import get_redoc_html, get_swagger_ui_html
 from fastapi.responses import HTMLResponse, Response
 from starlette.exceptions import HTTPException
 
-from service.api.http.files import LocalFile
+from service.api.http.answering.files import LocalFile
 
 _FOLDER = Path(fastapi_offline.__file__).parent / "static"
 _FILES = {

@@ -20,11 +20,11 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.catalog import tallies
 from service.catalog.catalog import Catalog
-from service.catalog.deliveries import Backlog
+from service.catalog.following.deliveries import Backlog
 from service.catalog.jobs import OpenSteps
 from service.catalog.records import JobStatus, WebhookStatus
+from service.catalog.sql.tables import now
 from service.catalog.steps import STEPS
-from service.catalog.tables import now
 from service.queue import Snapshot
 
 log = logging.getLogger(__name__)

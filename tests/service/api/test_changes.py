@@ -10,7 +10,7 @@ import httpx
 import pytest
 from fastapi.testclient import TestClient
 
-from service.api.http.paging import encoded
+from service.api.http.answering.paging import encoded
 from service.api.tiles import TileCollection
 from service.catalog.catalog import Catalog
 from service.catalog.records import Problem, TileState

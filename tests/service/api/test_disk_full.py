@@ -9,7 +9,7 @@ import pytest
 from fastapi.testclient import TestClient
 
 from service.catalog.catalog import Catalog
-from service.catalog.disk import BALLAST_BYTES
+from service.catalog.files.disk import BALLAST_BYTES
 from service.settings import Settings
 from tests.support.samples import (
     RememberingQueue,

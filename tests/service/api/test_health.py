@@ -10,8 +10,8 @@ import pytest
 from fastapi.testclient import TestClient
 from sqlalchemy import text
 
+from service.api.http.answering.problems import MEDIA_TYPE
 from service.api.http.monitor import HealthMonitor, Part
-from service.api.http.problems import MEDIA_TYPE
 from service.catalog.catalog import Catalog
 from service.errors import QueueUnavailable
 from service.queue import QueueState

@@ -16,7 +16,7 @@ from service.api import housekeeping
 from service.catalog.catalog import Catalog
 from service.errors import NotFound
 from service.settings import Settings
-from tests.service.catalog.test_retention import aged
+from tests.service.catalog.files.test_retention import aged
 from tests.support.samples import RememberingQueue, add_map, add_scan, catalog_of, running, services_of
 
 

@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 from fastapi.testclient import TestClient
 
-from service.catalog import blob_keys
 from service.catalog.catalog import Catalog
+from service.catalog.files import blob_keys
 from service.settings import Settings
 from tests.support.samples import (
     BOUNDS,

@@ -8,8 +8,8 @@ import httpx
 import pytest
 from fastapi.testclient import TestClient
 
-from service.catalog import blob_keys
 from service.catalog.catalog import Catalog
+from service.catalog.files import blob_keys
 from service.catalog.records import Problem
 from service.errors import Conflict
 from service.settings import Settings

@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 from fastapi.testclient import TestClient
 
-from service.api.geodesy import to_wgs84
-from service.api.http.paging import encoded
+from service.api.gis.geodesy import to_wgs84
+from service.api.http.answering.paging import encoded
 from service.api.objects import FgObjectCollection, FgObjectHistory, FgSightingCollection
 from service.catalog.catalog import Catalog
 from service.catalog.records import Anchor, ObjectRecord

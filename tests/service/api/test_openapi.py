@@ -17,7 +17,7 @@ from fastapi.openapi.utils import get_openapi
 from service.api import openapi
 from service.api.app import create_app
 from service.api.http.description import not_null, operations, schemas_under
-from service.catalog.deliveries import SCHEDULE
+from service.catalog.following.deliveries import SCHEDULE
 from service.settings import Settings
 
 PROJECT = Path(__file__).resolve().parents[3]

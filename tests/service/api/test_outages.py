@@ -9,8 +9,8 @@ import pytest
 from fastapi.testclient import TestClient
 from httpx import Response
 
-from service.catalog.blobs import Blobs
-from service.catalog.patience import Patience
+from service.catalog.files.blobs import Blobs
+from service.catalog.sql.patience import Patience
 from service.settings import Settings
 from tests.support.processes import until
 from tests.support.samples import (

@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 from fastapi.testclient import TestClient
 
-from service.catalog import blob_keys
 from service.catalog.catalog import Catalog
+from service.catalog.files import blob_keys
 from service.catalog.records import Placement, Problem, ScanOutcome
 from service.settings import Settings
 from tests.support.samples import IDENTITY, NOON, RememberingQueue, add_map, add_scan, add_survey, ply, tile

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from fastapi.testclient import TestClient
 
-from service.api.geodesy import to_wgs84
+from service.api.gis.geodesy import to_wgs84
 from service.catalog.catalog import Catalog
 from service.catalog.records import Anchor, TileRecord
 from tests.service.api.test_objects import BERLIN

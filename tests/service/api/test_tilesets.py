@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 from fastapi.testclient import TestClient
 
-from service.api import geodesy
-from service.catalog import blob_keys
+from service.api.gis import geodesy
 from service.catalog.catalog import Catalog
+from service.catalog.files import blob_keys
+from service.catalog.files.tilesets import MOST_BYTES, address
 from service.catalog.records import Tileset
-from service.catalog.tilesets import MOST_BYTES, address
 from service.settings import Settings
 from tests.support.samples import (
     BOUNDS,

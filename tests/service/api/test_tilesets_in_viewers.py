@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from service.api.geodesy import to_ecef
-from service.catalog import blob_keys
+from service.api.gis.geodesy import to_ecef
+from service.catalog.files import blob_keys
+from service.catalog.files.tilesets import address
 from service.catalog.records import Anchor, Bounds, Tileset
-from service.catalog.tilesets import address
 from tests.support.live import live
 from tests.support.samples import add_map, settings_in
 from tests.support.tools import MISSING, TESTS, TOOLS, run

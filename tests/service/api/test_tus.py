@@ -12,8 +12,8 @@ import httpx
 import pytest
 from fastapi.testclient import TestClient
 
-from service.catalog.tables import now
-from service.catalog.uploads import Uploads
+from service.catalog.files.uploads import Uploads
+from service.catalog.sql.tables import now
 from service.errors import DatabaseUnavailable, DiskFull
 from service.settings import Settings
 from tests.support.samples import RememberingQueue, catalog_of, ply, running
@@ -305,7 +305,7 @@ def test_a_scan_in_use_that_comes_again_with_another_pose_is_corrected(client: T
 
 
 def test_no_more_uploads_are_begun_than_may_be(client: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("service.catalog.uploads.MAX_UPLOADS", 2)
+    monkeypatch.setattr("service.catalog.files.uploads.MAX_UPLOADS", 2)
     for _ in range(2):
         begin(client)
     answer = client.post("/uploads", headers={**TUS, "Upload-Length": "9"})
@@ -332,7 +332,7 @@ def test_a_disk_that_fills_while_pieces_come_keeps_those_before(
     url = begin(client)
     send(client, url, 0, SCAN[:500])
     with monkeypatch.context() as patch:
-        patch.setattr("service.catalog.disk.Disk.require", full)
+        patch.setattr("service.catalog.files.disk.Disk.require", full)
         answer = send(client, url, 500, SCAN[500:])
         assert (answer.status_code, code(answer)) == (507, "disk_full")
         assert offset(client, url) == 500

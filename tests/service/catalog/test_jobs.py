@@ -9,11 +9,11 @@ from threading import Barrier
 import pytest
 from sqlalchemy import update
 
-from service.catalog import tables
 from service.catalog.catalog import Catalog
 from service.catalog.jobs import Run
 from service.catalog.records import JobStatus, Problem
-from service.catalog.tables import now
+from service.catalog.sql import tables
+from service.catalog.sql.tables import now
 from service.errors import Conflict, NotFound
 from tests.support.samples import add_map, add_scan, add_survey
 

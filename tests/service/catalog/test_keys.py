@@ -9,7 +9,7 @@ import pytest
 
 from service.catalog.catalog import Catalog
 from service.catalog.keys import SCOPES, new_secret
-from service.catalog.tables import now
+from service.catalog.sql.tables import now
 from service.errors import BadRequest, Conflict, NotFound
 from service.settings import Settings
 

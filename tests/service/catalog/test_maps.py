@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from service.catalog import blob_keys
 from service.catalog.catalog import Catalog
+from service.catalog.files import blob_keys
 from service.catalog.records import (
     Bounds,
     ObjectRecord,

@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 from sqlalchemy import inspect
 
-from service.catalog import blob_keys
 from service.catalog.catalog import Catalog, open_catalog
-from service.catalog.changes import ChangeFilter
-from service.catalog.database import Database, WrongRevision
+from service.catalog.files import blob_keys
+from service.catalog.findings.changes import ChangeFilter
+from service.catalog.sql.database import Database, WrongRevision
 from service.settings import Settings
 from service.up.embedded_redis import LaunchFailed
 from service.up.launcher import _migrate

@@ -11,8 +11,8 @@ import pytest
 from sqlalchemy import text
 from sqlalchemy.exc import OperationalError
 
-from service.catalog.database import Database
-from service.catalog.patience import Patience
+from service.catalog.sql.database import Database
+from service.catalog.sql.patience import Patience
 from service.errors import DatabaseUnavailable
 from tests.support.servers import PostgreSQL, postgresql
 

@@ -7,8 +7,8 @@ from datetime import timedelta
 import pytest
 
 from service.catalog.catalog import Catalog
-from service.catalog.changes import ChangeFilter
-from service.catalog.objects import ObjectFilter
+from service.catalog.findings.changes import ChangeFilter
+from service.catalog.findings.objects import ObjectFilter
 from service.catalog.records import MapObjectRecord, ObjectRecord, Placement, TileRecord
 from service.errors import Conflict
 from tests.support.samples import NOON, add_map, add_survey, place, thing, tile

@@ -12,7 +12,7 @@ from service.catalog.catalog import Catalog, open_catalog
 from service.cli.main import main
 from service.errors import NotFound
 from service.settings import Settings
-from tests.service.catalog.test_retention import aged
+from tests.service.catalog.files.test_retention import aged
 from tests.support.samples import add_map, add_scan
 
 

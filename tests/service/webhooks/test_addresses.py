@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from service.catalog.deliveries import Outcome, Task
-from service.catalog.webhooks import new_secret
+from service.catalog.following.deliveries import Outcome, Task
+from service.catalog.following.webhooks import new_secret
 from service.errors import BadRequest
 from service.webhooks import addresses
 from service.webhooks.addresses import AddressRefused, check, checked_url, networks

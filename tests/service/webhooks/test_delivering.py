@@ -17,13 +17,13 @@ import pytest
 from sqlalchemy import update
 from standardwebhooks import Webhook, WebhookVerificationError
 
-from service.catalog import deliveries as delivering
 from service.catalog import tallies
 from service.catalog.catalog import Catalog, open_catalog
-from service.catalog.publication import tell
+from service.catalog.following import deliveries as delivering
+from service.catalog.following.publication import tell
 from service.catalog.records import DeliveryRecord, EventType
-from service.catalog.tables import Webhook as WebhookRow
-from service.catalog.tables import WebhookDelivery, now
+from service.catalog.sql.tables import Webhook as WebhookRow
+from service.catalog.sql.tables import WebhookDelivery, now
 from service.errors import Gone, NotFound
 from service.settings import Settings
 from service.webhooks.addresses import networks
@@ -181,8 +181,8 @@ def test_a_process_that_is_killed_before_it_records_leaves_the_event_to_another(
     happen(catalog, "first", "second")
     script = (
         "import os, signal, sys\n"
-        "from service.catalog.deliveries import Deliveries\n"
-        "from service.catalog.database import Database\n"
+        "from service.catalog.following.deliveries import Deliveries\n"
+        "from service.catalog.sql.database import Database\n"
         "from service.webhooks.addresses import networks\n"
         "from service.webhooks.deliverer import Deliverer\n"
         "from service.webhooks.sending import Sender\n"

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.catalog import blob_keys
-from service.catalog.blobs import Blobs
+from service.catalog.files import blob_keys
+from service.catalog.files.blobs import Blobs
 from worker.jobs.pair_cache import StoredPairCache
 from worker.pipeline.registration.scan_to_scan import PairResult
 

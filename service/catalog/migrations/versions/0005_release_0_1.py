@@ -11,7 +11,7 @@ from typing import Any
 import sqlalchemy as sa
 from alembic import op
 
-from service.catalog.tables import UtcDateTime
+from service.catalog.sql.tables import UtcDateTime
 
 revision = "0005"
 down_revision = None

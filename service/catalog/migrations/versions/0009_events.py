@@ -11,7 +11,7 @@ from uuid import uuid4
 import sqlalchemy as sa
 from alembic import op
 
-from service.catalog.tables import UtcDateTime
+from service.catalog.sql.tables import UtcDateTime
 
 revision = "0009"
 down_revision = "0008"

@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 from fastapi.testclient import TestClient
 
-from service.api.http.json_text import MAX_NAMES, read_json
-from service.api.http.problems import MAX_ERRORS
+from service.api.http.answering.json_text import MAX_NAMES, read_json
+from service.api.http.answering.problems import MAX_ERRORS
 from tests.support.samples import (
     RememberingQueue,
     add_map,

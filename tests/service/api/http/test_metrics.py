@@ -10,9 +10,10 @@ from fastapi.testclient import TestClient
 from prometheus_client.parser import text_string_to_metric_families
 from sqlalchemy import text, update
 
-from service.api.http.problems import PROBLEMS
-from service.catalog import tables, tallies
+from service.api.http.answering.problems import PROBLEMS
+from service.catalog import tallies
 from service.catalog.catalog import Catalog
+from service.catalog.sql import tables
 from service.queue import QueueState, Snapshot, step_id
 from tests.support.samples import RememberingQueue, add_map, add_survey, services_of
 

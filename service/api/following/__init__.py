@@ -1,0 +1,1 @@
+"""What happened, for whoever follows it: events as lists, streams and webhooks."""

@@ -1,0 +1,1 @@
+"""What the features of all resources share: shapes, boxes, feeds, positions on Earth."""

@@ -1,0 +1,1 @@
+"""What goes out: documents, problems, pages, files, representations."""

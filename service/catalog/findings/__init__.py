@@ -1,0 +1,1 @@
+"""What surveys found, from visit to visit: changes, objects, their history."""

@@ -1,0 +1,1 @@
+"""What happened, in the order of its publication, and who is told."""
