@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+from rq.executions import Execution
 from rq.job import Job
 
 from service.queue import step_of_id
@@ -23,6 +24,7 @@ class StepJob(Job):  # type: ignore[misc]  # rq is untyped here
     """An rq job that calls allowed functions only; the base allows none, `step_job` makes one that does."""
 
     allowed: frozenset[str] = frozenset()
+    claim: Execution | None = None  #: of the worker that has taken it
 
     @property
     def func(self) -> Callable[..., Any]:

@@ -82,7 +82,8 @@ class SharedBatches:
             while len(request.results) < len(items):
                 with self._changed:
                     self._start()
-                    self._changed.wait_for(lambda: _has_news(request, told), _LISTEN_S)
+                    if not _has_news(request, told):
+                        self._changed.wait(_LISTEN_S)
                     told = len(request.results)
                 if request.error is not None:
                     raise request.error

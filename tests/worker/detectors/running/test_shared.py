@@ -138,17 +138,16 @@ def test_models_take_turns(held):
 
 def test_a_batch_waits_for_a_step_that_has_the_model_in_hand_and_for_nobody_else(held):
     batches = SharedBatches(FittedRuns(8), wait_s=FOR_EVER)
-    with asking(batches) as ask:
+    with asking(batches) as ask, batches.expect("held/1"):
+        alone = ask(held, "a", 2)
+        held.let(1)
+        assert alone.result(60) == ["a0", "a1"]  # it is the one that was expected
         with batches.expect("held/1"):
-            alone = ask(held, "a", 2)
+            first = ask(held, "b", 2)
+            assert len(held.batches) == 1  # it waits
+            second = ask(held, "c", 1)
             held.let(1)
-            assert alone.result(60) == ["a0", "a1"]  # it is the one that was expected
-            with batches.expect("held/1"):
-                first = ask(held, "b", 2)
-                assert len(held.batches) == 1  # it waits
-                second = ask(held, "c", 1)
-                held.let(1)
-                assert first.result(60) + second.result(60) == ["b0", "b1", "c0"]
+            assert first.result(60) + second.result(60) == ["b0", "b1", "c0"]
     assert len(held.batches) == 2
 
 
