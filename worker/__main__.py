@@ -17,7 +17,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 from uuid import uuid4
 
 from redis import Redis
@@ -89,19 +89,24 @@ def main(arguments: list[str] | None = None) -> int:
         importlib.import_module(module)
     name = options.name or f"{_host(options.queue)}{os.getpid()}-{uuid4().hex[:8]}"
     connect = functools.partial(Redis.from_url, settings.redis_url, socket_connect_timeout=CONNECT_S)
-    common = {"allowed": ALLOWED_FUNCTIONS, "grace_s": options.grace, "name": name}
     if options.queue == "geometry":
         log.info("geometry worker is ready")
-        records = CatalogRecords(settings)
-        work(lambda: GeometryWorker("geometry", connect(), records=records, **common))
+        work(
+            lambda: GeometryWorker("geometry", connect(), **_of_all(options, name, CatalogRecords(settings)))
+        )
         return 0
     limit_inference(settings)
     with serving(settings, name) as share:
         log.info("inference worker is ready, steps at a time: %d", share.concurrency)
-        inference = CatalogRecords(settings, counted=share.counted)
-        own = {"records": inference, "concurrency": share.concurrency, "tells": share.tells}
-        work(lambda: InferenceWorker("inference", connect(), **own, **common))
+        own = _of_all(options, name, CatalogRecords(settings, counted=share.counted))
+        own |= {"concurrency": share.concurrency, "tells": share.tells}
+        work(lambda: InferenceWorker("inference", connect(), **own))
     return 0
+
+
+def _of_all(options: argparse.Namespace, name: str, records: CatalogRecords) -> dict[str, Any]:
+    """Return what a worker of either kind is made with."""
+    return {"allowed": ALLOWED_FUNCTIONS, "grace_s": options.grace, "name": name, "records": records}
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -248,8 +253,8 @@ class CatalogRecords:
 
     def _write_counted(self) -> None:
         """Write what networks have counted since the last time; where that fails it is counted the next time."""
-        counted = self._counted.take() if self._counted is not None else {}
-        if not counted:
+        counted = {} if self._counted is None else self._counted.take()
+        if self._counted is None or not counted:
             return
         try:
             with self._database.write() as session:

@@ -7,11 +7,9 @@ import signal
 from dataclasses import dataclass
 from typing import Literal
 
-from rq.timeouts import JobTimeoutException
-
 from service.errors import Unavailable, is_disk_full
 from worker.errors import NoSpaceLeft, PipelineError
-from worker.rq_jobs import FunctionRefused, StepJob
+from worker.rq_jobs import FunctionRefused, StepJob, StepTimedOut
 
 _OUTSIDE = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGQUIT)
 
@@ -48,7 +46,7 @@ def _problem(error: BaseException, job: StepJob) -> tuple[str, str]:
             return error.code, str(error)
         case FunctionRefused():
             return "function_refused", str(error)
-        case JobTimeoutException():
+        case StepTimedOut():
             return "timed_out", f"step {job.id} took longer than {job.timeout} s; send fewer or smaller scans"
         case _ if is_disk_full(error):
             return NoSpaceLeft.code, "the disk is full; make room, then run it again"

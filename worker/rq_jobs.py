@@ -12,8 +12,11 @@ from typing import Any
 
 from rq.executions import Execution
 from rq.job import Job
+from rq.timeouts import JobTimeoutException
 
 from service.queue import step_of_id
+
+StepTimedOut = JobTimeoutException  #: what the time limit of a step raises
 
 
 class FunctionRefused(Exception):

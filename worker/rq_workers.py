@@ -27,7 +27,7 @@ from rq import Queue, SimpleWorker, Worker, worker_registration
 from rq.exceptions import StopRequested
 from rq.executions import Execution
 from rq.serializers import JSONSerializer
-from rq.timeouts import JobTimeoutException, UnixSignalDeathPenalty
+from rq.timeouts import UnixSignalDeathPenalty
 from rq.utils import now
 from rq.worker.base import BaseWorker, WorkerStatus
 
@@ -38,7 +38,7 @@ from service.up.lifetime import end_with_parent, out_of_memory_kills
 from worker.endings import Ending, WorkerStopped, ending_of, ending_of_status
 from worker.errors import PipelineError
 from worker.memory import limit_memory
-from worker.rq_jobs import FunctionRefused, StepJob, step_job
+from worker.rq_jobs import FunctionRefused, StepJob, StepTimedOut, step_job
 from worker.rq_threads import Door, StepThreads
 from worker.watch import Watch
 
@@ -72,7 +72,7 @@ class Records(Protocol):
         """Hand over what is due, and find what was lost."""
 
 
-_EXPECTED = (PipelineError, FunctionRefused, WorkerStopped, JobTimeoutException, Unavailable)
+_EXPECTED = (PipelineError, FunctionRefused, WorkerStopped, StepTimedOut, Unavailable)
 
 
 class _StepWorker(BaseWorker):  # type: ignore[misc]  # rq is untyped here
@@ -219,8 +219,8 @@ class _StepWorker(BaseWorker):  # type: ignore[misc]  # rq is untyped here
             self._record(job, ending_of(error, job))
 
     def _limited(self, job: StepJob) -> AbstractContextManager[object]:
-        """Return a block that raises JobTimeoutException when the step's time is up."""
-        penalty: AbstractContextManager[object] = UnixSignalDeathPenalty(job.timeout, JobTimeoutException)
+        """Return a block that raises StepTimedOut when the step's time is up."""
+        penalty: AbstractContextManager[object] = UnixSignalDeathPenalty(job.timeout, StepTimedOut)
         return penalty
 
     @contextmanager
@@ -253,7 +253,7 @@ class _StepWorker(BaseWorker):  # type: ignore[misc]  # rq is untyped here
         last.daemon = True
         last.start()
         log.error("%s: does not hear that its time is up; this worker ends", job.id)
-        self._record(job, ending_of(JobTimeoutException(), job))
+        self._record(job, ending_of(StepTimedOut(), job))
         self._before_exit(job)
         os._exit(1)
 
@@ -370,7 +370,7 @@ class GeometryWorker(_StepWorker, Worker):  # type: ignore[misc]
     def _due_end(self, job: StepJob, ran_s: float, watch: Watch) -> Ending | None:
         """Return why a step has to be ended; None while it may go on."""
         if job.timeout and ran_s > job.timeout + LATE_S:
-            return ending_of(JobTimeoutException(), job)
+            return ending_of(StepTimedOut(), job)
         trouble = watch.trouble()
         if trouble is None:
             return None
@@ -455,7 +455,7 @@ class InferenceWorker(_StepWorker, SimpleWorker):  # type: ignore[misc]
     @contextmanager
     def _limited_in_thread(self, job: StepJob, door: Door) -> Iterator[None]:
         """Have the step's thread leave when its time is up: a thread hears no signal."""
-        timer = threading.Timer(job.timeout, door.leave, (JobTimeoutException,)) if job.timeout else None
+        timer = threading.Timer(job.timeout, door.leave, (StepTimedOut,)) if job.timeout else None
         if timer is not None:
             timer.daemon = True
             timer.start()

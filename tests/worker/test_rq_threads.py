@@ -20,7 +20,8 @@ def endless(began: threading.Event, pause: threading.Event) -> None:
 
 
 def test_a_step_is_left_by_the_error_and_the_others_go_on():
-    threads, ended, go = StepThreads(2), [], threading.Event()
+    threads, go = StepThreads(2), threading.Event()
+    ended: list[tuple[str, type[BaseException] | None]] = []
     doors: dict[str, Door] = {}
 
     def run(name: str):

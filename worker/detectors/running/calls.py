@@ -118,13 +118,18 @@ class FittedRuns:
             self.meter.add("out_of_memory", call.model)
             log.warning("model %s: %d items at once do not fit into the GPU's memory", call.model, len(items))
         # only here, for the error holds on to what the network had made
-        if torch.cuda.is_initialized():
-            torch.cuda.empty_cache()
+        give_cache_back()
         return None
 
     def _remember(self, call: NetworkCall[I, R], size: int) -> None:
         with self._lock:
             self._fits[call.key] = max(1, min(size, self._fits.get(call.key, size)))
+
+
+def give_cache_back() -> None:
+    """Give the GPU back what torch keeps for arrays to come."""
+    if torch.cuda.is_available():
+        torch.cuda.empty_cache()
 
 
 def _too_large(call: NetworkCall[I, R]) -> OutOfMemory:

@@ -15,7 +15,7 @@ Figure = Literal[
     "models_opened",
     "models_evicted",
 ]
-Counted = Mapping[tuple[Figure, str], tuple[int, float]]  #: by figure and model: how often, and the sum
+Counted = Mapping[tuple[str, str], tuple[int, float]]  #: by figure and model: how often, and the sum
 
 
 class Meter:
@@ -23,13 +23,11 @@ class Meter:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._counted: dict[tuple[Figure, str], tuple[int, float]] = {}
+        self._counted: dict[tuple[str, str], tuple[int, float]] = {}
 
-    def add(self, figure: Figure, model: str, value: float = 1.0, *, count: int = 1) -> None:
+    def add(self, figure: Figure, model: str, value: float = 1.0) -> None:
         """Count a value."""
-        with self._lock:
-            before, total = self._counted.get((figure, model), (0, 0.0))
-            self._counted[figure, model] = before + count, total + value
+        self.give_back({(figure, model): (1, value)})
 
     def take(self) -> Counted:
         """Return what was counted since the last time."""
@@ -39,5 +37,7 @@ class Meter:
 
     def give_back(self, counted: Counted) -> None:
         """Count again what was taken and could not be kept."""
-        for (figure, model), (count, total) in counted.items():
-            self.add(figure, model, total, count=count)
+        with self._lock:
+            for key, (count, total) in counted.items():
+                before, sum_before = self._counted.get(key, (0, 0.0))
+                self._counted[key] = before + count, sum_before + total

@@ -9,10 +9,10 @@ from collections.abc import Callable, Hashable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
-import torch
-
 from worker.detectors.detector import Detector
+from worker.detectors.running.calls import give_cache_back
 from worker.detectors.running.meter import Meter
+from worker.detectors.store import Weights
 
 log = logging.getLogger("worker.detectors")
 
@@ -93,11 +93,11 @@ class WarmModels:
         for model in closed:
             log.info("model %s is closed: others need the room", model)
             self._meter.add("models_evicted", model)
-        if closed and torch.cuda.is_initialized():
-            torch.cuda.empty_cache()
+        if closed:
+            give_cache_back()
 
 
 def weight_of(detector: Detector) -> int:
     """Return the bytes of a detector's weights, `LEAST_BYTES` at least."""
-    weights = getattr(detector, "weights", dict)()
-    return max(LEAST_BYTES, sum(tensor.numel() * tensor.element_size() for tensor in weights.values()))
+    weights: Callable[[], Weights] = getattr(detector, "weights", dict)
+    return max(LEAST_BYTES, sum(tensor.nbytes for tensor in weights().values()))

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from worker.detectors.precision import Precision
-from worker.detectors.spicd_net.layers import NormedLinear
+from worker.detectors.siamese.layers import NormedLinear
 from worker.detectors.spicd_net.network import PointEncoder, TransformNet
 
 MULTIPLE = (
@@ -50,14 +50,16 @@ class _Folded(nn.Module):
 class _Pooled(_Folded):
     """A layer that is max-pooled at once, and its maximum over the points."""
 
+    coarse_weight: Tensor | None
+
     def __init__(self, layer: NormedLinear, precision: Precision) -> None:
         super().__init__(layer)
-        self.coarse = precision == "bfloat16"
-        self.register_buffer("coarse_weight", self.weight.bfloat16() if self.coarse else None)
+        coarse = precision == "bfloat16"
+        self.register_buffer("coarse_weight", self.weight.bfloat16() if coarse else None)
 
     def forward(self, x: Tensor) -> Tensor:
         """(B, N, inputs) -> (B, outputs), not rectified"""
-        if not self.coarse:
+        if self.coarse_weight is None:
             return functional.linear(x, self.weight).amax(dim=1) + self.bias  # of (B, N, outputs)
         winners = functional.linear(x.bfloat16(), self.coarse_weight).argmax(dim=1)  # (B, outputs)
         clouds = torch.arange(len(x), device=x.device)[:, None]

@@ -16,7 +16,8 @@ class Small:
     """A network that doubles numbers, in a device where so many items fit; notes its batches."""
 
     def __init__(self, fits: int = 1000, model: str = "small/1", most: int | None = None) -> None:
-        self.fits, self.batches = fits, []
+        self.fits = fits
+        self.batches: list[list[int]] = []
         self.call = NetworkCall(
             model=model, function="double", fingerprint="f", run=self._run, size=lambda item: 1, most=most
         )
@@ -33,7 +34,8 @@ def quietly(done: int) -> None:
 
 
 def test_items_are_run_in_order_in_batches_of_at_most_so_many():
-    small, told = Small(), []
+    small = Small()
+    told: list[int] = []
     results = DirectBatches(FittedRuns(4)).run(small.call, range(10), told.append)
     assert results == [2 * item for item in range(10)]
     assert [len(batch) for batch in small.batches] == [4, 4, 2]
@@ -49,13 +51,12 @@ def test_a_call_may_ask_for_smaller_batches_and_not_for_larger_ones():
 
 def test_a_large_item_counts_as_much_as_it_is_and_is_run_all_the_same():
     batches: list[list[int]] = []
-    call = NetworkCall(
-        model="m/1",
-        function="f",
-        fingerprint="",
-        run=lambda items: batches.append(list(items)) or items,
-        size=lambda item: item,
-    )
+
+    def run(items: Sequence[int]) -> Sequence[int]:
+        batches.append(list(items))
+        return items
+
+    call = NetworkCall(model="m/1", function="f", fingerprint="", run=run, size=lambda item: item)
     DirectBatches(FittedRuns(4)).run(call, [1, 2, 9, 3, 1, 1], quietly)
     assert batches == [[1, 2], [9], [3, 1], [1]]
 
@@ -94,10 +95,15 @@ def _all_but_three(items: Sequence[int]) -> Sequence[int]:
     return items
 
 
+def _broken(items: Sequence[int]) -> Sequence[int]:
+    raise RuntimeError("no number")
+
+
 def test_other_errors_and_a_dismissal_pass():
     small = Small()
-    with pytest.raises(TypeError):
-        DirectBatches().run(small.call, [None], quietly)  # type: ignore[list-item]
+    broken = NetworkCall(model="m/1", function="f", fingerprint="", run=_broken)
+    with pytest.raises(RuntimeError, match="no number"):
+        DirectBatches().run(broken, [1], quietly)
 
     def dismissed(done: int) -> None:
         if done:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
+from worker.detectors.precision import Precision
 from worker.detectors.spicd_net.frozen import FrozenEncoder
 from worker.detectors.spicd_net.together import TogetherEncoder, level
 
@@ -16,7 +17,7 @@ def clouds() -> list[torch.Tensor]:
 
 
 @torch.inference_mode()
-def together(network, clouds: list[torch.Tensor], precision: str = "float32") -> torch.Tensor:
+def together(network, clouds: list[torch.Tensor], precision: Precision = "float32") -> torch.Tensor:
     centroids = torch.stack([cloud.mean(0) for cloud in clouds])
     return TogetherEncoder(network.encoder, precision)(level(clouds), centroids)
 
