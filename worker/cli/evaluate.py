@@ -14,7 +14,7 @@ import typer
 
 from worker.cli import terminal
 from worker.cli.command_line import command_line
-from worker.cli.options import DEFAULT_MODEL, PAPER_MODEL, AsJson, Model, ModelStore
+from worker.cli.options import DEFAULT_MODEL, PAPER_MODEL, AsJson, Device, Model, ModelStore
 from worker.detectors.card import MODEL_STORE
 
 
@@ -327,6 +327,75 @@ def record(
         raise ValueError("nothing to record: give --paper, --revisit, or both")
     path = record_figures(model_store, model, files)
     terminal.output().print(f"{path}: {', '.join(files)}", highlight=False)
+
+
+def precision(
+    model: Model = PAPER_MODEL,
+    device: Device = "auto",
+    way: Annotated[
+        Literal["cpu", "cuda"] | None,
+        typer.Option(help="Compute as a processor or as a GPU does, whatever the device; else its own way."),
+    ] = None,
+    offices: Annotated[int, typer.Option(min=1, help="Simulated, each visited twice.")] = 3,
+    scans: Annotated[int, typer.Option(min=2, help="Of each visit.")] = 6,
+    seed: Annotated[int, typer.Option(help="Of the first office.")] = 1,
+    put_on_card: Annotated[
+        bool, typer.Option("--record", help="Put the result on the model's card.")
+    ] = False,
+    model_store: ModelStore = MODEL_STORE,
+) -> None:
+    """Measure how far the scores of a model move where its network computes in bfloat16."""
+    from worker.benchmarks.precision import PrecisionSettings, measure, record, table  # noqa: PLC0415
+
+    settings = PrecisionSettings(
+        model=model,
+        model_store=model_store,
+        device=device,
+        way=way,
+        offices=offices,
+        scans=scans,
+        seed=seed,
+    )
+    with terminal.progress_bar() as progress:
+        check = measure(settings, progress)
+    terminal.output().print(table(check, model))
+    if put_on_card:
+        terminal.output().print(f"recorded in {record(settings, check)}", highlight=False)
+
+
+def bench_network(
+    device: Device = "auto",
+    precision: Annotated[
+        Literal["float32", "bfloat16"], typer.Option(help="Of the large products.")
+    ] = "float32",
+    compiled: Annotated[bool, typer.Option("--compile", help="By torch.compile.")] = False,
+    graphs: Annotated[bool, typer.Option("--graphs", help="As a CUDA graph.")] = False,
+    tiles: Annotated[int, typer.Option(min=1, help="Of the map.")] = 172,
+    points: Annotated[int, typer.Option(min=1, help="Of each tile, all distinct.")] = 4096,
+    batch: Annotated[int, typer.Option(min=1, help="Tiles of one product.")] = 64,
+    repeats: Annotated[int, typer.Option(min=1, help="Of each, of which the median counts.")] = 20,
+    out: Annotated[Path, typer.Option(help="Where the figures are saved.")] = Path("bench/network.json"),
+    model_store: ModelStore = MODEL_STORE,
+) -> None:
+    """Measure milliseconds of SPICD-Net's network for a map's tiles beside their floor, best on a GPU."""
+    from worker.benchmarks.documents import write_json  # noqa: PLC0415
+    from worker.benchmarks.network_time import NetworkTimeSettings, measure, table  # noqa: PLC0415
+
+    settings = NetworkTimeSettings(
+        device=device,
+        precision=precision,
+        compiled=compiled,
+        graphs=graphs,
+        tiles=tiles,
+        points=points,
+        batch=batch,
+        repeats=repeats,
+        model_store=model_store,
+    )
+    with terminal.progress_bar() as progress:
+        figures = measure(settings, progress)
+    write_json(out, figures)
+    terminal.show(figures, table, f"saved in {out}")
 
 
 def _numbers(words: str) -> tuple[int, ...]:

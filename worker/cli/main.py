@@ -38,7 +38,15 @@ def _commands() -> typer.Typer:
         pretty_exceptions_enable=False,
         help="Compares LiDAR scans of a space on this machine, trains the detector, and shows the whole service.",
     )
-    for command in (detect, register, with_training_options(train), train_voxels, demo, evaluate.bench):
+    for command in (
+        detect,
+        register,
+        with_training_options(train),
+        train_voxels,
+        demo,
+        evaluate.bench,
+        evaluate.bench_network,
+    ):
         commands.command()(command)
     measuring = typer.Typer(no_args_is_help=True, help="How good it is, measured where the truth is known.")
     for command in (
@@ -48,6 +56,7 @@ def _commands() -> typer.Typer:
         evaluate.revisit,
         evaluate.real,
         evaluate.record,
+        evaluate.precision,
     ):
         measuring.command()(command)
     commands.add_typer(measuring, name="evaluate")

@@ -23,8 +23,7 @@ class SpicdNet(SiameseDetector):
         super().__init__(card, network, network.head, device)
         self._spicd = network
         self._encoder = FrozenEncoder(network.encoder)
-        self._at_once: TogetherEncoder | None = None  #: on a GPU, which encodes a batch as one
-        self._use_precision("float32")
+        self._encode_with("float32", at_once=device.type == "cuda")
 
     @classmethod
     def load(cls, card: Card, weights: dict[str, Tensor], device: torch.device) -> SpicdNet:
@@ -33,19 +32,15 @@ class SpicdNet(SiameseDetector):
         network.load_state_dict(weights)
         return cls(card, network, device)
 
-    def _use_precision(self, precision: Precision) -> None:
-        super()._use_precision(precision)
-        if self._device.type != "cpu":
-            self._encode_at_once(precision)
-
-    def _encode_at_once(self, precision: Precision) -> None:
-        self._at_once = TogetherEncoder(self._spicd.encoder, precision).to(self._device)
+    def _encode_with(self, precision: Precision, *, at_once: bool) -> None:
+        super()._encode_with(precision, at_once=at_once)
+        self._together = TogetherEncoder(self._spicd.encoder, precision).to(self._device) if at_once else None
 
     @torch.inference_mode()
     def _descriptors(self, patches: Sequence[Patch]) -> Tensor:
-        if self._at_once is not None:
+        if self._together is not None:
             clouds, centroids = zip(*map(self._on_device, patches), strict=True)
-            descriptors: Tensor = self._at_once(level(clouds), torch.stack(centroids))
+            descriptors: Tensor = self._together(level(clouds), torch.stack(centroids))
             return descriptors
         return torch.stack([self._encoder(*self._on_device(patch)) for patch in patches])
 
