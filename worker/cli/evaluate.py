@@ -17,6 +17,8 @@ from worker.cli.command_line import command_line
 from worker.cli.options import DEFAULT_MODEL, PAPER_MODEL, AsJson, Model, ModelStore
 from worker.detectors.card import MODEL_STORE
 
+PAGE = Path("docs/comparison.md")  #: of a checkout
+
 
 def bench(
     out: Annotated[Path, typer.Option(help="Where the figures are saved.")] = Path("bench/bench.json"),
@@ -154,7 +156,12 @@ def placement(
 
 def paper(
     context: typer.Context,
-    model: Model = PAPER_MODEL,
+    model: Annotated[
+        list[str] | None,
+        typer.Option(
+            envvar="SPICD_MODEL", help=f"name/version; may be given again. Left out: {PAPER_MODEL}."
+        ),
+    ] = None,
     model_store: ModelStore = MODEL_STORE,
     weights: Annotated[
         Path | None, typer.Option(help="Checkpoint of training to measure, under the model's card.")
@@ -178,29 +185,38 @@ def paper(
             "--quick", help="Three experiments on a short corridor: whether it runs, no figures to cite."
         ),
     ] = False,
-    out: Annotated[Path | None, typer.Option(help="Folder for report.html, paper.json and pictures.")] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder for report.html, paper.json and pictures; of several models a folder each."
+        ),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Repeat the fourteen experiments of the paper on a simulated corridor, its figures beside ours."""
-    from worker.benchmarks.paper.benchmark import QUICK, PaperSettings, evaluate  # noqa: PLC0415
+    from worker.benchmarks.paper.benchmark import QUICK, PaperSettings, evaluate_each  # noqa: PLC0415
     from worker.benchmarks.paper.report import document, tables, write_report  # noqa: PLC0415
     from worker.benchmarks.paper.site import QUICK_SITE, SiteSettings  # noqa: PLC0415
 
     settings = PaperSettings(
         site=replace(QUICK_SITE if quick else SiteSettings(), seed=seed, true_poses=true_poses),
         validation_seed=validation_seed,
-        model=model,
         model_store=model_store,
         weights=weights,
         everywhere=everywhere,
         robustness=robustness,
         only=QUICK if quick else None,
     )
+    models = tuple(model or (PAPER_MODEL,))
+    if len(models) > 1 and (weights is not None or as_json):
+        raise ValueError("--weights and --json are for one model; leave out the others")
     with terminal.progress_bar() as progress:
-        measured = evaluate(settings, progress)
-        result = {"command": command_line(context), **document(measured)}
-        notes = [] if out is None else [f"report: {write_report(measured, result, out)}"]
-    terminal.show(result, tables, *notes, as_json=as_json)
+        for measured in evaluate_each(settings, models, progress):
+            result = {"command": command_line(context), **document(measured)}
+            name = measured.settings.model.replace("/", "-")
+            folder = out if out is None or len(models) == 1 else out / name
+            notes = [] if folder is None else [f"report: {write_report(measured, result, folder)}"]
+            terminal.show(result, tables, *notes, as_json=as_json)
 
 
 def revisit(
@@ -270,6 +286,7 @@ def revisit(
 
 
 def real(
+    context: typer.Context,
     folder: Annotated[Path, typer.Argument(help="Real scans: see docs/test-data.md.")],
     model: Annotated[
         list[str] | None, typer.Option(help="name/version; may be given again. Left out: all that there are.")
@@ -309,24 +326,60 @@ def real(
         registered=registered,
     )
     with terminal.progress_bar() as progress:
-        result = evaluate(settings, progress)
+        result = {"command": command_line(context), **evaluate(settings, progress)}
     terminal.show(result, tables, f"saved in {write_report(result, out)}", as_json=as_json)
+
+
+def speed(
+    context: typer.Context,
+    out: Annotated[Path, typer.Option(help="Where the figures are saved.")] = Path("bench/speed.json"),
+    repeats: Annotated[int, typer.Option(min=1, help="Of each way of scoring.")] = 3,
+    scans: Annotated[int, typer.Option(min=2, help="Of the simulated corridor's map.")] = 25,
+    model_store: ModelStore = MODEL_STORE,
+) -> None:
+    """Time all models of the store and the baselines in one run, on 172 tiles of a simulated corridor."""
+    from worker.benchmarks.detector_speed import SpeedSettings, measure, tables  # noqa: PLC0415
+    from worker.benchmarks.documents import write_json  # noqa: PLC0415
+
+    settings = SpeedSettings(scans=scans, repeats=repeats, model_store=model_store)
+    with terminal.progress_bar() as progress:
+        result = {"command": command_line(context), **measure(settings, progress)}
+    write_json(out, result)
+    terminal.show(result, tables, f"saved in {out}")
 
 
 def record(
     paper: Annotated[Path | None, typer.Option(help="paper.json of `evaluate paper`.")] = None,
     revisit: Annotated[Path | None, typer.Option(help="revisit.json of `evaluate revisit`.")] = None,
+    real: Annotated[Path | None, typer.Option(help="real.json of `evaluate real`.")] = None,
+    speed: Annotated[Path | None, typer.Option(help="speed.json of `evaluate speed`.")] = None,
     model: Model = DEFAULT_MODEL,
     model_store: ModelStore = MODEL_STORE,
 ) -> None:
     """Put the figures of the benchmarks on a model's card; refused where they were measured with other weights."""
     from worker.benchmarks.card_figures import record_figures  # noqa: PLC0415
 
-    files = {name: path for name, path in (("paper", paper), ("revisit", revisit)) if path is not None}
+    given = {"paper": paper, "revisit": revisit, "real": real, "speed": speed}
+    files = {name: path for name, path in given.items() if path is not None}
     if not files:
-        raise ValueError("nothing to record: give --paper, --revisit, or both")
+        raise ValueError("nothing to record: give --paper, --revisit, --real or --speed")
     path = record_figures(model_store, model, files)
     terminal.output().print(f"{path}: {', '.join(files)}", highlight=False)
+
+
+def table(
+    page: Annotated[Path, typer.Option(help="The document whose table is written anew.")] = PAGE,
+    model_store: ModelStore = MODEL_STORE,
+    check: Annotated[
+        bool,
+        typer.Option("--check", help="Write nothing; fail where the document is not what the cards say."),
+    ] = False,
+) -> None:
+    """Set all detectors side by side, from what their cards say: the table of docs/comparison.md."""
+    from worker.benchmarks.table import write_table  # noqa: PLC0415
+
+    changed = write_table(page, model_store, check=check)
+    terminal.output().print(f"{page}: {'written' if changed else 'up to date'}", highlight=False)
 
 
 def _numbers(words: str) -> tuple[int, ...]:

@@ -47,7 +47,9 @@ def _commands() -> typer.Typer:
         evaluate.paper,
         evaluate.revisit,
         evaluate.real,
+        evaluate.speed,
         evaluate.record,
+        evaluate.table,
     ):
         measuring.command()(command)
     commands.add_typer(measuring, name="evaluate")
