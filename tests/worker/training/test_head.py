@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from worker.detectors.spicd_net.chamfer import chamfer_statistics
+from worker.detectors.siamese.chamfer import chamfer_statistics
 from worker.detectors.spicd_net.network import SpicdNetwork
 from worker.training.dataset import save_tiles, split_tiles
 from worker.training.head import train_head

@@ -9,7 +9,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from worker.detectors.spicd_net.network import PairHead
+from worker.detectors.siamese.head import PairHead
 from worker.errors import Cancelled
 from worker.training.dataset import save_tiles
 from worker.training.log import LOG

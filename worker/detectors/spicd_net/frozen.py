@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from worker.detectors.spicd_net.layers import NormedLinear
+from worker.detectors.siamese.layers import NormedLinear
 from worker.detectors.spicd_net.network import PointEncoder, TransformNet
 
 Layer = tuple[Tensor, Tensor]  #: weight (outputs, inputs), bias (outputs,)

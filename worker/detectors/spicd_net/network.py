@@ -16,13 +16,11 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from worker.detectors.spicd_net.chamfer import STATISTICS, chamfer_statistics
-from worker.detectors.spicd_net.layers import NormedLinear, PooledLinear
+from worker.detectors.siamese.chamfer import chamfer_statistics
+from worker.detectors.siamese.head import PairHead
+from worker.detectors.siamese.layers import NormedLinear, PooledLinear
 
 DESCRIPTOR = 1024
-CHAMFER_FEATURES = 32
-CHAMFER_GATING = 0.2
-CLASSES = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,67 +80,13 @@ class PointEncoder(nn.Module):
         return self.mlp4(features, sizes), a3, a64
 
 
-class PairHead(nn.Module):
-    """Two descriptors and the Chamfer statistics to three logits (paper, Sections 3.6.2 to 3.6.4)."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.chamfer = nn.Sequential(
-            nn.Linear(STATISTICS, 64), nn.ReLU(), nn.Linear(64, CHAMFER_FEATURES), nn.ReLU()
-        )
-        self.classifier = nn.Sequential(
-            nn.Linear(2 * DESCRIPTOR + CHAMFER_FEATURES, 256),
-            nn.ReLU(),
-            nn.Dropout(0.5),
-            nn.Linear(256, 128),
-            nn.ReLU(),
-            nn.Dropout(0.5),
-            nn.Linear(128, CLASSES),
-        )
-
-    def forward(self, reference: Tensor, current: Tensor, statistics: Tensor) -> Tensor:
-        """(B, 1024), (B, 1024), (B, 8) -> (B, 3) logits"""
-        geometry = self.chamfer(statistics)
-        if self.training:
-            geometry = geometry * (torch.rand(len(geometry), 1, device=geometry.device) >= CHAMFER_GATING)
-        logits: Tensor = self.classifier(fused(reference, current, geometry))
-        return logits
-
-    @torch.no_grad()
-    def initialize_from_data(self, reference: Tensor, current: Tensor, statistics: Tensor) -> None:
-        """Initialise from data: both first layers begin as if their inputs were standardised.
-
-        The statistics differ by centimetres and the products are some ten, so that at first the head would
-        hear of nothing but the products. Same arguments as `forward`.
-        """
-        _standardise(self.chamfer[0], statistics, blocks=(STATISTICS,))
-        inputs = fused(reference, current, self.chamfer(statistics))
-        _standardise(self.classifier[0], inputs, blocks=(DESCRIPTOR, DESCRIPTOR, CHAMFER_FEATURES))
-
-
-def fused(reference: Tensor, current: Tensor, geometry: Tensor) -> Tensor:
-    """(B, 1024), (B, 1024), (B, 32) -> (B, 2080)"""
-    return torch.cat([(reference - current).abs(), reference * current, geometry], dim=1)
-
-
-def _standardise(layer: nn.Module, inputs: Tensor, *, blocks: tuple[int, ...]) -> None:
-    """Scale and shift a Linear for its inputs (n, C), each block of columns giving the outputs equal variance."""
-    if not isinstance(layer, nn.Linear):
-        raise TypeError(f"a linear layer is initialised from data, not {type(layer).__name__}")
-    std = inputs.std(dim=0)
-    std = std.clamp_min(0.1 * float(std[std > 0].median()))  # columns that hardly vary are not blown up
-    shares = [torch.full((n,), (inputs.shape[1] / (len(blocks) * n)) ** 0.5) for n in blocks]
-    layer.weight.mul_(torch.cat(shares).to(std.device) / std)
-    layer.bias.sub_(layer.weight @ inputs.mean(dim=0))
-
-
 class SpicdNetwork(nn.Module):
     """Shared encoder, fusion and head."""
 
     def __init__(self) -> None:
         super().__init__()
         self.encoder = PointEncoder()
-        self.head = PairHead()
+        self.head = PairHead(DESCRIPTOR)
 
     def forward(
         self, points: Tensor, sizes: list[int], chamfer_points: Tensor, chamfer_sizes: list[int]

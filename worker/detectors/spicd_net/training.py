@@ -1,51 +1,41 @@
-"""How SPICD-Net is trained: its batches, its loss, its head's first weights (paper, Sections 3.6 and 3.7)."""
+"""How SPICD-Net is trained: its batches, and what its T-Nets add to the loss (paper, Sections 3.6 and 3.7)."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from worker.cloud.patches import patch
+from worker.cloud.patches import Patch
 from worker.cloud.types import Points
-from worker.detectors.spicd_net.chamfer import STATISTICS, chamfer_statistics
+from worker.detectors.siamese import training as siamese
+from worker.detectors.siamese.head import PairHead
+from worker.detectors.siamese.layers import PooledLinear
+from worker.detectors.siamese.training import SiameseTraining, both_sides, device_of, focal_loss, labels_of
 from worker.detectors.spicd_net.frozen import FrozenEncoder
-from worker.detectors.spicd_net.layers import PooledLinear
-from worker.detectors.spicd_net.network import DESCRIPTOR, PairHead, PairOutput, SpicdNetwork
-from worker.detectors.trainable import DIFFERENT, Pair
-from worker.progress import Progress
+from worker.detectors.spicd_net.network import PairOutput, SpicdNetwork
+from worker.detectors.trainable import Pair
 
-CLOUDS_PER_REPORT = 32
-ALPHA = (0.25, 0.35, 0.40)  #: against the classes' shares of 50, 35 and 15%
-GAMMA = 2.0
 ORTHOGONALITY = 0.001
 
 
-@dataclass(frozen=True, slots=True)
-class Batch:
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Batch(siamese.Batch):
     """B examples as the network takes them."""
 
     points: Points  #: (P, 3) float32: 2 B clouds end to end, references first, each with its centroid at 0
     sizes: list[int]  #: of the clouds
-    chamfer_points: Points  #: (Q, 3) in the same order, tile-centre frame: what the Chamfer branch compares
-    chamfer_sizes: list[int]
-    labels: NDArray[np.int64]  #: (B,)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class SpicdNetTraining:
-    """TrainableNetwork (worker.detectors.trainable); the fields are those of SpicdNetSettings."""
+class SpicdNetTraining(SiameseTraining[Batch]):
+    """TrainableNetwork (worker.detectors.trainable)."""
 
     title: ClassVar[str] = "SPICD-Net"
-
-    patch_points: int
-    chamfer_points: int | None
-    seed: int
 
     def build(self, *, coarse_search: bool = False) -> SpicdNetwork:
         """Return the network before training; a coarse search is that of PooledLinear."""
@@ -57,95 +47,45 @@ class SpicdNetTraining:
 
     def collate(self, pairs: Sequence[Pair], rng: np.random.Generator) -> Batch:
         """Put references before currents, every cloud about its centroid."""
-        clouds = [pair.reference for pair in pairs] + [pair.current for pair in pairs]
-        compared = [self._compared(cloud, rng) for cloud in clouds]
+        clouds = both_sides(pairs)
+        samples = self._samples(clouds, rng)
         return Batch(
-            np.concatenate([cloud - cloud.mean(axis=0) for cloud in clouds]),
-            [len(cloud) for cloud in clouds],
-            np.concatenate(compared),
-            [len(cloud) for cloud in compared],
-            np.array([pair.label for pair in pairs], dtype=np.int64),
+            points=np.concatenate([cloud - cloud.mean(axis=0) for cloud in clouds]),
+            sizes=[len(cloud) for cloud in clouds],
+            chamfer_points=np.concatenate(samples),
+            chamfer_sizes=[len(sample) for sample in samples],
+            labels=labels_of(pairs),
         )
 
     def answer(self, module: nn.Module, batch: Batch) -> tuple[Tensor, Tensor]:
         """Return logits (B, 3), and focal loss with the T-Nets' orthogonality."""
-        device = _device(module)
-        points, compared, labels = (
-            torch.from_numpy(array).to(device) for array in (batch.points, batch.chamfer_points, batch.labels)
+        points, samples, labels = (
+            torch.from_numpy(array).to(device_of(module))
+            for array in (batch.points, batch.chamfer_points, batch.labels)
         )
-        output: PairOutput = module(points, batch.sizes, compared, batch.chamfer_sizes)
+        output: PairOutput = module(points, batch.sizes, samples, batch.chamfer_sizes)
         return output.logits, total_loss(output.logits, labels, output.transforms)
 
-    def class_loss(self, logits: Tensor, labels: Tensor) -> Tensor:
-        """Return the focal loss of logits (n, 3)."""
-        return focal_loss(logits, labels)
-
-    def start_from(self, module: nn.Module, weights: Mapping[str, Tensor], *, fresh_head: bool) -> None:
-        """Take over all weights, or with `fresh_head` those of the encoder."""
-        if not fresh_head:
-            module.load_state_dict(weights)
-            return
-        inner = "encoder."
-        _network(module).encoder.load_state_dict(
-            {name.removeprefix(inner): value for name, value in weights.items() if name.startswith(inner)}
-        )
-
-    @torch.no_grad()
-    def initialize_from_data(self, module: nn.Module, batches: Iterable[Batch]) -> None:
-        """Initialise the head by pairs of one place, whose distances are the fine ones."""
-        network, device = _network(module), _device(module)
-        sides, statistics = [], []
-        for batch in batches:
-            points, compared = (
-                torch.from_numpy(array).to(device) for array in (batch.points, batch.chamfer_points)
-            )
-            same_place = torch.from_numpy(batch.labels) != DIFFERENT
-            sides.append([side[same_place] for side in network.encoder(points, batch.sizes)[0].chunk(2)])
-            clouds = torch.split(compared, batch.chamfer_sizes)
-            half = len(clouds) // 2
-            statistics.append(chamfer_statistics(clouds[:half], clouds[half:])[same_place])
-        reference, current = (torch.cat(side) for side in zip(*sides, strict=True))
-        network.head.initialize_from_data(reference, current, torch.cat(statistics))
+    def descriptors(self, module: nn.Module, batch: Batch) -> Tensor:
+        """Encode the clouds of a batch as a training step does: (2 B, 1024)."""
+        points = torch.from_numpy(batch.points).to(device_of(module))
+        descriptors: Tensor = _network(module).encoder(points, batch.sizes)[0]
+        return descriptors
 
     def head(self, module: nn.Module) -> PairHead:
         """Return the head of a network that `build` made."""
         return _network(module).head
 
-    def encode(
-        self, module: nn.Module, clouds: Sequence[Points], progress: Progress
-    ) -> tuple[Tensor, list[Tensor]]:
-        """Return descriptors (n, 1024), and of each cloud what the Chamfer branch sees, as in use."""
-        device, frozen = _device(module), FrozenEncoder(_network(module).encoder)
-        descriptors, compared = torch.empty(len(clouds), DESCRIPTOR), []
-        for row, points in enumerate(clouds):
-            if row % CLOUDS_PER_REPORT == 0:
-                progress("encode", row / len(clouds))
-            prepared = patch(points, size=self.patch_points, seed=self.seed)
-            distinct, centroid = (
-                torch.from_numpy(part).to(device) for part in (prepared.distinct, prepared.centroid)
+    def encoder(self, module: nn.Module) -> siamese.Encoder:
+        """Return the frozen encoder, which takes a patch's distinct points and its centroid."""
+        device, frozen = device_of(module), FrozenEncoder(_network(module).encoder)
+
+        def encode(prepared: Patch) -> Tensor:
+            return frozen(
+                *(torch.from_numpy(part).to(device) for part in (prepared.distinct, prepared.centroid))
             )
-            descriptors[row] = frozen(distinct, centroid).cpu()
-            sample = self._compared(prepared.distinct, np.random.default_rng((self.seed, 5, row)))
-            compared.append(torch.from_numpy(sample))
-        return descriptors, compared
 
-    def compare(self, references: Sequence[Tensor], currents: Sequence[Tensor]) -> NDArray[np.float32]:
-        """Return the Chamfer statistics (n, 8)."""
-        if not references:
-            return np.zeros((0, STATISTICS), np.float32)
-        statistics: NDArray[np.float32] = chamfer_statistics(references, currents).numpy()
-        return statistics
-
-    def swapped(self, statistics: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Exchange the four of one direction for those of the other, (n, 8) -> (n, 8)."""
-        return np.roll(statistics, STATISTICS // 2, axis=1)
-
-    def _compared(self, distinct: Points, rng: np.random.Generator) -> Points:
-        """Return all points, or a new draw without replacement from the padded patch (paper, Section 3.6.3)."""
-        if self.chamfer_points is None:
-            return distinct
-        places = rng.choice(self.patch_points, self.chamfer_points, replace=False)
-        return distinct[places % len(distinct)]
+        return encode
 
 
 def _network(module: nn.Module) -> SpicdNetwork:
@@ -154,20 +94,9 @@ def _network(module: nn.Module) -> SpicdNetwork:
     return module
 
 
-def _device(module: nn.Module) -> torch.device:
-    return next(module.parameters()).device
-
-
 def total_loss(logits: Tensor, labels: Tensor, transforms: tuple[Tensor, ...]) -> Tensor:
     """Return focal loss and the T-Nets' orthogonality, L = L_focal + 0.001 L_ortho."""
     return focal_loss(logits, labels) + ORTHOGONALITY * orthogonality(transforms)
-
-
-def focal_loss(logits: Tensor, labels: Tensor) -> Tensor:
-    """Return mean of -alpha_c (1 - p_c)^2 log p_c over (B, 3) logits, c the true class of each of (B,) labels."""
-    log_p = logits.float().log_softmax(dim=1).gather(1, labels[:, None])[:, 0]  # (B,)
-    alpha = torch.tensor(ALPHA, device=logits.device)[labels]
-    return -(alpha * (1 - log_p.exp()) ** GAMMA * log_p).mean()
 
 
 def orthogonality(transforms: tuple[Tensor, ...]) -> Tensor:

@@ -11,7 +11,7 @@ from worker.cloud.tiling import TilePairs
 from worker.cloud.types import Arrays
 from worker.detectors.card import Card
 from worker.detectors.comparison import Comparison
-from worker.detectors.spicd_net.chamfer import chamfer_statistics
+from worker.detectors.siamese.chamfer import chamfer_statistics
 from worker.detectors.spicd_net.detector import SpicdNet
 from worker.errors import Cancelled
 from worker.progress import Progress, no_progress
@@ -77,7 +77,7 @@ def test_a_survey_that_finds_the_same_points_differs_by_nothing_but_the_sample(
         return seen[0]
 
     monkeypatch.setattr(
-        "worker.detectors.spicd_net.detector.chamfer_statistics",
+        "worker.detectors.siamese.detector.chamfer_statistics",
         noted,
     )
     detector.detect(compared(same))

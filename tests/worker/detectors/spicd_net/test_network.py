@@ -8,10 +8,11 @@ import pytest
 import torch
 from torch import nn
 
-from worker.detectors.spicd_net.chamfer import chamfer_statistics, nearest_distances
+from worker.detectors.siamese.chamfer import chamfer_statistics, nearest_distances
+from worker.detectors.siamese.head import PairHead, fused
+from worker.detectors.siamese.layers import Moments, NormedLinear, PooledLinear
 from worker.detectors.spicd_net.frozen import FrozenEncoder
-from worker.detectors.spicd_net.layers import Moments, NormedLinear, PooledLinear
-from worker.detectors.spicd_net.network import PairHead, SpicdNetwork, TransformNet, fused
+from worker.detectors.spicd_net.network import SpicdNetwork, TransformNet
 
 SIZES = [40, 25, 60]
 
@@ -153,7 +154,7 @@ def test_the_tree_finds_the_distances_of_all_pairs(monkeypatch):
 
 
 def test_the_chamfer_feature_is_gated_in_training_only():
-    head = PairHead()
+    head = PairHead(1024)
     for layer in head.classifier:
         if isinstance(layer, nn.Dropout):
             layer.p = 0.0
@@ -168,7 +169,7 @@ def test_the_chamfer_feature_is_gated_in_training_only():
 
 def test_a_head_initialised_from_data_hears_every_block_of_its_input_alike():
     torch.manual_seed(0)
-    head = PairHead().eval()
+    head = PairHead(1024).eval()
     base = 5 * torch.randn(600, 1024)
     reference, current = base, base + 0.1 * torch.randn(600, 1024)
     statistics = 0.1 + 0.02 * torch.rand(600, 8)

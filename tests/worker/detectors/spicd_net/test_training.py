@@ -7,7 +7,8 @@ import math
 import pytest
 import torch
 
-from worker.detectors.spicd_net.training import focal_loss, orthogonality, total_loss
+from worker.detectors.siamese.training import focal_loss
+from worker.detectors.spicd_net.training import orthogonality, total_loss
 
 
 def test_focal_loss_of_even_logits_by_hand():
