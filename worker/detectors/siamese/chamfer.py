@@ -7,6 +7,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from worker.detectors.siamese.parallel import in_groups
+
 STATISTICS = 8
 
 
@@ -17,11 +19,17 @@ def chamfer_statistics(references: Sequence[Tensor], currents: Sequence[Tensor])
     B clouds (n, 3) and as many (m, 3), metres, tile-centre frame; the result is (B, 8) float32, the four of
     reference to current first. Two equal clouds give zeros to the bit. No gradient passes.
     """
-    rows = [
-        torch.cat([_summary(there), _summary(back)])
-        for there, back in map(nearest_distances, references, currents)
-    ]
-    return torch.log1p(torch.stack(rows))
+    pairs = list(zip(references, currents, strict=True))
+    on_processor = pairs[0][0].device.type == "cpu"
+    parts = in_groups(_statistics, pairs) if on_processor else [_statistics(pairs)]
+    return torch.log1p(torch.cat(parts))
+
+
+@torch.no_grad()
+def _statistics(pairs: Sequence[tuple[Tensor, Tensor]]) -> Tensor:
+    """B pairs of clouds -> (B, 8)"""
+    ways = (nearest_distances(reference, current) for reference, current in pairs)
+    return torch.stack([torch.cat([_summary(there), _summary(back)]) for there, back in ways])
 
 
 def nearest_distances(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:

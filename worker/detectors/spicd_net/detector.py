@@ -22,7 +22,7 @@ class SpicdNet(SiameseDetector):
     def __init__(self, card: Card, network: SpicdNetwork, device: torch.device) -> None:
         super().__init__(card, network, network.head, device)
         self._spicd = network
-        self._encoder = FrozenEncoder(network.encoder)
+        self._encoder: FrozenEncoder  #: on a processor; in place of bfloat16 it searches in 8 bits
         self._at_once: TogetherEncoder | None = None  #: on a GPU, which encodes a batch as one
         self._use_precision("float32")
 
@@ -35,7 +35,9 @@ class SpicdNet(SiameseDetector):
 
     def _use_precision(self, precision: Precision) -> None:
         super()._use_precision(precision)
-        if self._device.type != "cpu":
+        if self._device.type == "cpu":
+            self._encoder = FrozenEncoder(self._spicd.encoder, searched=precision == "bfloat16")
+        else:
             self._encode_at_once(precision)
 
     def _encode_at_once(self, precision: Precision) -> None:
@@ -43,11 +45,11 @@ class SpicdNet(SiameseDetector):
 
     @torch.inference_mode()
     def _descriptors(self, patches: Sequence[Patch]) -> Tensor:
-        if self._at_once is not None:
-            clouds, centroids = zip(*map(self._on_device, patches), strict=True)
-            descriptors: Tensor = self._at_once(level(clouds), torch.stack(centroids))
-            return descriptors
-        return torch.stack([self._encoder(*self._on_device(patch)) for patch in patches])
+        clouds, centroids = zip(*map(self._on_device, patches), strict=True)
+        if self._at_once is None:
+            return self._encoder.encode(clouds, centroids)
+        descriptors: Tensor = self._at_once(level(clouds), torch.stack(centroids))
+        return descriptors
 
     def _on_device(self, patch: Patch) -> tuple[Tensor, Tensor]:
         distinct, centroid = (

@@ -118,6 +118,29 @@ def test_the_frozen_encoder_on_distinct_points_is_the_network_on_repeated_ones(n
     assert expected.std() > 0.01  # the network tells channels apart, so that the line above says something
 
 
+@pytest.mark.parametrize("searched", [False, True])
+def test_the_frozen_encoder_encodes_each_of_several_clouds_as_it_does_alone(network, searched):
+    clouds = [torch.rand(points, 3) - 0.5 for points in (700, 30, 256, 1)]
+    encoder = FrozenEncoder(network.encoder, searched=searched)
+    centroids = [cloud.mean(0) for cloud in clouds]
+    alone = torch.stack([encoder(*pair) for pair in zip(clouds, centroids, strict=True)])
+    assert torch.allclose(encoder.encode(clouds, centroids), alone, atol=1e-5)
+
+
+def test_a_searched_encoder_is_all_but_the_exact_one(network):
+    clouds = [torch.rand(700, 3) - 0.5 for _ in range(4)]
+    centroids = [cloud.mean(0) for cloud in clouds]
+    exact, searched = (FrozenEncoder(network.encoder, searched=way) for way in (False, True))
+    off = (searched.encode(clouds, centroids) - exact.encode(clouds, centroids)).abs()
+    assert 0 < off.max() < 0.02
+    assert off.mean() < 1e-3
+
+
+def test_a_cloud_without_points_is_refused(network):
+    with pytest.raises(ValueError, match="at least one point"):
+        FrozenEncoder(network.encoder)(torch.empty(0, 3), torch.zeros(3))
+
+
 def test_chamfer_statistics_of_a_shifted_copy_are_the_shift():
     grid = torch.stack(torch.meshgrid(*[torch.arange(5.0)] * 3, indexing="ij"), -1).reshape(125, 3)
     shifted = grid + torch.tensor([0.0, 0.0, 0.3])
