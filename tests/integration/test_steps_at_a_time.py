@@ -24,9 +24,9 @@ def bench(tmp_path: Path) -> Iterator[Bench]:
 
 def started(bench: Bench, grace: float = 5) -> subprocess.Popen[bytes]:
     """Start a worker, and wait for its first sign of life: on a busy machine that takes longer than any step."""
-    answering = len(bench.queue.snapshot()["inference"].answering)
+    before = set(bench.queue.snapshot()["inference"].answering)
     worker = bench.worker("inference", grace=grace)
-    until(lambda: len(bench.queue.snapshot()["inference"].answering) > answering, 180)
+    until(lambda: set(bench.queue.snapshot()["inference"].answering) - before, 180)
     return worker
 
 

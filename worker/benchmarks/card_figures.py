@@ -32,7 +32,7 @@ OBJECTS = (
 #: Of the things that were put into real scans.
 REAL = ("pairs", "things", "found", "recall", "objects", "precision", "false_objects_a_pair")
 #: Of the time that a map's tiles take.
-SPEED = ("tiles", "seconds", "processor_seconds", "times_c2c", "times_c2c_of_processor")
+SPEED = ("precision", "tiles", "seconds", "processor_seconds", "times_c2c", "times_c2c_of_processor")
 
 
 def record_figures(model_store: Path, model: str, files: Mapping[str, Path]) -> Path:

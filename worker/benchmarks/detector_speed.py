@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Literal
 
 import numpy as np
 import torch
@@ -20,7 +21,7 @@ from rich.console import Group
 
 from worker.benchmarks.baselines import installed_baselines
 from worker.benchmarks.documents import Document, spread, titled_table
-from worker.benchmarks.methods import change_scores, encode_reference, open_model, stored_models
+from worker.benchmarks.methods import change_scores, encode_reference, stored_models
 from worker.benchmarks.speed import (
     PAPER_TILES,
     BenchSettings,
@@ -31,12 +32,15 @@ from worker.benchmarks.speed import (
     simulated_visit,
     told_by_voxels,
 )
-from worker.benchmarks.timing import machine, processor_seconds
+from worker.benchmarks.timing import machine, processor_name, processor_seconds
 from worker.benchmarks.trajectory import map_frame, scan_files
 from worker.cloud.tiling import TilePairs
 from worker.detectors.card import MODEL_STORE
 from worker.detectors.comparison import Comparison
 from worker.detectors.detector import Detector
+from worker.detectors.precision import chosen_precision
+from worker.detectors.running.runtime import RunsNetwork, Runtime
+from worker.detectors.store import open_detector, resolve_device
 from worker.errors import DetectorUnavailable
 from worker.pipeline.flow import build_map
 from worker.pipeline.settings import PipelineSettings
@@ -84,7 +88,7 @@ def measure(settings: SpeedSettings, progress: Progress = no_progress) -> Docume
             "points_per_tile": points,
         },
         "machine": machine(
-            processor=_processor(),
+            processor=processor_name(),
             cores_used=torch.get_num_threads(),
             torch=torch.__version__,
             device=torch.cuda.get_device_name() if torch.cuda.is_available() else "cpu",
@@ -112,7 +116,7 @@ def _opened(model_store: Path) -> tuple[list[Detector], list[str]]:
     detectors, left_out = [], []
     for model in stored_models(model_store):
         try:
-            detectors.append(open_model(model_store, model))
+            detectors.append(open_detector(model_store, model, runtime=Runtime(precision="auto")))
         except DetectorUnavailable as closed:
             left_out.append(str(closed))
     return detectors, left_out
@@ -155,6 +159,7 @@ def _row(
         "model": name,
         "sha256": None if card is None else card.sha256,
         "fingerprint": None if card is None else card.fingerprint,
+        "precision": _precision(timed.detector),
         "tiles": timed.tiles,
         "seconds": spread(clock, "median", "least", "most", digits=3),
         "processor_seconds": spread(processor, "median", "least", "most", digits=3),
@@ -163,14 +168,13 @@ def _row(
     }
 
 
-def _processor() -> str:
-    """Return the processor's name where the system tells it."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-    except OSError:
-        return str(machine()["processor"])
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else str(machine()["processor"])
+def _precision(detector: Detector | None) -> str | None:
+    """Return what a network was computed with, as the workers choose it by the card; None without a network."""
+    if not isinstance(detector, RunsNetwork):
+        return None
+    device = resolve_device("auto")
+    kind: Literal["cpu", "cuda"] = "cuda" if device.type == "cuda" else "cpu"
+    return chosen_precision("auto", device, holds=detector.card.holds_in_bfloat16(kind))
 
 
 def tables(figures: Document) -> Group:
@@ -182,7 +186,7 @@ def tables(figures: Document) -> Group:
     )
     rows = (
         (
-            row["model"],
+            row["model"] if row["precision"] in (None, "float32") else f"{row['model']} ({row['precision']})",
             f"{row['tiles']}",
             f"{row['seconds']['median']:.2f}",
             f"{row['seconds']['least']:.2f} to {row['seconds']['most']:.2f}",

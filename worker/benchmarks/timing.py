@@ -6,6 +6,8 @@ import os
 import platform
 import resource
 import time
+from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 from worker.progress import Progress
@@ -41,6 +43,15 @@ def processor_seconds() -> float:
     """Return those of this process and of its ended children: what others do on the machine does not count."""
     usages = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
     return sum(usage.ru_utime + usage.ru_stime for usage in usages)
+
+
+def processor_name() -> str:
+    """Return the processor's name as Linux has it, elsewhere what Python knows."""
+    with suppress(OSError):
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()
 
 
 def machine(**more: Any) -> dict[str, Any]:

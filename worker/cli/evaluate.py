@@ -14,10 +14,8 @@ import typer
 
 from worker.cli import terminal
 from worker.cli.command_line import command_line
-from worker.cli.options import DEFAULT_MODEL, PAPER_MODEL, AsJson, Model, ModelStore
+from worker.cli.options import DEFAULT_MODEL, PAPER_MODEL, AsJson, Device, Model, ModelStore
 from worker.detectors.card import MODEL_STORE
-
-PAGE = Path("docs/comparison.md")  #: of a checkout
 
 
 def bench(
@@ -330,56 +328,73 @@ def real(
     terminal.show(result, tables, f"saved in {write_report(result, out)}", as_json=as_json)
 
 
-def speed(
-    context: typer.Context,
-    out: Annotated[Path, typer.Option(help="Where the figures are saved.")] = Path("bench/speed.json"),
-    repeats: Annotated[int, typer.Option(min=1, help="Of each way of scoring.")] = 3,
-    scans: Annotated[int, typer.Option(min=2, help="Of the simulated corridor's map.")] = 25,
-    model_store: ModelStore = MODEL_STORE,
-) -> None:
-    """Time all models of the store and the baselines in one run, on 172 tiles of a simulated corridor."""
-    from worker.benchmarks.detector_speed import SpeedSettings, measure, tables  # noqa: PLC0415
-    from worker.benchmarks.documents import write_json  # noqa: PLC0415
-
-    settings = SpeedSettings(scans=scans, repeats=repeats, model_store=model_store)
-    with terminal.progress_bar() as progress:
-        result = {"command": command_line(context), **measure(settings, progress)}
-    write_json(out, result)
-    terminal.show(result, tables, f"saved in {out}")
-
-
-def record(
-    paper: Annotated[Path | None, typer.Option(help="paper.json of `evaluate paper`.")] = None,
-    revisit: Annotated[Path | None, typer.Option(help="revisit.json of `evaluate revisit`.")] = None,
-    real: Annotated[Path | None, typer.Option(help="real.json of `evaluate real`.")] = None,
-    speed: Annotated[Path | None, typer.Option(help="speed.json of `evaluate speed`.")] = None,
-    model: Model = DEFAULT_MODEL,
-    model_store: ModelStore = MODEL_STORE,
-) -> None:
-    """Put the figures of the benchmarks on a model's card; refused where they were measured with other weights."""
-    from worker.benchmarks.card_figures import record_figures  # noqa: PLC0415
-
-    given = {"paper": paper, "revisit": revisit, "real": real, "speed": speed}
-    files = {name: path for name, path in given.items() if path is not None}
-    if not files:
-        raise ValueError("nothing to record: give --paper, --revisit, --real or --speed")
-    path = record_figures(model_store, model, files)
-    terminal.output().print(f"{path}: {', '.join(files)}", highlight=False)
-
-
-def table(
-    page: Annotated[Path, typer.Option(help="The document whose table is written anew.")] = PAGE,
-    model_store: ModelStore = MODEL_STORE,
-    check: Annotated[
-        bool,
-        typer.Option("--check", help="Write nothing; fail where the document is not what the cards say."),
+def precision(
+    model: Model = PAPER_MODEL,
+    device: Device = "auto",
+    way: Annotated[
+        Literal["cpu", "cuda"] | None,
+        typer.Option(help="Compute as a processor or as a GPU does, whatever the device; else its own way."),
+    ] = None,
+    offices: Annotated[int, typer.Option(min=1, help="Simulated, each visited twice.")] = 3,
+    scans: Annotated[int, typer.Option(min=2, help="Of each visit.")] = 6,
+    seed: Annotated[int, typer.Option(help="Of the first office.")] = 1,
+    put_on_card: Annotated[
+        bool, typer.Option("--record", help="Put the result on the model's card.")
     ] = False,
+    model_store: ModelStore = MODEL_STORE,
 ) -> None:
-    """Set all detectors side by side, from what their cards say: the table of docs/comparison.md."""
-    from worker.benchmarks.table import write_table  # noqa: PLC0415
+    """Measure how far the scores of a model move where its network computes in bfloat16."""
+    from worker.benchmarks.precision import PrecisionSettings, measure, record, table  # noqa: PLC0415
 
-    changed = write_table(page, model_store, check=check)
-    terminal.output().print(f"{page}: {'written' if changed else 'up to date'}", highlight=False)
+    settings = PrecisionSettings(
+        model=model,
+        model_store=model_store,
+        device=device,
+        way=way,
+        offices=offices,
+        scans=scans,
+        seed=seed,
+    )
+    with terminal.progress_bar() as progress:
+        check = measure(settings, progress)
+    terminal.output().print(table(check, model))
+    if put_on_card:
+        terminal.output().print(f"recorded in {record(settings, check)}", highlight=False)
+
+
+def bench_network(
+    device: Device = "auto",
+    precision: Annotated[
+        Literal["float32", "bfloat16"], typer.Option(help="Of the large products.")
+    ] = "float32",
+    compiled: Annotated[bool, typer.Option("--compile", help="By torch.compile.")] = False,
+    graphs: Annotated[bool, typer.Option("--graphs", help="As a CUDA graph.")] = False,
+    tiles: Annotated[int, typer.Option(min=1, help="Of the map.")] = 172,
+    points: Annotated[int, typer.Option(min=1, help="Of each tile, all distinct.")] = 4096,
+    batch: Annotated[int, typer.Option(min=1, help="Tiles of one product.")] = 64,
+    repeats: Annotated[int, typer.Option(min=1, help="Of each, of which the median counts.")] = 20,
+    out: Annotated[Path, typer.Option(help="Where the figures are saved.")] = Path("bench/network.json"),
+    model_store: ModelStore = MODEL_STORE,
+) -> None:
+    """Measure milliseconds of SPICD-Net's network for a map's tiles beside their floor, best on a GPU."""
+    from worker.benchmarks.documents import write_json  # noqa: PLC0415
+    from worker.benchmarks.network_time import NetworkTimeSettings, measure, table  # noqa: PLC0415
+
+    settings = NetworkTimeSettings(
+        device=device,
+        precision=precision,
+        compiled=compiled,
+        graphs=graphs,
+        tiles=tiles,
+        points=points,
+        batch=batch,
+        repeats=repeats,
+        model_store=model_store,
+    )
+    with terminal.progress_bar() as progress:
+        figures = measure(settings, progress)
+    write_json(out, figures)
+    terminal.show(figures, table, f"saved in {out}")
 
 
 def _numbers(words: str) -> tuple[int, ...]:

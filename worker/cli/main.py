@@ -6,7 +6,7 @@ import sys
 
 import typer
 
-from worker.cli import evaluate, terminal
+from worker.cli import cards, evaluate, terminal
 from worker.cli.demo import demo
 from worker.cli.detect import detect
 from worker.cli.register import register
@@ -38,7 +38,15 @@ def _commands() -> typer.Typer:
         pretty_exceptions_enable=False,
         help="Compares LiDAR scans of a space on this machine, trains the detector, and shows the whole service.",
     )
-    for command in (detect, register, with_training_options(train), train_voxels, demo, evaluate.bench):
+    for command in (
+        detect,
+        register,
+        with_training_options(train),
+        train_voxels,
+        demo,
+        evaluate.bench,
+        evaluate.bench_network,
+    ):
         commands.command()(command)
     measuring = typer.Typer(no_args_is_help=True, help="How good it is, measured where the truth is known.")
     for command in (
@@ -47,9 +55,10 @@ def _commands() -> typer.Typer:
         evaluate.paper,
         evaluate.revisit,
         evaluate.real,
-        evaluate.speed,
-        evaluate.record,
-        evaluate.table,
+        evaluate.precision,
+        cards.speed,
+        cards.record,
+        cards.table,
     ):
         measuring.command()(command)
     commands.add_typer(measuring, name="evaluate")

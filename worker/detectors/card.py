@@ -81,9 +81,9 @@ class Card(StrictModel):
         default_factory=dict, description="the detector's own; it validates them when it is loaded"
     )
     quiet: QuietRecord | None = Field(default=None, description="of models that score voxels")
-    precision: PrecisionCheck | None = Field(
-        default=None,
-        description="what `spicd-worker evaluate precision` measured; None: bfloat16 only where asked for",
+    precision: dict[str, PrecisionCheck] = Field(
+        default_factory=dict,
+        description="what `spicd-worker evaluate precision` measured, by `cpu` and `cuda`, which compute differently",
     )
     weights: str | None = Field(default=None, description="file beside the card")
     sha256: str | None = Field(default=None, description="of the weights file")
@@ -119,10 +119,10 @@ class Card(StrictModel):
             return self.sha256
         return hashlib.sha256(json.dumps(self.detector_settings, sort_keys=True).encode()).hexdigest()
 
-    @property
-    def holds_in_bfloat16(self) -> bool:
-        """Whether these very weights were measured in bfloat16, and their scores hold."""
-        return self.precision is not None and self.precision.holds and self.precision.sha256 == self.sha256
+    def holds_in_bfloat16(self, kind: str) -> bool:
+        """Tell whether these very weights were measured in bfloat16 as a `cpu` or `cuda` computes, and scores hold."""
+        check = self.precision.get(kind)
+        return check is not None and check.holds and check.sha256 == self.sha256
 
     def settings_as(self, kind: type[S]) -> S:
         """Read the detector's own settings. Raises ValueError, which names each unsound field."""

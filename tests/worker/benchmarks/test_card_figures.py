@@ -118,6 +118,7 @@ def speed_told(device: str = "cpu") -> dict[str, Any]:
 
     def method(name: str, fingerprint: str | None) -> dict[str, Any]:
         known = {"model": name, "sha256": fingerprint, "fingerprint": fingerprint, "tiles": 172}
+        known["precision"] = None
         seconds = {"median": 2.0, "least": 1.0, "most": 3.0}
         ratios = {"times_c2c": 4.0, "times_c2c_of_processor": 5.0}
         return {**known, "seconds": seconds, "processor_seconds": seconds, **ratios}

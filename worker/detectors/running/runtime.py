@@ -15,6 +15,7 @@ class Runtime:
 
     batches: Batches = field(default_factory=DirectBatches)
     precision: PrecisionChoice = "float32"
+    at_once: bool | None = None  #: whether a batch is computed as one, as a GPU does best; None: on a GPU
 
 
 @runtime_checkable

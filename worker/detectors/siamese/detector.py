@@ -82,12 +82,13 @@ class SiameseDetector(ABC):
     def run_with(self, runtime: Runtime) -> None:
         """Run the network so from now on (worker.detectors.running.runtime)."""
         self._batches = runtime.batches
-        holds = self.card.holds_in_bfloat16
-        self._use_precision(chosen_precision(runtime.precision, self._device, holds=holds))
+        at_once = self._device.type == "cuda" if runtime.at_once is None else runtime.at_once
+        holds = self.card.holds_in_bfloat16("cuda" if at_once else "cpu")
+        self._encode_with(chosen_precision(runtime.precision, self._device, holds=holds), at_once=at_once)
 
-    def _use_precision(self, precision: Precision) -> None:
-        """Compute descriptors in this precision from now on."""
-        self._precision = precision
+    def _encode_with(self, precision: Precision, *, at_once: bool) -> None:
+        """Encode in this precision from now on; `at_once`: a batch as one, as a GPU does best."""
+        self._precision, self._at_once = precision, at_once
 
     @abstractmethod
     def _descriptors(self, patches: Sequence[Patch]) -> Tensor:

@@ -22,9 +22,7 @@ class SpicdNet(SiameseDetector):
     def __init__(self, card: Card, network: SpicdNetwork, device: torch.device) -> None:
         super().__init__(card, network, network.head, device)
         self._spicd = network
-        self._encoder: FrozenEncoder  #: on a processor; in place of bfloat16 it searches in 8 bits
-        self._at_once: TogetherEncoder | None = None  #: on a GPU, which encodes a batch as one
-        self._use_precision("float32")
+        self._encode_with("float32", at_once=device.type == "cuda")
 
     @classmethod
     def load(cls, card: Card, weights: dict[str, Tensor], device: torch.device) -> SpicdNet:
@@ -33,22 +31,19 @@ class SpicdNet(SiameseDetector):
         network.load_state_dict(weights)
         return cls(card, network, device)
 
-    def _use_precision(self, precision: Precision) -> None:
-        super()._use_precision(precision)
-        if self._device.type == "cpu":
-            self._encoder = FrozenEncoder(self._spicd.encoder, searched=precision == "bfloat16")
-        else:
-            self._encode_at_once(precision)
-
-    def _encode_at_once(self, precision: Precision) -> None:
-        self._at_once = TogetherEncoder(self._spicd.encoder, precision).to(self._device)
+    def _encode_with(self, precision: Precision, *, at_once: bool) -> None:
+        """Take the encoder of a processor, which in place of bfloat16 searches in 8 bits, or that of a GPU."""
+        super()._encode_with(precision, at_once=at_once)
+        searched = precision == "bfloat16" and self._device.type == "cpu"
+        self._encoder = FrozenEncoder(self._spicd.encoder, searched=searched)
+        self._together = TogetherEncoder(self._spicd.encoder, precision).to(self._device) if at_once else None
 
     @torch.inference_mode()
     def _descriptors(self, patches: Sequence[Patch]) -> Tensor:
         clouds, centroids = zip(*map(self._on_device, patches), strict=True)
-        if self._at_once is None:
+        if self._together is None:
             return self._encoder.encode(clouds, centroids)
-        descriptors: Tensor = self._at_once(level(clouds), torch.stack(centroids))
+        descriptors: Tensor = self._together(level(clouds), torch.stack(centroids))
         return descriptors
 
     def _on_device(self, patch: Patch) -> tuple[Tensor, Tensor]:

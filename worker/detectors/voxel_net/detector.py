@@ -59,7 +59,7 @@ class VoxelNet(Scorer):
     def run_with(self, runtime: Runtime) -> None:
         """Run the networks so from now on (worker.detectors.running.runtime)."""
         self._batches = runtime.batches
-        holds = self.card.holds_in_bfloat16
+        holds = self.card.holds_in_bfloat16(self._device.type)
         self._precision = chosen_precision(runtime.precision, self._device, holds=holds)
 
     def _call(self, name: str) -> NetworkCall[Looked, NDArray[np.float32]]:

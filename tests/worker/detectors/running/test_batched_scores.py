@@ -29,12 +29,14 @@ SURVEYS = 3
 
 
 @contextmanager
-def shared(meter: Meter, most: int) -> Iterator[Callable[[Detector, list[Comparison]], list[Detection]]]:
+def shared(
+    meter: Meter, most: int, *, at_once: bool = False
+) -> Iterator[Callable[[Detector, list[Comparison]], list[Detection]]]:
     """Detects in a thread each, in batches that are certain to have tiles of all: they wait for each other for ever."""
     batches = SharedBatches(FittedRuns(most, meter), wait_s=3600)
 
     def detect(detector: Detector, comparisons: list[Comparison]) -> list[Detection]:
-        detector.run_with(Runtime(batches=batches))  # type: ignore[attr-defined]
+        detector.run_with(Runtime(batches=batches, at_once=at_once))  # type: ignore[attr-defined]
         with ThreadPoolExecutor(len(comparisons)) as pool, ExitStack() as users:
             for _ in comparisons:
                 users.enter_context(batches.expect(detector.card.model))
@@ -74,12 +76,12 @@ def test_a_survey_of_tiles_has_the_scores_that_it_has_alone(
     """To float rounding: 1e-5 of the scores of a network that tells the surveys apart by more than 1e-4."""
     detector = SpicdNet(card, network, torch.device("cpu"))
     if at_once:
-        detector._encode_at_once("float32")
+        detector.run_with(Runtime(at_once=True))
     asked = surveys(pairs)
     alone = [detector.detect(one) for one in asked]
     assert differ(alone[0], SpicdNet(card, network, torch.device("cpu")).detect(asked[0])) < 1e-5
     meter = Meter()
-    with shared(meter, most=64) as detect:
+    with shared(meter, most=64, at_once=at_once) as detect:
         together = detect(detector, asked)
     counted = meter.take()
     batches, steps = counted["batch_requests", card.model]
