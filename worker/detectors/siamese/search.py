@@ -3,6 +3,9 @@
 Exact, it is the product of all points in float32. Searched, the winner of each output among a piece of points is looked
 for with 8 bits, which processors with VNNI multiply four times faster, and its value is computed in float32. So only a
 winner that another point of the piece all but equals can be missed, and the value is then that of the other.
+
+Without VNNI such products may be cut off at 16 bits; every processor that has bfloat16 has it
+(`worker.detectors.precision.has_bfloat16`).
 """
 
 from __future__ import annotations
