@@ -22,6 +22,8 @@ RATIOS = ("precision", "recall", "f1", "accuracy")
 AREAS = ("area_under_roc", "average_precision")
 #: Of the removals in the paper's experiments.
 REMOVALS = ("precision", "recall", "f1")
+#: What files of `evaluate paper` of release 0.3 and before do not say of the baselines.
+LATER = ("removals", "false_positives_with_no_change")
 #: Of the objects, where a method tells them.
 OBJECTS = (
     "regions", "recall", "recall_interval", "objects", "precision", "precision_interval", "false_objects",
@@ -85,16 +87,15 @@ def paper_figures(document: Figures, card: Card) -> Figures:
         **_operating(ours),
         **_picked(ours, AREAS),
         "at_test_threshold": _operating(ours["at_test_threshold"], ours["test_threshold"]),
-        "false_positives_with_no_change": ours["false_positives_with_no_change"],
-        "removals": _picked(ours["removals"], REMOVALS),
+        "false_positives_with_no_change": _quiet(experiments),
+        "removals": _removals(experiments),
         "f1_by_experiment": {row["name"]: row["f1"] for row in experiments if row["operation"]},
         "f1_by_kind": {kind: rows[ours["method"]] for kind, rows in document["by_kind"].items()},
         "baselines": {
             row["method"]: {
                 **_picked(row, ("threshold", *RATIOS, *AREAS)),
                 "f1_at_test_threshold": row["at_test_threshold"]["f1"],
-                "false_positives_with_no_change": row["false_positives_with_no_change"],
-                "removals": _picked(row["removals"], REMOVALS),
+                **_picked(row, tuple(name for name in LATER if name in row)),
             }
             for row in baselines
         },
@@ -203,13 +204,14 @@ def _head(document: Figures, card: Card, data: Figures) -> Figures:
 
 
 def _measured_as(row: Figures) -> tuple[str | None, str | None]:
-    return row["sha256"], row["fingerprint"]
+    """Return what tells whose figures these are; files of release 0.3 and before name weights alone."""
+    return row["sha256"], row.get("fingerprint", row["sha256"])
 
 
 def _require_same(row: Figures, card: Card) -> None:
     if _measured_as(row) != (card.sha256, card.fingerprint):
         raise ValueError(
-            f"measured with weights {row['fingerprint']}, and not with the card's {card.fingerprint}"
+            f"measured with weights {_measured_as(row)[1]}, and not with the card's {card.fingerprint}"
         )
 
 
@@ -227,6 +229,20 @@ def _operating(row: Figures, threshold: float | None = None) -> Figures:
         "threshold": row["threshold"] if threshold is None else threshold,
         **_picked(row, (*RATIOS, *COUNTS)),
     }
+
+
+def _quiet(experiments: list[Figures]) -> Figures:
+    """Return the false positives of the experiment without a change, at both thresholds."""
+    row = next(row for row in experiments if row["operation"] is None)
+    return {
+        "validation_threshold": row["false_positives"],
+        "test_threshold": row["at_test_threshold"]["false_positives"],
+    }
+
+
+def _removals(experiments: list[Figures]) -> Figures:
+    """Return the figures of the one experiment that removes."""
+    return _picked(next(row for row in experiments if row["operation"] == "remove"), REMOVALS)
 
 
 def _visited(row: Figures) -> Figures:

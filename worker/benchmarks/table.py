@@ -193,7 +193,9 @@ def _quiet_alarms(row: Measured) -> str | None:
 
 def _quiet_visits(row: Measured) -> str | None:
     section = row.sections.get("revisit")
-    return section and f"{section['quiet_visits_with_false_tile']} of {section['quiet_visits']}"
+    if section is None:
+        return None
+    return f"{section['quiet_visits_with_false_tile']} of {section['quiet_visits']}"
 
 
 def _objects(row: Measured) -> str | None:
@@ -217,7 +219,9 @@ def _speed(row: Measured, section: str) -> str | None:
         return None
     tiles = "" if told["tiles"] == told["data"]["tiles"] else f" for {told['tiles']}"
     processor = f" ({told['processor_seconds']['median']:.1f} s of processor)" if section == "speed" else ""
-    return f"{told['seconds']['median']:.2f} s{tiles}{processor}"
+    precision = told.get("precision") or "float32"
+    coarse = "" if precision == "float32" else f", {precision}"
+    return f"{told['seconds']['median']:.2f} s{tiles}{processor}{coarse}"
 
 
 def _duration(seconds: float | None) -> str | None:

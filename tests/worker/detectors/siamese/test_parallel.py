@@ -73,5 +73,5 @@ def test_chamfer_statistics_are_the_same_in_shares(threads: int) -> None:
     generator = torch.Generator().manual_seed(0)
     pairs = [torch.rand(2, 50 + n, 3, generator=generator) for n in range(5)]
     whole = chamfer_statistics([pair[0] for pair in pairs], [pair[1] for pair in pairs])
-    alone = torch.cat([chamfer_statistics(pair[:1], pair[1:]) for pair in pairs])
+    alone = torch.cat([chamfer_statistics([pair[0]], [pair[1]]) for pair in pairs])
     assert torch.equal(whole, alone)
