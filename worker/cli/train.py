@@ -32,7 +32,7 @@ def train(
     threads: Annotated[int | None, typer.Option(min=1, help="Of the CPU.")] = None,
     **options: Any,
 ) -> None:
-    """Train SPICD-Net on simulated visits; what is left out keeps its default, the paper's where it has one."""
+    """Train a network of tiles on simulated visits; what is left out keeps its default, the paper's where it has one."""
     # Not at the head of the file: torch takes seconds, which `--help` need not wait for.
     import torch  # noqa: PLC0415
 

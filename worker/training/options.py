@@ -31,6 +31,7 @@ class Option:
 
 
 OPTIONS = (
+    Option("detector", str, "Whose network is trained: spicd-net, pointnet2 or kpconv."),
     Option("epochs", int, "At most so many.", 0),
     Option("minutes", float, "Wall clock of the training; the learning rate follows it.", 0),
     Option("train_pairs", int, "An epoch.", 1),
