@@ -70,6 +70,8 @@ class QueueState:
     claims: tuple[Claim, ...] = ()
     answering: tuple[str, ...] = ()  #: names of the workers that gave a sign of life
     silent: tuple[str, ...] = ()  #: of those that did not, and never said that they end
+    models: int = 0  #: that the answering workers keep open
+    model_bytes: int = 0  #: of these models' weights
 
     @property
     def held(self) -> frozenset[str]:
@@ -206,8 +208,11 @@ class JobQueue:
                 pipe.hget(f"rq:execution:{claim}", "worker_name")
             for worker in workers:
                 pipe.exists(worker)
+            for worker in workers:
+                pipe.hmget(worker, "models", "model_bytes")
             told = pipe.execute()
-        holders, alive = told[: len(claims)], told[len(claims) :]
+        holders, told = told[: len(claims)], told[len(claims) :]
+        alive, open_models = told[: len(workers)], told[len(workers) :]
         names = [worker.removeprefix(_WORKER) for worker in workers]
         return QueueState(
             waiting=_texts(waiting),
@@ -215,6 +220,8 @@ class JobQueue:
             claims=tuple(_claim(key, holder) for key, holder in zip(claims, holders, strict=True)),
             answering=tuple(name for name, there in zip(names, alive, strict=True) if there),
             silent=tuple(name for name, there in zip(names, alive, strict=True) if not there),
+            models=sum(int(models or 0) for models, _ in open_models),
+            model_bytes=sum(int(size or 0) for _, size in open_models),
         )
 
     def _remove(

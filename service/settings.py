@@ -63,6 +63,41 @@ class Settings(BaseSettings):
     model: str = Field("voxel-net/1", description="model used where a request names none")
     geometry_workers: int = Field(1, ge=0, description="worker processes of the geometry queue")
     inference_workers: int = Field(1, ge=0, description="worker processes of the inference queue")
+    inference_concurrency: int | None = Field(
+        None,
+        ge=1,
+        le=32,
+        description="steps that an inference worker runs at a time, so that batches of the network have tiles of several "
+        "surveys; unset: 1, with a GPU 4",
+    )
+    inference_batch_tiles: int = Field(
+        64,
+        ge=1,
+        description="most tiles of a batch; halved for a model that does not fit into the GPU's memory so",
+    )
+    inference_batch_wait_ms: float = Field(
+        5.0,
+        ge=0,
+        le=1000,
+        description="longest time that a batch which is not full waits for tiles of another survey that is under way",
+    )
+    inference_precision: Literal["auto", "float32", "bfloat16"] = Field(
+        "auto",
+        description="of the network's large products; `auto`: bfloat16 where the device has it and the model's card says "
+        "that the scores hold",
+    )
+    inference_model_bytes: int = Field(
+        1024**3,
+        ge=0,
+        description="weights of models that an inference worker keeps open; beyond, who was used longest ago is closed",
+    )
+    inference_gpu_share: float | None = Field(
+        None,
+        gt=0,
+        le=1,
+        description="share of the GPU's memory that an inference worker may take; unset: all, or with several "
+        "`SPICD_INFERENCE_WORKERS` an equal part of nine tenths",
+    )
     max_upload_bytes: int = Field(2 * 1024**3, gt=0, description="largest body of one request")
     upload_timeout_s: int = Field(14_400, gt=0, description="longest time of the body of one request")
     keep_uploads_hours: float = Field(

@@ -16,7 +16,7 @@ from service.api.http.answering.problems import PROBLEMS
 from service.catalog.jobs import WORKER_DIED
 from service.errors import ServiceError
 from service.settings import Settings
-from worker import rq_workers
+from worker.endings import ending_of
 from worker.errors import Cancelled, PipelineError
 from worker.pipeline.registration.diagnosis import MEANING
 from worker.rq_jobs import FunctionRefused
@@ -131,4 +131,4 @@ def codes_of_ends() -> set[str]:
     """What is recorded of a step that could not speak for itself."""
     ends = (FunctionRefused(), JobTimeoutException(), KeyError())
     step = SimpleNamespace(id="job-1-register", timeout=1)
-    return {WORKER_DIED, *(rq_workers._ending_of(end, step).code for end in ends)}  # type: ignore[arg-type]
+    return {WORKER_DIED, *(ending_of(end, step).code for end in ends)}  # type: ignore[arg-type]

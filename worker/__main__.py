@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import functools
 import importlib
 import logging
 import os
@@ -15,6 +16,8 @@ import socket
 import sys
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any, Protocol
 from uuid import uuid4
 
 from redis import Redis
@@ -25,6 +28,7 @@ from service.catalog.records import Problem
 from service.catalog.sql.database import Database
 from service.catalog.sql.patience import SUPERVISION
 from service.catalog.steps import ALLOWED_FUNCTIONS
+from service.catalog.tallies import InferenceCounts, tally_inference
 from service.dispatch import Dispatcher
 from service.errors import QueueUnavailable
 from service.logs import set_up_logging
@@ -34,9 +38,9 @@ from service.settings import Settings
 from service.up.embedded_redis import LaunchFailed
 from service.up.lifetime import end_with_parent
 from service.up.requirements import require_model, require_queue
-from worker.memory import limit_memory
+from worker.memory import limit_gpu_memory, limit_memory
 from worker.rq_workers import GeometryWorker, InferenceWorker
-from worker.scratch import sweep
+from worker.scratch import shared_temporary, sweep
 from worker.threads import wait_passively
 
 log = logging.getLogger("worker")
@@ -47,6 +51,13 @@ AGAIN_S = 1.0  #: between two attempts to reach it
 # Imported before the first fork, so that no step pays for it. Importing is all that may happen here: native work in
 # the parent starts threads, and a fork among threads that hold locks deadlocks.
 WARM_MODULES = {"geometry": ("open3d", "torch", "worker.jobs"), "inference": ("torch", "worker.jobs")}
+
+
+class Counter(Protocol):
+    """What was counted in this process and not written yet (`worker.detectors.running.meter.Meter`)."""
+
+    def take(self) -> InferenceCounts: ...
+    def give_back(self, counted: InferenceCounts) -> None: ...
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -76,27 +87,46 @@ def main(arguments: list[str] | None = None) -> int:
     wait_passively()
     for module in WARM_MODULES[options.queue]:
         importlib.import_module(module)
-    if options.queue == "inference":
-        limit_inference(settings)
-    log.info("%s worker is ready", options.queue)
-    records = CatalogRecords(settings)
-    kind = GeometryWorker if options.queue == "geometry" else InferenceWorker
     name = options.name or f"{_host(options.queue)}{os.getpid()}-{uuid4().hex[:8]}"
-
-    redis_url = settings.redis_url
-
-    def make() -> GeometryWorker | InferenceWorker:
-        return kind(
-            options.queue,
-            Redis.from_url(redis_url, socket_connect_timeout=CONNECT_S),
-            allowed=ALLOWED_FUNCTIONS,
-            records=records,
-            grace_s=options.grace,
-            name=name,
+    connect = functools.partial(Redis.from_url, settings.redis_url, socket_connect_timeout=CONNECT_S)
+    if options.queue == "geometry":
+        log.info("geometry worker is ready")
+        work(
+            lambda: GeometryWorker("geometry", connect(), **_of_all(options, name, CatalogRecords(settings)))
         )
-
-    work(make)
+        return 0
+    limit_inference(settings)
+    with serving(settings, name) as share:
+        log.info("inference worker is ready, steps at a time: %d", share.concurrency)
+        own = _of_all(options, name, CatalogRecords(settings, counted=share.counted))
+        own |= {"concurrency": share.concurrency, "tells": share.tells}
+        work(lambda: InferenceWorker("inference", connect(), **own))
     return 0
+
+
+def _of_all(options: argparse.Namespace, name: str, records: CatalogRecords) -> dict[str, Any]:
+    """Return what a worker of either kind is made with."""
+    return {"allowed": ALLOWED_FUNCTIONS, "grace_s": options.grace, "name": name, "records": records}
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Share:
+    """What the steps of an inference worker have in common, as its process sees it."""
+
+    concurrency: int  #: steps at a time
+    tells: Callable[[], dict[str, int]]  #: what stands beside the worker's signs of life
+    counted: Counter  #: what its networks have counted
+
+
+@contextlib.contextmanager
+def serving(settings: Settings, name: str) -> Iterator[Share]:
+    """Prepare what the steps of this process share, for the length of a block."""
+    from worker.jobs.models import networks  # noqa: PLC0415  # torch takes seconds
+
+    shared = networks(settings)
+    together = shared.concurrency > 1
+    with shared_temporary(settings.scratch_dir(), name) if together else contextlib.nullcontext():
+        yield Share(concurrency=shared.concurrency, tells=shared.tells, counted=shared.meter)
 
 
 def alive(arguments: list[str]) -> int:
@@ -148,11 +178,13 @@ def _require_device(settings: Settings, queue: str) -> None:
 def limit_inference(settings: Settings) -> int:
     """Limit what an inference worker may allocate, as each geometry step is; returns the limit in bytes, 0 for none.
 
-    Not where it has a GPU: CUDA maps far more than it uses. The limit is of the process, which outlives its steps.
+    Not where it has a GPU, of whose memory it gets a share: CUDA maps far more than it uses. The limit is of the process,
+    which outlives its steps.
     """
-    from worker.jobs.models import finds_gpu  # noqa: PLC0415  # torch takes seconds
+    from worker.jobs.models import runs_on_gpu  # noqa: PLC0415  # torch takes seconds
 
-    if settings.device != "cpu" and finds_gpu():
+    if runs_on_gpu(settings):
+        limit_gpu_memory(settings.inference_gpu_share, settings.inference_workers)
         return 0
     return limit_memory(settings.step_memory_bytes)
 
@@ -182,7 +214,8 @@ class CatalogRecords:
     The database alone is opened, and closed again: this process forks, and the blob store starts threads.
     """
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: Settings, counted: Counter | None = None) -> None:
+        self._counted = counted
         self._database = Database(settings.resolved_database_url(), patience=SUPERVISION)
         self._jobs = Jobs(self._database)
         queue = JobQueue(settings.redis_url or "", timeout_s=settings.job_timeout_s)
@@ -213,7 +246,22 @@ class CatalogRecords:
         """Sweep what killed steps left, find what was lost, and hand over what is due."""
         sweep(self._scratch)
         with self._opened():
-            self._dispatcher.run()
+            try:
+                self._dispatcher.run()
+            finally:
+                self._write_counted()
+
+    def _write_counted(self) -> None:
+        """Write what networks have counted since the last time; where that fails it is counted the next time."""
+        counted = {} if self._counted is None else self._counted.take()
+        if self._counted is None or not counted:
+            return
+        try:
+            with self._database.write() as session:
+                tally_inference(session, counted)
+        except Exception:
+            self._counted.give_back(counted)
+            raise
 
     @contextlib.contextmanager
     def _opened(self) -> Iterator[None]:

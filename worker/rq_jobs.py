@@ -10,9 +10,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+from rq.executions import Execution
 from rq.job import Job
+from rq.timeouts import JobTimeoutException
 
 from service.queue import step_of_id
+
+StepTimedOut = JobTimeoutException  #: what the time limit of a step raises
 
 
 class FunctionRefused(Exception):
@@ -23,6 +27,7 @@ class StepJob(Job):  # type: ignore[misc]  # rq is untyped here
     """An rq job that calls allowed functions only; the base allows none, `step_job` makes one that does."""
 
     allowed: frozenset[str] = frozenset()
+    claim: Execution | None = None  #: of the worker that has taken it
 
     @property
     def func(self) -> Callable[..., Any]:

@@ -1,7 +1,8 @@
 """The two kinds of worker process.
 
 `GeometryWorker` forks a process for each step, so that a crash in C++ or a lack of memory ends one step and not the
-worker. `InferenceWorker` keeps the network in its own memory and never forks (CUDA does not survive one).
+worker. `InferenceWorker` keeps the network in its own memory and never forks (CUDA does not survive one); it may run
+several steps at a time, each in a thread.
 
 rq hands out steps, keeps the list of workers, and carries the word that a step is to be stopped. What became of a step
 is recorded in the catalog, by the step itself (worker/jobs/step.py) or, where that cannot speak any more, by its
@@ -16,10 +17,9 @@ import random
 import signal
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass
-from typing import Any, Literal, Protocol
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager, suppress
+from typing import Any, Protocol
 
 from redis import Redis
 from redis.exceptions import RedisError
@@ -27,17 +27,19 @@ from rq import Queue, SimpleWorker, Worker, worker_registration
 from rq.exceptions import StopRequested
 from rq.executions import Execution
 from rq.serializers import JSONSerializer
-from rq.timeouts import JobTimeoutException, UnixSignalDeathPenalty
+from rq.timeouts import UnixSignalDeathPenalty
 from rq.utils import now
 from rq.worker.base import BaseWorker, WorkerStatus
 
-from service.errors import Unavailable, is_disk_full
+from service.errors import Unavailable
 from service.logs import about
 from service.settings import Settings
 from service.up.lifetime import end_with_parent, out_of_memory_kills
-from worker.errors import NoSpaceLeft, PipelineError
+from worker.endings import Ending, WorkerStopped, ending_of, ending_of_status
+from worker.errors import PipelineError
 from worker.memory import limit_memory
-from worker.rq_jobs import FunctionRefused, StepJob, step_job
+from worker.rq_jobs import FunctionRefused, StepJob, StepTimedOut, step_job
+from worker.rq_threads import Door, StepThreads
 from worker.watch import Watch
 
 log = logging.getLogger("worker")
@@ -49,9 +51,6 @@ LATE_S = 3.0  #: a step that outlasts its time limit by this does not hear its o
 _TELL_TRIES = 3  #: to tell the catalog how a step ended; each takes some seconds where it does not answer
 _LAST_WORDS_S = 10.0  #: that a worker which ends itself has to tell the catalog
 _LOOK_S = 1.0  #: between two looks at the processes of a step
-_OUTSIDE = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGQUIT)
-
-How = Literal["lost", "interrupted", "failed", "stopped", "dismissed"]
 
 
 class Records(Protocol):
@@ -73,20 +72,7 @@ class Records(Protocol):
         """Hand over what is due, and find what was lost."""
 
 
-class WorkerStopped(BaseException):
-    """The worker was told to end and its time is up. Not an `Exception`, so that no step swallows it."""
-
-
-_EXPECTED = (PipelineError, FunctionRefused, WorkerStopped, JobTimeoutException, Unavailable)
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Ending:
-    """How a step's process ended that could not tell itself."""
-
-    how: How
-    sentence: str = ""  #: or the first half of one
-    code: str = ""  #: of the problem, where it failed
+_EXPECTED = (PipelineError, FunctionRefused, WorkerStopped, StepTimedOut, Unavailable)
 
 
 class _StepWorker(BaseWorker):  # type: ignore[misc]  # rq is untyped here
@@ -117,6 +103,7 @@ class _StepWorker(BaseWorker):  # type: ignore[misc]  # rq is untyped here
         )
         self._records = records
         self._grace_s = grace_s
+        self._telling = threading.RLock()  #: one at a time tells the catalog
 
     @property
     def stopping(self) -> bool:
@@ -142,7 +129,8 @@ class _StepWorker(BaseWorker):  # type: ignore[misc]  # rq is untyped here
         """Give a sign of life, and renew the claim on the step."""
         with self.connection.pipeline() as pipe:
             self.heartbeat(pipeline=pipe)
-            self.execution.heartbeat(job.started_job_registry, CLAIM_S, pipe)
+            if job.claim is not None:
+                job.claim.heartbeat(job.started_job_registry, CLAIM_S, pipe)
             pipe.execute()
 
     def run_maintenance_tasks(self) -> None:
@@ -152,8 +140,14 @@ class _StepWorker(BaseWorker):  # type: ignore[misc]  # rq is untyped here
 
     def execute_job(self, job: StepJob, queue: Queue) -> None:
         """Claim a step, have it run, and give the claim back once the catalog knows how it ended."""
-        begun = time.monotonic()
         self._claim(job, queue)
+        self._carry_out(job)
+        with suppress(RedisError):
+            self.set_state(WorkerStatus.IDLE)
+
+    def _carry_out(self, job: StepJob) -> None:
+        """Have a step run that is claimed, and give the claim back."""
+        begun = time.monotonic()
         with about(job_id=job.catalog_id):  # a process that is forked for the step inherits it
             log.info("%s: %s started", self.queues[0].name, job.id)
             try:
@@ -163,8 +157,6 @@ class _StepWorker(BaseWorker):  # type: ignore[misc]  # rq is untyped here
                 with suppress(RedisError):  # the claim ends by itself
                     self._give_back(job)
                 self._tell(self._records.tick)
-                with suppress(RedisError):
-                    self.set_state(WorkerStatus.IDLE)
 
     def _shutdown(self) -> None:
         self._stop_requested = True  # rq notes it of a busy worker only, and tells Redis, which may be away
@@ -200,29 +192,36 @@ class _StepWorker(BaseWorker):  # type: ignore[misc]  # rq is untyped here
 
     def _claim(self, job: StepJob, queue: Queue) -> None:
         with self.connection.pipeline() as pipe:
-            self.execution = Execution.create(job, CLAIM_S, pipeline=pipe, worker_name=self.name)
+            job.claim = Execution.create(job, CLAIM_S, pipeline=pipe, worker_name=self.name)
             pipe.lrem(queue.intermediate_queue_key, 0, job.id)
             self.set_current_job_id(job.id, pipeline=pipe)
             self.set_state(WorkerStatus.BUSY, pipeline=pipe)
             pipe.execute()
 
     def _give_back(self, job: StepJob) -> None:
+        if job.claim is None:
+            return
         with self.connection.pipeline() as pipe:
-            self.execution.delete(job=job, pipeline=pipe)
+            job.claim.delete(job=job, pipeline=pipe)
             pipe.delete(job.key)
             self.set_current_job_id(None, pipeline=pipe)
             pipe.execute()
-        self.execution = None
+        job.claim = None
 
     def _run(self, job: StepJob) -> None:
         """Call the step under its time limit; record what it could not record itself."""
         try:
-            with UnixSignalDeathPenalty(job.timeout, JobTimeoutException):
+            with self._limited(job):
                 job.run()
         except BaseException as error:
             expected = isinstance(error, _EXPECTED)
             log.error("%s failed: %s", job.id, error, exc_info=None if expected else error)
-            self._record(job, _ending_of(error, job))
+            self._record(job, ending_of(error, job))
+
+    def _limited(self, job: StepJob) -> AbstractContextManager[object]:
+        """Return a block that raises StepTimedOut when the step's time is up."""
+        penalty: AbstractContextManager[object] = UnixSignalDeathPenalty(job.timeout, StepTimedOut)
+        return penalty
 
     @contextmanager
     def _alive(self, job: StepJob, *, limit_s: float | None = None) -> Iterator[None]:
@@ -254,8 +253,12 @@ class _StepWorker(BaseWorker):  # type: ignore[misc]  # rq is untyped here
         last.daemon = True
         last.start()
         log.error("%s: does not hear that its time is up; this worker ends", job.id)
-        self._record(job, _ending_of(JobTimeoutException(), job))
+        self._record(job, ending_of(StepTimedOut(), job))
+        self._before_exit(job)
         os._exit(1)
+
+    def _before_exit(self, job: StepJob) -> None:
+        """Take leave of whatever else runs in this process, which a step holds that does not hear."""
 
     def _record(self, job: StepJob, ending: Ending) -> None:
         """Tell the catalog how a step ended."""
@@ -281,7 +284,8 @@ class _StepWorker(BaseWorker):  # type: ignore[misc]  # rq is untyped here
         What it did not hear, a dispatcher finds: a step that has begun, and on which nobody has a claim.
         """
         try:
-            record(*words)
+            with self._telling:
+                record(*words)
             return True
         except StopRequested:
             raise
@@ -337,7 +341,7 @@ class GeometryWorker(_StepWorker, Worker):  # type: ignore[misc]
         elif self._stopped_job_id == job.id:
             self._stopped_job_id, ending = None, Ending(how="dismissed")
         if ending is None:
-            ending = _ending_of_status(status, job, out_of_memory=out_of_memory_kills() > killed_before)
+            ending = ending_of_status(status, job, out_of_memory=out_of_memory_kills() > killed_before)
         if ending.sentence:
             log.warning("%s: %s", job.id, ending.sentence)
         with self._alive(job):
@@ -366,7 +370,7 @@ class GeometryWorker(_StepWorker, Worker):  # type: ignore[misc]
     def _due_end(self, job: StepJob, ran_s: float, watch: Watch) -> Ending | None:
         """Return why a step has to be ended; None while it may go on."""
         if job.timeout and ran_s > job.timeout + LATE_S:
-            return _ending_of(JobTimeoutException(), job)
+            return ending_of(StepTimedOut(), job)
         trouble = watch.trouble()
         if trouble is None:
             return None
@@ -384,58 +388,91 @@ class GeometryWorker(_StepWorker, Worker):  # type: ignore[misc]
 
 
 class InferenceWorker(_StepWorker, SimpleWorker):  # type: ignore[misc]
-    """One process that stays warm; a thread keeps its claim alive while it works."""
+    """One process that stays warm; a thread keeps its claim alive while it works.
+
+    With a `concurrency` above 1 it takes so many steps at a time and runs each in a thread, so that what they ask of the
+    network can be batched. All else of a step is as it is alone: its claim, its time limit, its end.
+    """
+
+    def __init__(
+        self,
+        queue: str,
+        connection: Redis,
+        *,
+        concurrency: int = 1,
+        tells: Callable[[], Mapping[str, int]] = dict,
+        **others: Any,
+    ) -> None:
+        """`tells` says what stands beside each sign of life, for `service.queue.JobQueue.snapshot`."""
+        super().__init__(queue, connection, **others)
+        self._tells = tells
+        self._steps = StepThreads(concurrency) if concurrency > 1 else None
+        self._here = threading.local()  #: the door of a thread's step
+        self._jobs: list[StepJob] = []  #: that run in threads
+
+    def serialize(self) -> dict[str, Any]:
+        """Return what stands in Redis of this worker."""
+        return {**super().serialize(), **self._tells()}
+
+    def execute_job(self, job: StepJob, queue: Queue) -> None:
+        """Run a step to its end, or with others: then start it, and return when there is room for the next."""
+        if self._steps is None:
+            super().execute_job(job, queue)
+            return
+        self._claim(job, queue)
+        self._steps.start(lambda door: self._carry_out_in_thread(job, door), str(job.id))
+        self._tell(self._records.tick)  # the next one comes at once
+        self._steps.wait_for_room(lambda: self.stopping)
 
     def request_force_stop(self, *_: Any) -> None:
-        """Leave the step from wherever it is: time is up."""
-        raise WorkerStopped
+        """Leave every step from wherever it is: time is up."""
+        if self._steps is None:
+            raise WorkerStopped
+        self._steps.leave(WorkerStopped)
+
+    def teardown(self) -> None:
+        """End, once the steps have: each was told to leave when its grace is over."""
+        if self._steps is not None:
+            self._state = WorkerStatus.BUSY  # a signal that comes now is noted, and does not end the wait
+            self._steps.wait_for_all()
+        super().teardown()
+
+    def _carry_out_in_thread(self, job: StepJob, door: Door) -> None:
+        self._here.door = door
+        self._jobs.append(job)
+        try:
+            self._carry_out(job)
+        finally:
+            self._jobs.remove(job)
 
     def _work_on(self, job: StepJob) -> None:
         with self._alive(job, limit_s=job.timeout and job.timeout + LATE_S):
             self._run(job)
 
+    def _limited(self, job: StepJob) -> AbstractContextManager[object]:
+        return super()._limited(job) if self._steps is None else self._limited_in_thread(job, self._here.door)
+
+    @contextmanager
+    def _limited_in_thread(self, job: StepJob, door: Door) -> Iterator[None]:
+        """Have the step's thread leave when its time is up: a thread hears no signal."""
+        timer = threading.Timer(job.timeout, door.leave, (StepTimedOut,)) if job.timeout else None
+        if timer is not None:
+            timer.daemon = True
+            timer.start()
+        try:
+            with door:
+                yield
+        finally:
+            door.shut()
+            if timer is not None:
+                timer.cancel()
+
+    def _before_exit(self, job: StepJob) -> None:
+        """Have the other steps run elsewhere: it is not their fault."""
+        for other in [other for other in self._jobs if other is not job]:
+            why = f"its worker ended, for step {job.id} did not hear that its time was up"
+            self._record(other, Ending(how="interrupted", sentence=why))
+
     def _end_grace(self) -> None:
         """Signal the main thread, which runs the step; the handler is `request_force_stop` by now."""
         os.kill(os.getpid(), signal.SIGTERM)
-
-
-def _ending_of(error: BaseException, job: StepJob) -> Ending:
-    """Return how a step ended that an error left."""
-    if isinstance(error, WorkerStopped):
-        return Ending(how="stopped")
-    if isinstance(error, Unavailable):  # the step could not even say that it was interrupted
-        return Ending(how="interrupted", sentence=str(error))
-    code, sentence = _problem(error, job)
-    return Ending(how="failed", code=code, sentence=sentence)
-
-
-def _problem(error: BaseException, job: StepJob) -> tuple[str, str]:
-    """Return code and sentence for an error that fails a job."""
-    match error:
-        case PipelineError():
-            return error.code, str(error)
-        case FunctionRefused():
-            return "function_refused", str(error)
-        case JobTimeoutException():
-            return "timed_out", f"step {job.id} took longer than {job.timeout} s; send fewer or smaller scans"
-        case _ if is_disk_full(error):
-            return NoSpaceLeft.code, "the disk is full; make room, then run it again"
-        case _:
-            what = f"an unexpected {type(error).__name__}"
-            return "internal", f"step {job.id} stopped on {what}; see the worker's log"
-
-
-def _ending_of_status(status: int, job: StepJob, *, out_of_memory: bool) -> Ending:
-    """Return how a process ended without a word, from its wait status.
-
-    A signal that a fault in the process itself raises costs an attempt; one that is sent from outside does not, unless
-    the kernel says that it killed a process for want of memory.
-    """
-    of = f"the process of step {job.id} ended"
-    if not os.WIFSIGNALED(status):
-        return Ending(how="lost", sentence=f"{of} with exit status {os.waitstatus_to_exitcode(status)}")
-    number = signal.Signals(os.WTERMSIG(status))
-    if number == signal.SIGKILL and out_of_memory:
-        return Ending(how="lost", sentence=f"{of} by signal {number.name}: out of memory")
-    how: How = "interrupted" if number in _OUTSIDE else "lost"
-    return Ending(how=how, sentence=f"{of} by signal {number.name}")

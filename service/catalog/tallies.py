@@ -113,6 +113,56 @@ DELIVERIES = Measure(
     labels=("outcome",),
     expected=(("delivered",), ("refused",), ("unanswered",)),
 )
+NETWORK_SECONDS = Measure(
+    name="spicd_inference_network_seconds",
+    help="Time that batches took in the network, to their results in the worker's memory",
+    labels=("model",),
+    summary=True,
+)
+NETWORK_WAIT_SECONDS = Measure(
+    name="spicd_inference_wait_seconds",
+    help="Time that the first of a batch had waited for the network",
+    labels=("model",),
+    summary=True,
+)
+BATCH_SIZE = Measure(
+    name="spicd_inference_batch_size",
+    help="Tiles of a batch, or other items that a network takes",
+    labels=("model",),
+    summary=True,
+)
+BATCH_STEPS = Measure(
+    name="spicd_inference_batch_steps",
+    help="Steps, so surveys for the most part, that a batch had items of",
+    labels=("model",),
+    summary=True,
+)
+OUT_OF_MEMORY = Measure(
+    name="spicd_inference_out_of_memory",
+    help="Batches that did not fit into the GPU's memory and were halved",
+    labels=("model",),
+)
+MODELS_OPENED = Measure(
+    name="spicd_inference_models_opened", help="Models that an inference worker opened", labels=("model",)
+)
+MODELS_EVICTED = Measure(
+    name="spicd_inference_models_evicted",
+    help="Models that an inference worker closed, for others needed the room",
+    labels=("model",),
+)
+#: What a worker's networks count, by the worker's name for it.
+_OF_NETWORKS = {
+    "network_seconds": NETWORK_SECONDS,
+    "wait_seconds": NETWORK_WAIT_SECONDS,
+    "batch_size": BATCH_SIZE,
+    "batch_requests": BATCH_STEPS,
+    "out_of_memory": OUT_OF_MEMORY,
+    "models_opened": MODELS_OPENED,
+    "models_evicted": MODELS_EVICTED,
+}
+#: By that name and the model: how often, and the sum.
+InferenceCounts = Mapping[tuple[str, str], tuple[int, float]]
+
 #: Everything that is tallied, in the order of `/metrics`.
 MEASURES = (
     JOBS_ENDED,
@@ -127,6 +177,7 @@ MEASURES = (
     TILES,
     SWEPT,
     DELIVERIES,
+    *_OF_NETWORKS.values(),
 )
 
 
@@ -140,10 +191,12 @@ class Sample:
     total: float
 
 
-def add(session: Session, name: str, labels: Mapping[str, str], value: float = 1.0) -> None:
-    """Count `value` under a name and labels, if the session's transaction commits."""
+def add(
+    session: Session, name: str, labels: Mapping[str, str], value: float = 1.0, *, count: int = 1
+) -> None:
+    """Count `value`, the sum of `count`, under a name and labels, if the session's transaction commits."""
     entry = noted_in(session).setdefault((name, _text(labels)), [0, 0.0])
-    entry[0] += 1
+    entry[0] += count
     entry[1] += value
 
 
@@ -217,6 +270,12 @@ def tally_tiles(session: Session, model: str, tiles: Iterable[TileRecord]) -> No
     add(session, TILES.name, {"model": model}, len(shares))
     if shares:
         add(session, OBSERVED.name, {"model": model}, sum(shares) / len(shares))
+
+
+def tally_inference(session: Session, counted: InferenceCounts) -> None:
+    """Count what the networks of a worker did since it last told."""
+    for (figure, model), (count, total) in counted.items():
+        add(session, _OF_NETWORKS[figure].name, {"model": model}, total, count=count)
 
 
 def _share(tile: TileRecord) -> float:

@@ -22,7 +22,7 @@ from service.up.embedded_redis import EmbeddedRedis
 from service.up.launcher import Supervision
 from tests.support.bench import STANDIN, Bench
 from tests.support.processes import running, until
-from worker.rq_workers import _ending_of, _ending_of_status
+from worker.endings import ending_of, ending_of_status
 
 KINDS: tuple[Queue, ...] = ("geometry", "inference")
 
@@ -410,7 +410,7 @@ def test_a_full_disk_fails_the_step_and_says_so(bench: Bench) -> None:
 
 def test_a_step_that_cannot_say_that_the_database_left_it_is_interrupted_and_not_failed() -> None:
     step = SimpleNamespace(id="m1-register", timeout=60)
-    ending = _ending_of(DatabaseUnavailable("the database does not answer"), step)  # type: ignore[arg-type]
+    ending = ending_of(DatabaseUnavailable("the database does not answer"), step)  # type: ignore[arg-type]
     assert ending.how == "interrupted"
 
 
@@ -430,4 +430,4 @@ def test_what_comes_from_outside_is_told_from_what_a_step_did_itself(
     status: int, out_of_memory: bool, how: str
 ) -> None:
     step = SimpleNamespace(id="m1-register", timeout=60)
-    assert _ending_of_status(status, step, out_of_memory=out_of_memory).how == how  # type: ignore[arg-type]
+    assert ending_of_status(status, step, out_of_memory=out_of_memory).how == how  # type: ignore[arg-type]

@@ -8,6 +8,7 @@ each kind of job consists. The catalog is that of FOLDER/data.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import json
 import logging
@@ -17,6 +18,7 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from redis import Redis
 
@@ -28,6 +30,7 @@ from worker.__main__ import CatalogRecords, work
 from worker.errors import RegistrationFailed
 from worker.jobs.step import Context, step
 from worker.rq_workers import GeometryWorker, InferenceWorker
+from worker.scratch import shared_temporary
 
 FUNCTIONS = (
     "first", "second", "third", "refuse", "crash", "crash_once", "sleep", "busy", "hold", "finish", "stray", "full",
@@ -215,20 +218,24 @@ def main() -> None:
     set_up_logging("info")
     logging.getLogger("worker").info("up")
     refresh()
-    kind = GeometryWorker if queue == "geometry" else InferenceWorker
-    records = Book(Settings())
+    settings = Settings()
+    concurrency = settings.inference_concurrency or 1
+    common: dict[str, Any] = {
+        "allowed": frozenset(f"tests.support.standin.{function}" for function in FUNCTIONS),
+        "records": Book(settings),
+        "grace_s": float(grace),
+        "name": name[0] if name else None,
+    }
 
     def make() -> GeometryWorker | InferenceWorker:
-        return kind(
-            queue,
-            Redis.from_url(redis_url),
-            allowed=frozenset(f"tests.support.standin.{function}" for function in FUNCTIONS),
-            records=records,
-            grace_s=float(grace),
-            name=name[0] if name else None,
-        )
+        redis = Redis.from_url(redis_url)
+        if queue == "geometry":
+            return GeometryWorker(queue, redis, **common)
+        return InferenceWorker(queue, redis, concurrency=concurrency, **common)
 
-    work(make)
+    several = queue == "inference" and concurrency > 1
+    with shared_temporary(settings.scratch_dir(), "standin") if several else contextlib.nullcontext():
+        work(make)
     record("ended", queue)
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from tests.support.processes import until
-from worker.scratch import scratch_folder, sweep
+from worker.scratch import scratch_folder, shared_temporary, sweep
 
 HOLDER = """
 import pathlib, sys, time
@@ -34,6 +34,22 @@ def test_a_folder_goes_with_its_step_and_takes_temporary_files_of_others(tmp_pat
     assert not folder.exists()
     assert tempfile.gettempdir() == before
     assert os.environ.get("TMPDIR") != str(folder)
+
+
+def test_steps_that_run_at_a_time_share_a_folder_for_temporary_files(tmp_path: Path) -> None:
+    before = tempfile.gettempdir()
+    with shared_temporary(tmp_path, "inference-1") as shared:
+        one, other = (scratch_folder(tmp_path, f"job-{number}-score") for number in (1, 2))
+        first, second = one.__enter__(), other.__enter__()
+        assert Path(tempfile.mkdtemp()).parent == shared
+        one.__exit__(None, None, None)  # the step that began first ends first
+        assert Path(tempfile.mkdtemp()).parent == shared
+        assert second.exists()
+        other.__exit__(None, None, None)
+        assert Path(tempfile.mkdtemp()).parent == shared
+        assert not first.exists()
+    assert tempfile.gettempdir() == before
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_folder_goes_with_a_step_that_raises(tmp_path: Path) -> None:

@@ -15,6 +15,9 @@ from worker.cloud.tiling import TileChoice
 #: The models that come with the code, wherever a command is typed.
 MODEL_STORE = Path(__file__).resolve().parents[2] / "model_store"
 
+#: A score may move so far in bfloat16: scores are shown with two digits.
+SCORES_HOLD = 0.01
+
 #: What release 0.1 kept under `preprocessing` and only SPICD-Net needs.
 _SPICD_NET_SETTINGS_OF_0_1 = ("patch_points", "chamfer_points", "seed")
 
@@ -43,6 +46,25 @@ class QuietRecord(StrictModel):
     )
 
 
+class PrecisionCheck(StrictModel):
+    """How far the scores move where the network's large products are computed in bfloat16."""
+
+    largest_score_difference: float = Field(ge=0, description="of all tiles, the probability of change")
+    decided_otherwise: int = Field(
+        ge=0, description="tiles that are on the other side of the card's threshold"
+    )
+    tiles: int = Field(gt=0, description="that were scored both ways")
+    sha256: str = Field(description="of the weights")
+    device: str
+    data: str
+    command: str
+
+    @property
+    def holds(self) -> bool:
+        """Whether the scores are the same for all that is made of them."""
+        return self.largest_score_difference <= SCORES_HOLD and not self.decided_otherwise
+
+
 class Card(StrictModel):
     """`model_store/<name>/<version>/card.json`."""
 
@@ -59,6 +81,10 @@ class Card(StrictModel):
         default_factory=dict, description="the detector's own; it validates them when it is loaded"
     )
     quiet: QuietRecord | None = Field(default=None, description="of models that score voxels")
+    precision: PrecisionCheck | None = Field(
+        default=None,
+        description="what `spicd-worker evaluate precision` measured; None: bfloat16 only where asked for",
+    )
     weights: str | None = Field(default=None, description="file beside the card")
     sha256: str | None = Field(default=None, description="of the weights file")
     training: dict[str, Any] = Field(default_factory=dict, description="how it was made, with the command")
@@ -92,6 +118,11 @@ class Card(StrictModel):
         if self.sha256 is not None:
             return self.sha256
         return hashlib.sha256(json.dumps(self.detector_settings, sort_keys=True).encode()).hexdigest()
+
+    @property
+    def holds_in_bfloat16(self) -> bool:
+        """Whether these very weights were measured in bfloat16, and their scores hold."""
+        return self.precision is not None and self.precision.holds and self.precision.sha256 == self.sha256
 
     def settings_as(self, kind: type[S]) -> S:
         """Read the detector's own settings. Raises ValueError, which names each unsound field."""

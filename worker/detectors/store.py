@@ -17,6 +17,7 @@ from safetensors.torch import load, save
 from worker.detectors.card import Card
 from worker.detectors.detector import Detector
 from worker.detectors.registry import DETECTORS
+from worker.detectors.running.runtime import RunsNetwork, Runtime
 from worker.errors import DetectorUnavailable, TrainingFailed
 from worker.files import write_text
 
@@ -49,18 +50,28 @@ def detector_class(key: str) -> DetectorClass:
     return opens
 
 
-def open_detector(model_store: Path, name: str = "voxel-net/1", device: Device = "auto") -> Detector:
+def open_detector(
+    model_store: Path,
+    name: str = "voxel-net/1",
+    device: Device = "auto",
+    runtime: Runtime | None = None,
+) -> Detector:
     """Return the detector `<name>/<version>`, ready to score.
 
     Raises DetectorUnavailable when there is no such model, its card is unsound, its weights are not those of
     the card, or the device is not there.
     """
     card = open_card(model_store, name)
-    return make_detector(card, _weights_file(_folder(model_store, name), card), device)
+    return make_detector(card, _weights_file(_folder(model_store, name), card), device, runtime)
 
 
-def make_detector(card: Card, content: bytes | None, device: Device = "auto") -> Detector:
-    """Return the detector of a card and the bytes of its weights file (None: none). Raises DetectorUnavailable."""
+def make_detector(
+    card: Card, content: bytes | None, device: Device = "auto", runtime: Runtime | None = None
+) -> Detector:
+    """Return the detector of a card and the bytes of its weights file (None: none). Raises DetectorUnavailable.
+
+    `runtime` is what its network is run by; by default in the thread that asks, in float32.
+    """
     name = card.model
     if card.detector not in DETECTORS:
         raise DetectorUnavailable(
@@ -68,9 +79,12 @@ def make_detector(card: Card, content: bytes | None, device: Device = "auto") ->
         )
     weights = {} if content is None else _checked_weights(name, card, content)
     try:
-        return detector_class(card.detector).load(card, weights, resolve_device(device))
+        detector = detector_class(card.detector).load(card, weights, resolve_device(device))
     except (RuntimeError, ValueError) as unsound:
         raise DetectorUnavailable(f"model {name}: {unsound}") from unsound
+    if runtime is not None and isinstance(detector, RunsNetwork):
+        detector.run_with(runtime)
+    return detector
 
 
 def settings_of(card: Card) -> dict[str, Any]:

@@ -53,11 +53,11 @@ def register_map(context: Context) -> None:
 def encode_map(context: Context) -> None:
     """Keep what the model can know of the reference alone, and what it finds where nothing changed."""
     version = context.catalog.versions.of_job(context.job.job_id)
-    detector = kept_detector(context, version.model)
-    encode_reference(context, version, detector, version.model)
-    if detector.card.preprocessing.tiles == "touched":
-        settings = pipeline_settings(context, version, detector.card)
-        kept_alarms(context, version, detector, version.model, settings)
+    with kept_detector(context, version.model) as detector:
+        encode_reference(context, version, detector, version.model)
+        if detector.card.preprocessing.tiles == "touched":
+            settings = pipeline_settings(context, version, detector.card)
+            kept_alarms(context, version, detector, version.model, settings)
     context.catalog.jobs.succeed(context.job.job_id, run=context.run)
 
 

@@ -1,19 +1,71 @@
-"""The model of a job, of the release or the site's own: opened once a process, and held against the map."""
+"""The model of a job, of the release or the site's own: kept open between jobs, and held against the map."""
 
 from __future__ import annotations
 
 import functools
-from pathlib import Path
+from collections.abc import Callable, Hashable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 
 from service.catalog.files import blob_keys
 from service.catalog.files.blobs import Blobs
 from service.catalog.records import ModelRecord, VersionRecord
+from service.settings import Settings
 from worker.detectors.card import Card
 from worker.detectors.detector import Detector
-from worker.detectors.store import Device, make_detector, open_card, open_detector, resolve_device
+from worker.detectors.precision import PrecisionChoice
+from worker.detectors.running.calls import DirectBatches, FittedRuns
+from worker.detectors.running.meter import Meter
+from worker.detectors.running.runtime import Runtime
+from worker.detectors.running.shared import SharedBatches
+from worker.detectors.running.warm import WarmModels
+from worker.detectors.store import make_detector, open_card, open_detector, resolve_device
 from worker.errors import DetectorUnavailable
 from worker.jobs.step import Context
 from worker.pipeline.settings import PipelineSettings
+
+ON_GPU = 4  #: steps at a time where nothing is set: one computes, one or two prepare, one writes
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Networks:
+    """What all steps of an inference worker's process share."""
+
+    concurrency: int  #: steps at a time
+    runtime: Runtime
+    warm: WarmModels
+    meter: Meter
+
+    def tells(self) -> dict[str, int]:
+        """Return what stands beside the worker's signs of life (`service.queue.WarmModels`)."""
+        held = self.warm.held
+        return {"models": held.models, "model_bytes": held.bytes}
+
+
+def networks(settings: Settings) -> Networks:
+    """Return what the steps of this process share; made once."""
+    return _networks(
+        settings.inference_concurrency or (ON_GPU if runs_on_gpu(settings) else 1),
+        settings.inference_batch_tiles,
+        settings.inference_batch_wait_ms / 1000,
+        settings.inference_precision,
+        settings.inference_model_bytes,
+    )
+
+
+@functools.lru_cache(maxsize=1)
+def _networks(
+    concurrency: int, tiles: int, wait_s: float, precision: PrecisionChoice, model_bytes: int
+) -> Networks:
+    meter = Meter()
+    fitted = FittedRuns(tiles, meter)
+    batches = SharedBatches(fitted, wait_s=wait_s) if concurrency > 1 else DirectBatches(fitted)
+    return Networks(
+        concurrency=concurrency,
+        runtime=Runtime(batches=batches, precision=precision),
+        warm=WarmModels(model_bytes, meter),
+        meter=meter,
+    )
 
 
 def finds_gpu() -> bool:
@@ -25,13 +77,34 @@ def finds_gpu() -> bool:
     return True
 
 
-def kept_detector(context: Context, model: str) -> Detector:
-    """Return the network, kept between jobs by the inference worker's process. Raises DetectorUnavailable."""
+def runs_on_gpu(settings: Settings) -> bool:
+    """Tell whether networks of this process run on a GPU."""
+    return settings.device != "cpu" and finds_gpu()
+
+
+@contextmanager
+def kept_detector(context: Context, model: str) -> Iterator[Detector]:
+    """Give a model for the length of a block; its process keeps it open for other steps. Raises DetectorUnavailable."""
+    shared = networks(context.settings)
+    key, opened = _opening(context, model)
+    with shared.warm.borrow(key, opened) as detector, shared.runtime.batches.expect(detector.card.model):
+        yield detector
+
+
+def _opening(context: Context, model: str) -> tuple[Hashable, Callable[[], Detector]]:
+    """Return what a model is kept under, and what opens it."""
     own, settings = _own(context, model), context.settings
+    runtime = networks(settings).runtime
     if own is None:
-        return _opened(settings.model_store, model, settings.device)
-    card = Card.model_validate(own.card).model_dump_json()
-    return _opened_own(settings.resolved_blob_url(), own.job_id, card, settings.device)
+        store, device = settings.model_store, settings.device
+        return (store, model, device), lambda: open_detector(store, model, device, runtime)
+    card = Card.model_validate(own.card)
+    url, job_id = (
+        settings.resolved_blob_url(),
+        own.job_id,
+    )  # by its job: a name may come again once its map is deleted
+    key = (url, job_id, card.model_dump_json(), settings.device)
+    return key, lambda: make_detector(card, _own_weights(url, job_id), settings.device, runtime)
 
 
 def card_of(context: Context, model: str) -> Card:
@@ -64,19 +137,11 @@ def _own(context: Context, model: str) -> ModelRecord | None:
     return own if own is not None and own.status == "ready" else None
 
 
-@functools.lru_cache(maxsize=4)
-def _opened(model_store: Path, model: str, device: Device) -> Detector:
-    return open_detector(model_store, model, device)
-
-
-@functools.lru_cache(maxsize=4)
-def _opened_own(blob_url: str, job_id: str, card: str, device: Device) -> Detector:
-    """Open by its job, for a name and number may come again once the map is deleted."""
+def _own_weights(blob_url: str, job_id: str) -> bytes:
     try:
-        content = Blobs(blob_url).get_bytes(blob_keys.model_weights(job_id))
+        return Blobs(blob_url).get_bytes(blob_keys.model_weights(job_id))
     except FileNotFoundError as missing:
         raise DetectorUnavailable(f"the weights of the model of job {job_id} are gone") from missing
-    return make_detector(Card.model_validate_json(card), content, device)
 
 
 def pipeline_settings(context: Context, record: VersionRecord, card: Card) -> PipelineSettings:

@@ -94,16 +94,16 @@ def register_survey(context: Context) -> None:
 def score_survey(context: Context) -> None:
     """Score the map and the survey side by side: class probabilities."""
     survey, version, settings = _asked(context)
-    detector = kept_detector(context, survey.model)
-    embedding = None
-    key = blob_keys.map_embedding(version.job_id, survey.model, detector.card.fingerprint)
-    if context.catalog.blobs.exists(key):
-        embedding = load(context, key, npz.load_arrays)
     comparison = _compared(context, survey, version, settings)
-    progress = scoring(context.report, encoded=embedding is not None)
-    detection = detector.detect(comparison, embedding=embedding, progress=progress)
-    if detection.voxels is not None:  # kept with the map, for the next step, which opens no network
-        kept_alarms(context, version, detector, survey.model, settings)
+    with kept_detector(context, survey.model) as detector:
+        embedding = None
+        key = blob_keys.map_embedding(version.job_id, survey.model, detector.card.fingerprint)
+        if context.catalog.blobs.exists(key):
+            embedding = load(context, key, npz.load_arrays)
+        progress = scoring(context.report, encoded=embedding is not None)
+        detection = detector.detect(comparison, embedding=embedding, progress=progress)
+        if detection.voxels is not None:  # kept with the map, for the next step, which opens no network
+            kept_alarms(context, version, detector, survey.model, settings)
     put(context, blob_keys.survey_scores(survey.survey_id), lambda path: npz.save(path, detection))
 
 

@@ -19,7 +19,7 @@ from worker.detectors.store import make_detector, read_card, resolve_device, set
 from worker.errors import Cancelled, GaveWay, TrainingFailed
 from worker.jobs import voxel_training
 from worker.jobs.maps import encode_reference
-from worker.jobs.models import card_that_fits, kept_detector, pipeline_settings
+from worker.jobs.models import card_that_fits, kept_detector, networks, pipeline_settings
 from worker.jobs.scans import kept_scan
 from worker.jobs.site_training_set import halves, held_out_share, training_set
 from worker.jobs.step import Context, put, step
@@ -90,7 +90,10 @@ def _is_over(context: Context) -> bool:
 
 def _train_pairs(context: Context, asked: _Asked, folder: Path, keep: Callable[[Path], None]) -> None:
     base = asked.model.base
-    start = None if base is None else weights_of(kept_detector(context, base))
+    start = None
+    if base is not None:
+        with kept_detector(context, base) as detector:
+            start = weights_of(detector)
     with context.catalog.blobs.local(blob_keys.model_tiles(context.job.job_id)) as tiles:
         train(
             _settings(context, asked, tiles),
@@ -113,10 +116,11 @@ def finish_model(context: Context) -> None:
         card, weights, log = _finished(context, asked, folder)
     except ValueError as error:  # files of an earlier release
         raise TrainingFailed(str(error)) from error
-    detector = make_detector(card, weights, context.settings.device)
+    device, runtime = context.settings.device, networks(context.settings).runtime
+    detector = make_detector(card, weights, device, runtime)
     if asked.voxels is not None:
         card = card.model_copy(update={"quiet": asked.voxels.quiet(context, card, detector)})
-        detector = make_detector(card, weights, context.settings.device)
+        detector = make_detector(card, weights, device, runtime)
     blobs.put_bytes(blob_keys.model_weights(context.job.job_id), weights)
     blobs.put_file(blob_keys.model_log(context.job.job_id), log)
     encode_reference(context, asked.version, detector, asked.model.model)
@@ -209,20 +213,21 @@ def _published(context: Context, asked: _Asked, best: Path, tiles: Path) -> Path
     model = asked.model
     other = model.base or asked.version.model
     title = replace(SITE, detector=asked.detector).network.title
-    return publish(
-        best,
-        tiles,
-        context.scratch / "models",
-        name=model.name,
-        version=str(model.version),
-        summary=f"{title} trained on version {model.map_version} of map {model.map_id}"
-        + ("" if model.base is None else f", from {model.base}"),
-        command=_command(model),
-        about={"map_id": model.map_id, "map_version": model.map_version, "base": model.base},
-        beside={other: kept_detector(context, other)},
-        base=model.base,
-        preprocessing=asked.card.preprocessing,
-    )
+    with kept_detector(context, other) as detector:
+        return publish(
+            best,
+            tiles,
+            context.scratch / "models",
+            name=model.name,
+            version=str(model.version),
+            summary=f"{title} trained on version {model.map_version} of map {model.map_id}"
+            + ("" if model.base is None else f", from {model.base}"),
+            command=_command(model),
+            about={"map_id": model.map_id, "map_version": model.map_version, "base": model.base},
+            beside={other: detector},
+            base=model.base,
+            preprocessing=asked.card.preprocessing,
+        )
 
 
 def _command(model: ModelRecord) -> str:

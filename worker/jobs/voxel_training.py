@@ -84,7 +84,8 @@ class VoxelTraining:
         """Train further, for so many minutes. Raises as `train_network` does."""
         samples = self._samples(context)
         kind = _kind_of(samples)
-        start = weights_under(kind, weights_of(kept_detector(context, self.base)))
+        with kept_detector(context, self.base) as detector:
+            start = weights_under(kind, weights_of(detector))
         settings = TRAINING.with_values(
             epochs=self.model.epochs or TRAINING.epochs,
             minutes=self.model.minutes,
@@ -104,7 +105,8 @@ class VoxelTraining:
         """Return card and weights of the better of base and trained network, and the log of the training."""
         samples = self._samples(context)
         kind = _kind_of(samples)
-        base = weights_of(kept_detector(context, self.base))
+        with kept_detector(context, self.base) as detector:
+            base = weights_of(detector)
         networks = {name: self._network(weights_under(name, base)) for name in (SEEING, BLIND)}
         state = load_checkpoint(folder / BEST.format(kind))
         held_out = [sample for sample in samples if sample.building % TRAINING.held_out == 0]

@@ -128,10 +128,17 @@ class _Collector:
         family = GaugeMetricFamily(
             "spicd_workers", "Workers by whether they answer", labels=("queue", "state")
         )
+        models = GaugeMetricFamily(
+            "spicd_inference_models_warm", "Models that the workers that answer keep open"
+        )
+        size = GaugeMetricFamily("spicd_inference_models_warm_bytes", "Weights of these models")
         for queue, held in self._look().queues.items():
             family.add_metric((queue, "answering"), len(held.answering))
             family.add_metric((queue, "silent"), len(held.silent))
-        return [family]
+            if queue == "inference":
+                models.add_metric((), held.models)
+                size.add_metric((), held.model_bytes)
+        return [family, models, size]
 
 
 def _by_status(counts: dict[str, int]) -> Metric:

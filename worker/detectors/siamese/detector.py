@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import ClassVar, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 import torch
@@ -19,12 +19,16 @@ from worker.cloud.types import Arrays, Points
 from worker.detectors.card import Card
 from worker.detectors.comparison import Comparison, Side
 from worker.detectors.detector import Detection
+from worker.detectors.precision import Precision, chosen_precision
+from worker.detectors.running.calls import NetworkCall
+from worker.detectors.running.runtime import Runtime
 from worker.detectors.siamese.chamfer import chamfer_statistics
 from worker.detectors.siamese.head import PairHead
 from worker.progress import Progress, no_progress
 
-#: Tiles between two calls of `progress`, so how soon a dismissed job stops: some 40 ms on two cores.
-TILES_PER_REPORT = 8
+#: Tiles of a batch on a processor, so between two calls of `progress`, and how soon a dismissed job stops: some 40 ms on
+#: two cores. More at once are no faster there.
+CPU_TILES = 8
 
 REFERENCE, CURRENT = 0, 1  #: streams of the Chamfer sample, so that two equal patches are not sampled alike
 
@@ -50,6 +54,10 @@ class SiameseSettings(StrictModel):
         return self
 
 
+#: Descriptors (D,) of both sides, and the two clouds that the Chamfer branch compares.
+_Compared = tuple[NDArray[np.float32], NDArray[np.float32], tuple[Points, Points]]
+
+
 class SiameseDetector(ABC):
     """Detector (worker.detectors.detector) around an encoder and the head of the paper's Section 3.6.
 
@@ -66,10 +74,34 @@ class SiameseDetector(ABC):
         self._device = device
         self._network = network.to(device).eval()
         self._head = head
+        self._batches = Runtime().batches
+        few = CPU_TILES if device.type == "cpu" else None
+        self._encoding = self._call("encode", self._descriptors_each, most=few)
+        self._comparing = self._call("compare", self._compare)
+
+    def run_with(self, runtime: Runtime) -> None:
+        """Run the network so from now on (worker.detectors.running.runtime)."""
+        self._batches = runtime.batches
+        holds = self.card.holds_in_bfloat16
+        self._use_precision(chosen_precision(runtime.precision, self._device, holds=holds))
+
+    def _use_precision(self, precision: Precision) -> None:
+        """Compute descriptors in this precision from now on."""
+        self._precision = precision
 
     @abstractmethod
     def _descriptors(self, patches: Sequence[Patch]) -> Tensor:
         """Encode a few patches, one at least, on the device: (n, D)."""
+
+    def _call(self, function: str, run: Any, most: int | None = None) -> NetworkCall[Any, Any]:
+        card = self.card
+        return NetworkCall(
+            model=card.model, function=function, fingerprint=card.fingerprint, run=run, most=most
+        )
+
+    def _descriptors_each(self, patches: Sequence[Patch]) -> list[NDArray[np.float32]]:
+        """Encode patches in one batch: a descriptor (D,) of each."""
+        return list(self._descriptors(patches).cpu().numpy())
 
     def weights(self) -> dict[str, Tensor]:
         """Return what `load` takes, to train further from."""
@@ -104,7 +136,7 @@ class SiameseDetector(ABC):
         else:
             known = self._selected(embedding, observed, tiles=len(pairs.observed))
         seen = self._encoded(after, progress, "scoring")
-        probabilities[observed] = self._probabilities(known, seen, self._statistics(before, after))
+        probabilities[observed] = self._probabilities(known, seen, self._pairs(before, after), progress)
         return Detection(probabilities=probabilities)
 
     def _both(self, pairs: TilePairs, chosen: NDArray[np.intp]) -> tuple[list[Patch], list[Patch]]:
@@ -127,38 +159,55 @@ class SiameseDetector(ABC):
 
     def _encoded(self, patches: Sequence[Patch], progress: Progress, stage: str) -> NDArray[np.float32]:
         """Return the descriptors (t, D)."""
-        descriptors = np.empty((len(patches), self._head.descriptor), dtype=np.float32)
-        for start in range(0, len(patches), TILES_PER_REPORT):
-            progress(stage, start / len(patches))
-            few = slice(start, start + TILES_PER_REPORT)
-            descriptors[few] = self._descriptors(patches[few]).cpu().numpy()
-        progress(stage, 1.0)
-        return descriptors
+        if not patches:
+            progress(stage, 1.0)
+            return np.empty((0, self._head.descriptor), np.float32)
 
-    def _statistics(self, before: Sequence[Patch], after: Sequence[Patch]) -> Tensor:
-        return chamfer_statistics(self._compared(before, REFERENCE), self._compared(after, CURRENT))
+        def done(count: int) -> None:
+            progress(stage, count / len(patches))
 
-    def _compared(self, patches: Sequence[Patch], stream: int) -> list[Tensor]:
-        """Return what of each patch the Chamfer branch sees, (n, 3)."""
+        return np.stack(self._batches.run(self._encoding, patches, done))
+
+    def _pairs(self, before: Sequence[Patch], after: Sequence[Patch]) -> list[tuple[Points, Points]]:
+        """Return what of each pair of patches the Chamfer branch sees, (n, 3) and (m, 3)."""
+        return list(zip(self._compared(before, REFERENCE), self._compared(after, CURRENT), strict=True))
+
+    def _compared(self, patches: Sequence[Patch], stream: int) -> list[Points]:
         settings = self._settings
         if settings.chamfer_points is None:
-            clouds = [prepared.distinct for prepared in patches]
-        else:
-            places = np.random.default_rng((settings.seed, stream)).choice(
-                settings.patch_points, settings.chamfer_points, replace=False
-            )
-            clouds = [prepared.points_at(places) for prepared in patches]
-        return [torch.from_numpy(cloud).to(self._device) for cloud in clouds]
+            return [prepared.distinct for prepared in patches]
+        places = np.random.default_rng((settings.seed, stream)).choice(
+            settings.patch_points, settings.chamfer_points, replace=False
+        )
+        return [prepared.points_at(places) for prepared in patches]
+
+    def _probabilities(
+        self,
+        reference: NDArray[np.float32],
+        current: NDArray[np.float32],
+        clouds: Sequence[tuple[Points, Points]],
+        progress: Progress,
+    ) -> NDArray[np.float32]:
+        """Classify descriptors (t, D) of both sides and t pairs of clouds: (t, 3).
+
+        A processor does it in the thread that asks, where k-d trees of several steps go side by side.
+        """
+        items = list(zip(reference, current, clouds, strict=True))
+        if self._device.type == "cpu":
+            return np.stack(self._compare(items))
+        return np.stack(self._batches.run(self._comparing, items, lambda _: progress("scoring", 1.0)))
 
     @torch.inference_mode()
-    def _probabilities(
-        self, reference: NDArray[np.float32], current: NDArray[np.float32], statistics: Tensor
-    ) -> NDArray[np.float32]:
-        """Classify descriptors (t, D) of both sides and statistics (t, 8): (t, 3)."""
-        f_ref, f_cur = (torch.from_numpy(side).to(self._device) for side in (reference, current))
-        logits: Tensor = self._head(f_ref, f_cur, statistics)
-        probabilities: NDArray[np.float32] = logits.softmax(dim=1).cpu().numpy()
-        return probabilities
+    def _compare(self, items: Sequence[_Compared]) -> list[NDArray[np.float32]]:
+        """Classify pairs in one batch: probabilities (3,) of each."""
+        references, currents, clouds = zip(*items, strict=True)
+        f_ref, f_cur = (self._placed(np.stack(side)) for side in (references, currents))
+        before, after = ([self._placed(cloud) for cloud in side] for side in zip(*clouds, strict=True))
+        logits: Tensor = self._head(f_ref, f_cur, chamfer_statistics(before, after))
+        return list(logits.softmax(dim=1).cpu().numpy())
+
+    def _placed(self, array: NDArray[np.float32]) -> Tensor:
+        return torch.from_numpy(array).to(self._device)
 
     def _selected(self, embedding: Arrays, observed: NDArray[np.intp], *, tiles: int) -> NDArray[np.float32]:
         descriptors, expected = embedding.get("descriptors"), (tiles, self._head.descriptor)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Self
 
 import numpy as np
@@ -12,7 +13,10 @@ from torch import Tensor
 
 from worker.cloud.settings import StrictModel
 from worker.detectors.card import Card
-from worker.detectors.voxel_net.network import WIDTHS, VoxelNetwork, probabilities
+from worker.detectors.precision import Precision, chosen_precision
+from worker.detectors.running.calls import NetworkCall
+from worker.detectors.running.runtime import Runtime
+from worker.detectors.voxel_net.network import WIDTHS, Looked, VoxelNetwork, probabilities_each
 from worker.detectors.voxels.evidence import Evidence, EvidenceSettings
 from worker.detectors.voxels.scores import Scorer, TileScoreSettings
 
@@ -20,6 +24,9 @@ Weights = dict[str, Tensor]
 
 #: The two networks of a model, by the prefix of their weights' names.
 SEEING, BLIND = "seeing", "blind"  #: with free space, and for clouds without a sensor's place
+
+
+A_TILES_VOXELS = 4096  #: that take about the memory of a patch, by which batches are measured
 
 
 class VoxelNetSettings(StrictModel):
@@ -45,6 +52,27 @@ class VoxelNet(Scorer):
         super().__init__(card, settings.evidence, settings.tiles)
         self._networks = {name: network.to(device).eval() for name, network in networks.items()}
         self._device = device
+        self._precision: Precision = "float32"
+        self._batches = Runtime().batches
+        self._calls = {name: self._call(name) for name in networks}
+
+    def run_with(self, runtime: Runtime) -> None:
+        """Run the networks so from now on (worker.detectors.running.runtime)."""
+        self._batches = runtime.batches
+        holds = self.card.holds_in_bfloat16
+        self._precision = chosen_precision(runtime.precision, self._device, holds=holds)
+
+    def _call(self, name: str) -> NetworkCall[Looked, NDArray[np.float32]]:
+        def run(clouds: Sequence[Looked]) -> list[NDArray[np.float32]]:
+            return probabilities_each(self._networks[name], clouds, self._device, self._precision)
+
+        return NetworkCall(
+            model=self.card.model,
+            function=name,
+            fingerprint=self.card.fingerprint,
+            run=run,
+            size=lambda cloud: max(1, len(cloud.channels) // A_TILES_VOXELS),
+        )
 
     @classmethod
     def load(cls, card: Card, weights: Weights, device: torch.device) -> Self:
@@ -61,8 +89,10 @@ class VoxelNet(Scorer):
 
     def score(self, evidence: Evidence, *, free_space: bool) -> NDArray[np.float32]:
         """Return (N,) the network's probabilities."""
-        network = self._networks[SEEING if free_space else BLIND]
-        return probabilities(network, evidence.keys, evidence.channels, self._device)
+        name = SEEING if free_space else BLIND
+        cloud = Looked.at(self._networks[name], evidence.keys, evidence.channels)
+        (told,) = self._batches.run(self._calls[name], [cloud], lambda _: None)
+        return told
 
 
 def joined(states: dict[str, Weights]) -> Weights:

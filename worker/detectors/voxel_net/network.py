@@ -6,13 +6,25 @@ map and survey swaps its two answers bit for bit.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from worker.cloud.voxel_keys import Keys
-from worker.detectors.voxel_net.sparse import CHILDREN, Convolution, Level, Merge, Split, pyramid
+from worker.detectors.precision import Precision, autocast
+from worker.detectors.voxel_net.sparse import (
+    CHILDREN,
+    Convolution,
+    Level,
+    Merge,
+    Split,
+    pyramid,
+    side_by_side,
+)
 from worker.detectors.voxels.evidence import CHANNELS
 
 WIDTHS = (16, 24, 32)
@@ -70,11 +82,34 @@ class VoxelNetwork(nn.Module):
         return logits
 
 
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class Looked:
+    """What the network is asked of one cloud, prepared on the processor."""
+
+    channels: NDArray[np.float32]  #: (N, 12)
+    levels: list[Level]  #: the pyramid over the N voxels
+
+    @classmethod
+    def at(cls, network: VoxelNetwork, keys: Keys, channels: NDArray[np.float32]) -> Looked:
+        """Prepare voxels of ascending keys (N,)."""
+        return cls(channels=channels, levels=pyramid(keys, network.levels))
+
+
 @torch.inference_mode()
+def probabilities_each(
+    network: VoxelNetwork, clouds: Sequence[Looked], device: torch.device, precision: Precision = "float32"
+) -> list[NDArray[np.float32]]:
+    """Return (N,) probabilities of the voxels of each cloud, which see nothing of each other."""
+    levels = [level.to(device) for level in side_by_side([cloud.levels for cloud in clouds])]
+    channels = torch.from_numpy(np.concatenate([cloud.channels for cloud in clouds])).to(device)
+    with autocast(device, precision):
+        logits = network(channels, levels)
+    told = torch.sigmoid(logits.float()).cpu().numpy()
+    return np.split(told, np.cumsum([len(cloud.channels) for cloud in clouds])[:-1])
+
+
 def probabilities(
     network: VoxelNetwork, keys: Keys, channels: NDArray[np.float32], device: torch.device
 ) -> NDArray[np.float32]:
     """Return (N,) probabilities of voxels of ascending keys (N,)."""
-    levels = [level.to(device) for level in pyramid(keys, network.levels)]
-    logits = network(torch.from_numpy(channels).to(device), levels)
-    return torch.sigmoid(logits).float().cpu().numpy()
+    return probabilities_each(network, [Looked.at(network, keys, channels)], device)[0]

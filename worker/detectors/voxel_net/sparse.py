@@ -6,7 +6,9 @@ occupied cells have features, and only they get some.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 from typing import Any
 
 import numpy as np
@@ -58,6 +60,36 @@ def pyramid(keys: Keys, levels: int) -> list[Level]:
         )
         finer = cells
     return made
+
+
+def side_by_side(pyramids: Sequence[Sequence[Level]]) -> list[Level]:
+    """Return the pyramid over the voxels of several, one behind the other, of which no cell has a neighbour in another."""
+    if len(pyramids) == 1:
+        return list(pyramids[0])
+    return [_joined(levels) for levels in zip(*pyramids, strict=True)]
+
+
+def _joined(levels: Sequence[Level]) -> Level:
+    cells = [len(level.neighbours) for level in levels]
+    finer = [len(level.parent) for level in levels]
+    first_cell, first_finer = list(accumulate(cells, initial=0)), list(accumulate(finer, initial=0))
+    return Level(
+        neighbours=_stacked([level.neighbours for level in levels], cells, first_cell),
+        children=_stacked([level.children for level in levels], finer, first_finer),
+        parent=torch.cat([level.parent + begin for level, begin in zip(levels, first_cell, strict=False)]),
+        child=torch.cat([level.child for level in levels]),
+    )
+
+
+def _stacked(tables: Sequence[Tensor], counts: Sequence[int], begins: Sequence[int]) -> Tensor:
+    """Stack tables of rows, each of which has its count for none, so that each row is found behind those before."""
+    none = begins[-1]
+    return torch.cat(
+        [
+            torch.where(table == count, none, table + begin)
+            for table, count, begin in zip(tables, counts, begins, strict=False)
+        ]
+    )
 
 
 def _child_of(keys: Keys) -> NDArray[np.int64]:
