@@ -38,6 +38,10 @@ class SpicdNetSettings(StrictModel):
         gt=0,
         description="of each patch, that are compared; null: all, where the paper takes 128",
     )
+    counts: bool = Field(
+        default=False,
+        description="whether the head is given, beside the paper's statistics, how many points are more and far",
+    )
     seed: int = Field(description="of FPS and of the Chamfer sample")
 
     @model_validator(mode="after")
@@ -68,7 +72,7 @@ class SpicdNet:
     @classmethod
     def load(cls, card: Card, weights: dict[str, Tensor], device: torch.device) -> SpicdNet:
         """Open a model. Raises RuntimeError for weights of another network, ValueError for unsound settings."""
-        network = SpicdNetwork()
+        network = SpicdNetwork(counts=card.settings_as(SpicdNetSettings).counts)
         network.load_state_dict(weights)
         return cls(card, network, device)
 
@@ -140,7 +144,8 @@ class SpicdNet:
         return descriptors
 
     def _statistics(self, before: Sequence[Patch], after: Sequence[Patch]) -> Tensor:
-        return chamfer_statistics(self._compared(before, REFERENCE), self._compared(after, CURRENT))
+        compared = self._compared(before, REFERENCE), self._compared(after, CURRENT)
+        return chamfer_statistics(*compared, counts=self._settings.counts)
 
     def _compared(self, patches: Sequence[Patch], stream: int) -> list[Tensor]:
         """Return what of each patch the Chamfer branch sees, (n, 3)."""
@@ -158,7 +163,7 @@ class SpicdNet:
     def _probabilities(
         self, reference: NDArray[np.float32], current: NDArray[np.float32], statistics: Tensor
     ) -> NDArray[np.float32]:
-        """Classify descriptors (t, 1024) of both sides and statistics (t, 8): (t, 3)."""
+        """Classify descriptors (t, 1024) of both sides and statistics (t, 8 or 16): (t, 3)."""
         f_ref, f_cur = (torch.from_numpy(side).to(self._device) for side in (reference, current))
         logits: Tensor = self._network.head(f_ref, f_cur, statistics)
         probabilities: NDArray[np.float32] = logits.softmax(dim=1).cpu().numpy()

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from worker.detectors.spicd_net.chamfer import STATISTICS, chamfer_statistics
+from worker.detectors.spicd_net.chamfer import COUNTS, STATISTICS, chamfer_statistics
 from worker.detectors.spicd_net.layers import NormedLinear, PooledLinear
 
 DESCRIPTOR = 1024
@@ -83,12 +83,16 @@ class PointEncoder(nn.Module):
 
 
 class PairHead(nn.Module):
-    """Two descriptors and the Chamfer statistics to three logits (paper, Sections 3.6.2 to 3.6.4)."""
+    """Two descriptors and the statistics of a pair to three logits (paper, Sections 3.6.2 to 3.6.4).
 
-    def __init__(self) -> None:
+    The paper's statistics are the eight of the Chamfer branch; with `counts` eight of point counts stand beside them.
+    """
+
+    def __init__(self, *, counts: bool = False) -> None:
         super().__init__()
+        self.statistics = STATISTICS + COUNTS * counts
         self.chamfer = nn.Sequential(
-            nn.Linear(STATISTICS, 64), nn.ReLU(), nn.Linear(64, CHAMFER_FEATURES), nn.ReLU()
+            nn.Linear(self.statistics, 64), nn.ReLU(), nn.Linear(64, CHAMFER_FEATURES), nn.ReLU()
         )
         self.classifier = nn.Sequential(
             nn.Linear(2 * DESCRIPTOR + CHAMFER_FEATURES, 256),
@@ -101,7 +105,7 @@ class PairHead(nn.Module):
         )
 
     def forward(self, reference: Tensor, current: Tensor, statistics: Tensor) -> Tensor:
-        """(B, 1024), (B, 1024), (B, 8) -> (B, 3) logits"""
+        """(B, 1024), (B, 1024), (B, 8 or 16) -> (B, 3) logits"""
         geometry = self.chamfer(statistics)
         if self.training:
             geometry = geometry * (torch.rand(len(geometry), 1, device=geometry.device) >= CHAMFER_GATING)
@@ -115,7 +119,7 @@ class PairHead(nn.Module):
         The statistics differ by centimetres and the products are some ten, so that at first the head would
         hear of nothing but the products. Same arguments as `forward`.
         """
-        _standardise(self.chamfer[0], statistics, blocks=(STATISTICS,))
+        _standardise(self.chamfer[0], statistics, blocks=(self.statistics,))
         inputs = fused(reference, current, self.chamfer(statistics))
         _standardise(self.classifier[0], inputs, blocks=(DESCRIPTOR, DESCRIPTOR, CHAMFER_FEATURES))
 
@@ -137,12 +141,13 @@ def _standardise(layer: nn.Module, inputs: Tensor, *, blocks: tuple[int, ...]) -
 
 
 class SpicdNetwork(nn.Module):
-    """Shared encoder, fusion and head."""
+    """Shared encoder, fusion and head; with `counts` the head is given those of `chamfer.py` too."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, counts: bool = False) -> None:
         super().__init__()
+        self.counts = counts
         self.encoder = PointEncoder()
-        self.head = PairHead()
+        self.head = PairHead(counts=counts)
 
     def forward(
         self, points: Tensor, sizes: list[int], chamfer_points: Tensor, chamfer_sizes: list[int]
@@ -157,7 +162,8 @@ class SpicdNetwork(nn.Module):
         f_ref, f_cur = descriptors.chunk(2)
         compared = torch.split(chamfer_points, chamfer_sizes)
         half = len(compared) // 2
-        logits = self.head(f_ref, f_cur, chamfer_statistics(compared[:half], compared[half:]))
+        statistics = chamfer_statistics(compared[:half], compared[half:], counts=self.counts)
+        logits = self.head(f_ref, f_cur, statistics)
         return PairOutput(logits, (*a3.chunk(2), *a64.chunk(2)))
 
 

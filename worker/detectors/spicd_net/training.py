@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from worker.cloud.patches import patch
 from worker.cloud.types import Points
-from worker.detectors.spicd_net.chamfer import STATISTICS, chamfer_statistics
+from worker.detectors.spicd_net.chamfer import chamfer_statistics, swapped
 from worker.detectors.spicd_net.frozen import FrozenEncoder
 from worker.detectors.spicd_net.layers import PooledLinear
 from worker.detectors.spicd_net.network import DESCRIPTOR, PairHead, PairOutput, SpicdNetwork
@@ -46,10 +46,11 @@ class SpicdNetTraining:
     patch_points: int
     chamfer_points: int | None
     seed: int
+    counts: bool = False
 
     def build(self, *, coarse_search: bool = False) -> SpicdNetwork:
         """Return the network before training; a coarse search is that of PooledLinear."""
-        network = SpicdNetwork()
+        network = SpicdNetwork(counts=self.counts)
         for module in network.modules():
             if isinstance(module, PooledLinear):
                 module.coarse_search = coarse_search
@@ -103,7 +104,8 @@ class SpicdNetTraining:
             sides.append([side[same_place] for side in network.encoder(points, batch.sizes)[0].chunk(2)])
             clouds = torch.split(compared, batch.chamfer_sizes)
             half = len(clouds) // 2
-            statistics.append(chamfer_statistics(clouds[:half], clouds[half:])[same_place])
+            compared_here = chamfer_statistics(clouds[:half], clouds[half:], counts=self.counts)
+            statistics.append(compared_here[same_place])
         reference, current = (torch.cat(side) for side in zip(*sides, strict=True))
         network.head.initialize_from_data(reference, current, torch.cat(statistics))
 
@@ -130,15 +132,16 @@ class SpicdNetTraining:
         return descriptors, compared
 
     def compare(self, references: Sequence[Tensor], currents: Sequence[Tensor]) -> NDArray[np.float32]:
-        """Return the Chamfer statistics (n, 8)."""
+        """Return the statistics (n, 8 or 16)."""
         if not references:
-            return np.zeros((0, STATISTICS), np.float32)
-        statistics: NDArray[np.float32] = chamfer_statistics(references, currents).numpy()
+            return np.zeros((0, PairHead(counts=self.counts).statistics), np.float32)
+        statistics: NDArray[np.float32] = chamfer_statistics(references, currents, counts=self.counts).numpy()
         return statistics
 
     def swapped(self, statistics: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Exchange the four of one direction for those of the other, (n, 8) -> (n, 8)."""
-        return np.roll(statistics, STATISTICS // 2, axis=1)
+        """Exchange what is of one direction for what is of the other, (n, S) -> (n, S)."""
+        exchanged: NDArray[np.float32] = swapped(torch.from_numpy(statistics)).numpy()
+        return exchanged
 
     def _compared(self, distinct: Points, rng: np.random.Generator) -> Points:
         """Return all points, or a new draw without replacement from the padded patch (paper, Section 3.6.3)."""
