@@ -22,8 +22,10 @@ from worker.progress import Progress, no_progress
 from worker.training.dataset import TileSet
 from worker.training.pairs import PairSettings, changed, noisy
 
-#: Shares of the unchanged pairs by what they are of.
-UNCHANGED_SHARES = {"revisit": 0.50, "beside": 0.30, "untouched": 0.15, "stored": 0.05}
+#: Shares of the unchanged pairs by what they are of: of those of two visits, and of those that are still, which are
+#: as many of them as of the changed ones. Otherwise that a pair is still would say what it is.
+OF_VISITS = {"revisit": 0.625, "beside": 0.375}
+STILL = {"untouched": 0.75, "stored": 0.25}
 NOISY = " noisy"  #: behind the kind of a pair that is still but for noise
 DIFFERENT_EACH = 2  #: pairs of different tiles that are kept for each tile
 
@@ -204,8 +206,10 @@ def _compared(
 
 def _shares(kinds: dict[str, PooledPairs], settings: PairSettings) -> dict[str, float]:
     """Return the shares of all pairs, by kind; what a class lacks goes to its other kinds."""
+    visits = max(1 - settings.rebuilt_share, 0.0)
     within = {
-        **UNCHANGED_SHARES,
+        **{kind: visits * share for kind, share in OF_VISITS.items()},
+        **{kind: settings.rebuilt_share * share for kind, share in STILL.items()},
         "whole": settings.edited_share,
         "rebuilt": settings.rebuilt_share,
         "synthetic": _synthetic_share(settings) if {"whole", "rebuilt"} & kinds.keys() else 1.0,

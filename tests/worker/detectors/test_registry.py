@@ -16,7 +16,7 @@ def test_every_entry_names_a_class_that_opens_models(key: str) -> None:
 
 def test_a_network_is_made_of_the_settings_of_its_detector() -> None:
     assert trainable_detectors() == ["spicd-net"]
-    settings = {"patch_points": 256, "chamfer_points": None, "seed": 1}
+    settings = {"patch_points": 256, "chamfer_points": None, "counts": True, "seed": 1}
     assert set(detector_class("spicd-net").settings_class.model_fields) == set(settings)
     assert network_class("spicd-net")(**settings).title == "SPICD-Net"
 

@@ -26,7 +26,7 @@ SETTINGS = TrainSettings(
     head_learning_rate=2e-3,
     head_validation_pairs=120,
     held_out=0.2,
-    pairs=PairSettings(patch_points=256),
+    pairs=PairSettings(patch_points=256, edited_share=0.5),
 )
 
 
