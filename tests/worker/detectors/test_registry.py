@@ -19,7 +19,7 @@ def test_every_entry_names_a_class_that_opens_models(key: str) -> None:
     [("kpconv", "Siamese-KPConv"), ("pointnet2", "Siamese-PointNet++"), ("spicd-net", "SPICD-Net")],
 )
 def test_a_network_is_made_of_the_settings_of_its_detector(key: str, title: str) -> None:
-    settings = {"patch_points": 256, "chamfer_points": None, "seed": 1}
+    settings = {"patch_points": 256, "chamfer_points": None, "counts": True, "seed": 1}
     assert set(detector_class(key).settings_class.model_fields) == set(settings)
     assert network_class(key)(**settings).title == title
 

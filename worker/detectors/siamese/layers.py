@@ -77,14 +77,15 @@ class NormedLinear(nn.Module):
 class Moments(torch.autograd.Function):
     """Mean (C,) and covariance (C, C) of rows (P, C), with the one product that their gradient takes.
 
-    Both are float32, also of rows in bfloat16.
+    Of rows in bfloat16 both are float32.
     """
 
     @staticmethod
     def forward(ctx: Any, rows: Tensor) -> tuple[Tensor, Tensor]:
-        mean = rows.mean(0, dtype=torch.float32)
+        exact = torch.promote_types(rows.dtype, torch.float32)
+        mean = rows.mean(0, dtype=exact)
         # Inputs are centred points or rectified unit-variance features, so this difference loses little.
-        covariance = (rows.t() @ rows).float() / len(rows) - mean[:, None] * mean
+        covariance = (rows.t() @ rows).to(exact) / len(rows) - mean[:, None] * mean
         ctx.save_for_backward(rows, mean)
         return mean, covariance
 

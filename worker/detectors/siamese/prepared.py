@@ -53,12 +53,13 @@ def starts(sizes: Sequence[int]) -> list[int]:
 
 
 class SiameseNetwork(nn.Module, Generic[C]):
-    """A shared encoder and the head."""
+    """A shared encoder and the head; with `counts` the head is given those of `chamfer.py` too."""
 
-    def __init__(self, encoder: PreparedEncoder[C]) -> None:
+    def __init__(self, encoder: PreparedEncoder[C], *, counts: bool = False) -> None:
         super().__init__()
+        self.counts = counts
         self.encoder = encoder
-        self.head = PairHead(encoder.descriptor)
+        self.head = PairHead(encoder.descriptor, counts=counts)
 
     def forward(self, clouds: C, references: Sequence[Tensor], currents: Sequence[Tensor]) -> Tensor:
         """Classify B pairs: (B, 3) logits.
@@ -67,7 +68,8 @@ class SiameseNetwork(nn.Module, Generic[C]):
         the Chamfer branch compares, B clouds (n, 3) each, metres, tile-centre frame.
         """
         f_ref, f_cur = self.encoder(clouds).chunk(2)
-        logits: Tensor = self.head(f_ref, f_cur, chamfer_statistics(references, currents))
+        statistics = chamfer_statistics(references, currents, counts=self.counts)
+        logits: Tensor = self.head(f_ref, f_cur, statistics)
         return logits
 
 
@@ -89,7 +91,7 @@ class PreparedTraining(SiameseTraining[PreparedBatch[C]]):
         """Return the network before training; with a coarse search its encoder may take steps in bfloat16."""
         encoder = self.encoder_class()
         encoder.coarse = coarse_search
-        return SiameseNetwork(encoder)
+        return SiameseNetwork(encoder, counts=self.counts)
 
     def collate(self, pairs: Sequence[Pair], rng: np.random.Generator) -> PreparedBatch[C]:
         """Prepare references before currents."""

@@ -26,7 +26,9 @@ class PreparedDetector(SiameseDetector):
     @classmethod
     def load(cls, card: Card, weights: dict[str, Tensor], device: torch.device) -> Self:
         """Open a model. Raises RuntimeError for weights of another network, ValueError for unsound settings."""
-        network: SiameseNetwork[Any] = SiameseNetwork(cls.encoder_class())
+        network: SiameseNetwork[Any] = SiameseNetwork(
+            cls.encoder_class(), counts=card.settings_as(cls.settings_class).counts
+        )
         network.load_state_dict(weights)
         return cls(card, network, device)
 
