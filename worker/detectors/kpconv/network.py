@@ -1,4 +1,4 @@
-"""The encoder of KPConv, rigid, as its authors classify with it (Thomas et al. 2019, Section 3.3): four levels of five.
+"""The encoder of KPConv, rigid (Thomas et al. 2019, Section 3.3): four of its authors' five levels, and their mean.
 
 Every convolution of a level has the same kernel points, so the correlations are computed once a level. They are few:
 a kernel point acts on a fifteenth of the ball or so. So they are a sparse matrix, and no neighbourhood is padded.
