@@ -81,6 +81,19 @@ class Stage(nn.Module):
         self.go_on = Residual(outputs // 2 if first else outputs, outputs)
         self.rise = None if last else Residual(outputs, outputs)
 
+    def forward(
+        self, features: Tensor, around: Tensor, rising: Tensor | None = None, below: Neighbours | None = None
+    ) -> Tensor:
+        """Return features of the next level, or on the last of this; (n, inputs) -> (C, outputs).
+
+        `around` are the correlations within the level, `rising` those of the next level's points with its `below`.
+        """
+        features = self.go_on(around, self.begin(around, features))
+        if self.rise is None:
+            return features
+        risen: Tensor = self.rise(rising, features, below)
+        return risen
+
 
 class KPConvEncoder(PreparedEncoder[Pyramid]):
     """Points to a descriptor: the mean over the last level."""
@@ -108,14 +121,15 @@ class KPConvEncoder(PreparedEncoder[Pyramid]):
         points = [torch.from_numpy(level).to(device) for level in clouds.points]
         features = torch.cat([torch.ones_like(points[0][:, :1]), points[0]], dim=1)
         for level, stage in enumerate(self.stages):
-            kernel = self.kernel * (CELL * 2**level)
             sigma, here = CELL * 2**level, points[level]
+            kernel = self.kernel * sigma
             around = correlations(here, here, clouds.within[level], kernel, sigma)
-            features = stage.go_on(around, stage.begin(around, features))
-            if stage.rise is not None:
-                below = clouds.below[level]
-                rising = correlations(points[level + 1], here, below, kernel, sigma)
-                features = stage.rise(rising, features, below)
+            if level == LEVELS - 1:
+                features = stage(features, around)
+                break
+            below = clouds.below[level]
+            rising = correlations(points[level + 1], here, below, kernel, sigma)
+            features = stage(features, around, rising, below)
         return torch.stack([cloud.mean(dim=0) for cloud in torch.split(features, clouds.sizes)])
 
 

@@ -9,6 +9,7 @@ import torch
 from worker.detectors.kpconv.network import (
     KernelPointConvolution,
     KPConvEncoder,
+    Stage,
     correlations,
     highest,
 )
@@ -37,6 +38,7 @@ def test_a_kernel_point_acts_on_a_neighbour_linearly_less_with_distance():
 def test_a_convolution_adds_up_the_weighted_neighbours_of_each_kernel_point_by_hand():
     convolution = KernelPointConvolution(1, 1).eval()
     with torch.no_grad():
+        assert convolution.unary.norm.running_var is not None
         convolution.unary.norm.running_var.fill_(1 - 1e-5)
         convolution.unary.linear.weight.zero_()
         convolution.unary.linear.weight[0, :2] = torch.tensor([10.0, 1.0])
@@ -89,7 +91,8 @@ def test_a_descriptor_is_the_mean_of_the_last_level():
     clouds = [(rng.uniform(-0.5, 0.5, (n, 3)) * (1.5, 1.5, 0.1)).astype(np.float32) for n in (500, 200)]
     seen = []
     last = encoder.stages[-1]
-    last.go_on.register_forward_hook(lambda _module, _given, made: seen.append(made))
+    assert isinstance(last, Stage)
+    last.register_forward_hook(lambda _module, _given, made: seen.append(made))
     made = encoder.prepare(clouds)
     with torch.inference_mode():
         descriptors = encoder(made)

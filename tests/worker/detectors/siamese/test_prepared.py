@@ -107,11 +107,12 @@ def test_a_kept_embedding_gives_the_same_scores_and_is_not_computed_again(detect
     fresh = detector.detect(comparison)
     encoded: list[int] = []
     prepare = detector.encoder_class.prepare
-    monkeypatch.setattr(
-        detector.encoder_class,
-        "prepare",
-        staticmethod(lambda clouds: encoded.append(len(clouds)) or prepare(clouds)),
-    )
+
+    def counted(clouds):
+        encoded.append(len(clouds))
+        return prepare(clouds)
+
+    monkeypatch.setattr(detector.encoder_class, "prepare", staticmethod(counted))
     kept = detector.detect(comparison, embedding=embedding)
     assert np.array_equal(kept.probabilities, fresh.probabilities, equal_nan=True)
     assert sum(encoded) == pairs.observed.sum()
