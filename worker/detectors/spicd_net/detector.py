@@ -10,7 +10,7 @@ from torch import Tensor
 from worker.cloud.patches import Patch
 from worker.detectors.card import Card
 from worker.detectors.precision import Precision
-from worker.detectors.siamese.detector import SiameseDetector
+from worker.detectors.siamese.detector import SiameseDetector, SiameseSettings
 from worker.detectors.spicd_net.frozen import FrozenEncoder
 from worker.detectors.spicd_net.network import SpicdNetwork
 from worker.detectors.spicd_net.together import TogetherEncoder, level
@@ -27,7 +27,7 @@ class SpicdNet(SiameseDetector):
     @classmethod
     def load(cls, card: Card, weights: dict[str, Tensor], device: torch.device) -> SpicdNet:
         """Open a model. Raises RuntimeError for weights of another network, ValueError for unsound settings."""
-        network = SpicdNetwork()
+        network = SpicdNetwork(counts=card.settings_as(SiameseSettings).counts)
         network.load_state_dict(weights)
         return cls(card, network, device)
 

@@ -10,7 +10,7 @@ from torch import nn
 
 from worker.detectors.card import MODEL_STORE
 from worker.detectors.precision import has_bfloat16
-from worker.detectors.siamese.chamfer import chamfer_statistics, nearest_distances
+from worker.detectors.siamese.chamfer import chamfer_statistics, nearest_distances, swapped
 from worker.detectors.siamese.head import PairHead, fused
 from worker.detectors.siamese.layers import Moments, NormedLinear, PooledLinear
 from worker.detectors.spicd_net.frozen import FrozenEncoder
@@ -199,6 +199,26 @@ def test_clouds_of_a_batch_are_compared_pair_by_pair_whatever_their_sizes():
     together = chamfer_statistics(clouds[:2], clouds[2:])
     alone = [chamfer_statistics([clouds[i]], [clouds[i + 2]])[0] for i in range(2)]
     assert torch.equal(together, torch.stack(alone))
+
+
+def test_point_counts_by_hand_three_points_more_of_which_two_are_far():
+    before = torch.arange(20.0)[:, None] * torch.tensor([1.0, 0.0, 0.0])
+    added = torch.tensor([[0.0, 0.03, 0.0], [1.0, 0.06, 0.0], [2.0, 0.3, 0.0]])  # beyond 2.5; 5; all three
+    counts = chamfer_statistics([before], [torch.cat([before, added])], counts=True)[0, 8:]
+    expected = torch.tensor([-4.0, 1, 1, 1, 4, 4, 3, 2]).abs().log() * torch.tensor([-1.0] + [1.0] * 7)
+    assert torch.allclose(counts, expected)
+
+
+def test_of_a_pair_turned_round_every_statistic_is_turned_round():
+    a, b = torch.rand(200, 3), torch.rand(150, 3)
+    forth, back = (chamfer_statistics([one], [other], counts=True) for one, other in ((a, b), (b, a)))
+    assert torch.allclose(swapped(forth), back)
+    assert torch.allclose(swapped(forth[:, :8]), back[:, :8])
+    assert forth[0, 8] == -back[0, 8]  # fifty points fewer, fifty more
+
+
+def test_a_head_with_counts_has_sixteen_statistics_and_one_without_the_papers_eight():
+    assert [PairHead(1024, counts=counts).chamfer[0].in_features for counts in (False, True)] == [8, 16]
 
 
 def test_the_tree_finds_the_distances_of_all_pairs(monkeypatch):
