@@ -81,7 +81,7 @@ def bench(settings: BenchSettings, progress: Progress = no_progress) -> Document
     with TemporaryDirectory(prefix="spicd-bench-") as name:
         folder = Path(name)
         progress("simulating", 0.0)
-        first, second = (_visit(settings, number, folder) for number in range(2))
+        first, second = (simulated_visit(settings, number, folder) for number in range(2))
         clock = StageClock(progress)
         files = scan_files(first)
         built = build_map(files, settings=pipeline, progress=clock)
@@ -96,13 +96,13 @@ def bench(settings: BenchSettings, progress: Progress = no_progress) -> Document
             _survey(file, built, seen, embedding, detector, pipeline, folder)
             for file in (one, replace(one, pose=None))
         )
-        pairs = _full_visit(second, built, frame)
+        pairs = full_visit(second, built, frame)
         rows: list[Document] = []
         if seen is None:
             pairs = resized(pairs, settings.tiles)
             runs = ways(pairs, detector)
         else:
-            comparison = _full_comparison(second, built, frame, seen, pipeline)
+            comparison = full_comparison(second, built, frame, seen, pipeline)
             runs, rows = voxel_ways(pairs, comparison, detector), scaling(comparison, detector, progress)
         scoring = scoring_bench(pairs, runs, repeats=settings.repeats, progress=progress)
     errors = [scan.error for scan in placed_scans(built.outcomes, first, frame)]
@@ -128,7 +128,7 @@ def bench(settings: BenchSettings, progress: Progress = no_progress) -> Document
     }
 
 
-def _visit(settings: BenchSettings, number: int, folder: Path) -> tuple[SimulatedScan, ...]:
+def simulated_visit(settings: BenchSettings, number: int, folder: Path) -> tuple[SimulatedScan, ...]:
     return visit(
         corridor(settings.seed),
         settings.scans,
@@ -184,7 +184,7 @@ class _TruePlaced:
     sensor_origin: Floats
 
 
-def _full_comparison(
+def full_comparison(
     scans: tuple[SimulatedScan, ...],
     built: BuiltMap,
     map_from_world: Matrix4,
@@ -207,7 +207,7 @@ def _full_comparison(
     )
 
 
-def _full_visit(scans: tuple[SimulatedScan, ...], built: BuiltMap, map_from_world: Matrix4) -> TilePairs:
+def full_visit(scans: tuple[SimulatedScan, ...], built: BuiltMap, map_from_world: Matrix4) -> TilePairs:
     """Pair the second visit, at its true poses, with the map, so that nearly every tile is observed."""
     points = np.concatenate([scan.world_points for scan in scans])
     fused = Voxels.of(transformed(points, map_from_world), size=built.reference.voxel_size)
@@ -263,12 +263,12 @@ def voxel_ways(
     """Return the yardstick on the same clouds, and a detector by voxels from both clouds to tiles and objects."""
 
     def by_voxels() -> TileScore:
-        return _told_by_voxels(_side_by_side(comparison), detector)
+        return told_by_voxels(side_by_side(comparison), detector)
 
     return {YARDSTICK: lambda: CloudToCloudBaseline().score(pairs), "voxels": by_voxels}
 
 
-def _side_by_side(comparison: Comparison) -> Comparison:
+def side_by_side(comparison: Comparison) -> Comparison:
     """Cut both clouds along the tiles that either touched, as `compare` does."""
     reference, current = comparison.reference.points, comparison.current.points
     tiles = touched_tiles(reference, current, comparison.grid)
@@ -276,7 +276,7 @@ def _side_by_side(comparison: Comparison) -> Comparison:
     return replace(comparison, tile_pairs=pairs)
 
 
-def _told_by_voxels(comparison: Comparison, detector: Detector) -> TileScore:
+def told_by_voxels(comparison: Comparison, detector: Detector) -> TileScore:
     detection = tile_scores(detector, comparison)
     if detection.voxels is not None:
         change_objects(comparison, detection.voxels)
@@ -297,7 +297,7 @@ def scaling(comparison: Comparison, detector: Detector, progress: Progress = no_
         sides = [Side(points=seen.points, seen=seen) for seen in both]
         wide = replace(comparison, reference=sides[0], current=sides[1])
         begun = time.perf_counter()
-        _told_by_voxels(_side_by_side(wide), detector)
+        told_by_voxels(side_by_side(wide), detector)
         told = time.perf_counter()
         for one, other in (both, both[::-1]):
             cKDTree(one.points).query(other.points, workers=query_threads())

@@ -154,7 +154,12 @@ def placement(
 
 def paper(
     context: typer.Context,
-    model: Model = PAPER_MODEL,
+    model: Annotated[
+        list[str] | None,
+        typer.Option(
+            envvar="SPICD_MODEL", help=f"name/version; may be given again. Left out: {PAPER_MODEL}."
+        ),
+    ] = None,
     model_store: ModelStore = MODEL_STORE,
     weights: Annotated[
         Path | None, typer.Option(help="Checkpoint of training to measure, under the model's card.")
@@ -178,29 +183,38 @@ def paper(
             "--quick", help="Three experiments on a short corridor: whether it runs, no figures to cite."
         ),
     ] = False,
-    out: Annotated[Path | None, typer.Option(help="Folder for report.html, paper.json and pictures.")] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder for report.html, paper.json and pictures; of several models a folder each."
+        ),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Repeat the fourteen experiments of the paper on a simulated corridor, its figures beside ours."""
-    from worker.benchmarks.paper.benchmark import QUICK, PaperSettings, evaluate  # noqa: PLC0415
+    from worker.benchmarks.paper.benchmark import QUICK, PaperSettings, evaluate_each  # noqa: PLC0415
     from worker.benchmarks.paper.report import document, tables, write_report  # noqa: PLC0415
     from worker.benchmarks.paper.site import QUICK_SITE, SiteSettings  # noqa: PLC0415
 
     settings = PaperSettings(
         site=replace(QUICK_SITE if quick else SiteSettings(), seed=seed, true_poses=true_poses),
         validation_seed=validation_seed,
-        model=model,
         model_store=model_store,
         weights=weights,
         everywhere=everywhere,
         robustness=robustness,
         only=QUICK if quick else None,
     )
+    models = tuple(model or (PAPER_MODEL,))
+    if len(models) > 1 and (weights is not None or as_json):
+        raise ValueError("--weights and --json are for one model; leave out the others")
     with terminal.progress_bar() as progress:
-        measured = evaluate(settings, progress)
-        result = {"command": command_line(context), **document(measured)}
-        notes = [] if out is None else [f"report: {write_report(measured, result, out)}"]
-    terminal.show(result, tables, *notes, as_json=as_json)
+        for measured in evaluate_each(settings, models, progress):
+            result = {"command": command_line(context), **document(measured)}
+            name = measured.settings.model.replace("/", "-")
+            folder = out if out is None or len(models) == 1 else out / name
+            notes = [] if folder is None else [f"report: {write_report(measured, result, folder)}"]
+            terminal.show(result, tables, *notes, as_json=as_json)
 
 
 def revisit(
@@ -270,6 +284,7 @@ def revisit(
 
 
 def real(
+    context: typer.Context,
     folder: Annotated[Path, typer.Argument(help="Real scans: see docs/test-data.md.")],
     model: Annotated[
         list[str] | None, typer.Option(help="name/version; may be given again. Left out: all that there are.")
@@ -309,24 +324,8 @@ def real(
         registered=registered,
     )
     with terminal.progress_bar() as progress:
-        result = evaluate(settings, progress)
+        result = {"command": command_line(context), **evaluate(settings, progress)}
     terminal.show(result, tables, f"saved in {write_report(result, out)}", as_json=as_json)
-
-
-def record(
-    paper: Annotated[Path | None, typer.Option(help="paper.json of `evaluate paper`.")] = None,
-    revisit: Annotated[Path | None, typer.Option(help="revisit.json of `evaluate revisit`.")] = None,
-    model: Model = DEFAULT_MODEL,
-    model_store: ModelStore = MODEL_STORE,
-) -> None:
-    """Put the figures of the benchmarks on a model's card; refused where they were measured with other weights."""
-    from worker.benchmarks.card_figures import record_figures  # noqa: PLC0415
-
-    files = {name: path for name, path in (("paper", paper), ("revisit", revisit)) if path is not None}
-    if not files:
-        raise ValueError("nothing to record: give --paper, --revisit, or both")
-    path = record_figures(model_store, model, files)
-    terminal.output().print(f"{path}: {', '.join(files)}", highlight=False)
 
 
 def precision(

@@ -6,7 +6,7 @@ import sys
 
 import typer
 
-from worker.cli import evaluate, terminal
+from worker.cli import cards, evaluate, terminal
 from worker.cli.demo import demo
 from worker.cli.detect import detect
 from worker.cli.register import register
@@ -55,8 +55,10 @@ def _commands() -> typer.Typer:
         evaluate.paper,
         evaluate.revisit,
         evaluate.real,
-        evaluate.record,
         evaluate.precision,
+        cards.speed,
+        cards.record,
+        cards.table,
     ):
         measuring.command()(command)
     commands.add_typer(measuring, name="evaluate")

@@ -28,11 +28,15 @@ def train(
     offices: Annotated[int | None, typer.Option(min=0, help="Simulated offices of a new set.")] = None,
     corridors: Annotated[int | None, typer.Option(min=0, help="Simulated corridors.")] = None,
     rooms: Annotated[int | None, typer.Option(min=0, help="Simulated single rooms.")] = None,
+    rebuilds: Annotated[
+        int | None,
+        typer.Option(min=0, help="Maps of each building fused anew, a few of their scans changed."),
+    ] = None,
     device: Device = "auto",
     threads: Annotated[int | None, typer.Option(min=1, help="Of the CPU.")] = None,
     **options: Any,
 ) -> None:
-    """Train SPICD-Net on simulated visits; what is left out keeps its default, the paper's where it has one."""
+    """Train a network of tiles on simulated visits; what is left out keeps its default, the paper's where it has one."""
     # Not at the head of the file: torch takes seconds, which `--help` need not wait for.
     import torch  # noqa: PLC0415
 
@@ -46,7 +50,9 @@ def train(
     settings = with_options(PAPER if paper else TrainSettings(), options, device=resolve_device(device).type)
     tiles = tiles or folder / "tiles.npz"
     asked = {"offices": offices, "corridors": corridors, "rooms": rooms}
-    buildings = {name: count for name, count in asked.items() if count is not None}
+    buildings: dict[str, Any] = {name: count for name, count in asked.items() if count is not None}
+    if rebuilds is not None:
+        buildings["walks"] = {"rebuilds": rebuilds}
     with terminal.progress_bar() as progress:
         _make_tiles(tiles, buildings, progress)
         best = run(settings, tiles, folder, progress, on_epoch=draw_curves)

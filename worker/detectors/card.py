@@ -65,6 +65,13 @@ class PrecisionCheck(StrictModel):
         return self.largest_score_difference <= SCORES_HOLD and not self.decided_otherwise
 
 
+class BaseRecord(StrictModel):
+    """The model whose weights are taken where a model's own file has none."""
+
+    model: str = Field(description="name/version, in the same store")
+    sha256: str = Field(description="of its weights file")
+
+
 class Card(StrictModel):
     """`model_store/<name>/<version>/card.json`."""
 
@@ -87,6 +94,9 @@ class Card(StrictModel):
     )
     weights: str | None = Field(default=None, description="file beside the card")
     sha256: str | None = Field(default=None, description="of the weights file")
+    base: BaseRecord | None = Field(
+        default=None, description="of a model of which a part alone was trained: where the rest of it lies"
+    )
     training: dict[str, Any] = Field(default_factory=dict, description="how it was made, with the command")
     evaluation: dict[str, Any] = Field(default_factory=dict, description="what it reaches, with the command")
     licence: str = ""

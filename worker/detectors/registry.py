@@ -19,6 +19,14 @@ class Entry:
 #: By the key that a card has as `detector`. A new detector is one folder and one entry here.
 DETECTORS: dict[str, Entry] = {
     "c2c": Entry(detector="worker.detectors.c2c.detector:CloudToCloud"),
+    "kpconv": Entry(
+        detector="worker.detectors.kpconv.detector:KPConv",
+        network="worker.detectors.kpconv.training:KPConvTraining",
+    ),
+    "pointnet2": Entry(
+        detector="worker.detectors.pointnet2.detector:PointNet2",
+        network="worker.detectors.pointnet2.training:PointNet2Training",
+    ),
     "spicd-net": Entry(
         detector="worker.detectors.spicd_net.detector:SpicdNet",
         network="worker.detectors.spicd_net.training:SpicdNetTraining",

@@ -14,7 +14,7 @@ from pydantic import BaseModel
 from safetensors import SafetensorError
 from safetensors.torch import load, save
 
-from worker.detectors.card import Card
+from worker.detectors.card import BaseRecord, Card
 from worker.detectors.detector import Detector
 from worker.detectors.registry import DETECTORS
 from worker.detectors.running.runtime import RunsNetwork, Runtime
@@ -62,15 +62,22 @@ def open_detector(
     the card, or the device is not there.
     """
     card = open_card(model_store, name)
-    return make_detector(card, _weights_file(_folder(model_store, name), card), device, runtime)
+    content = _weights_file(_folder(model_store, name), card)
+    return make_detector(card, content, device, runtime, base=_base_weights(model_store, card))
 
 
 def make_detector(
-    card: Card, content: bytes | None, device: Device = "auto", runtime: Runtime | None = None
+    card: Card,
+    content: bytes | None,
+    device: Device = "auto",
+    runtime: Runtime | None = None,
+    *,
+    base: Weights | None = None,
 ) -> Detector:
     """Return the detector of a card and the bytes of its weights file (None: none). Raises DetectorUnavailable.
 
-    `runtime` is what its network is run by; by default in the thread that asks, in float32.
+    `runtime` is what its network is run by; by default in the thread that asks, in float32. `base` are the weights of
+    the model that the card names as its base, if any.
     """
     name = card.model
     if card.detector not in DETECTORS:
@@ -79,7 +86,8 @@ def make_detector(
         )
     weights = {} if content is None else _checked_weights(name, card, content)
     try:
-        detector = detector_class(card.detector).load(card, weights, resolve_device(device))
+        merged = {**(base or {}), **weights}
+        detector = detector_class(card.detector).load(card, merged, resolve_device(device))
     except (RuntimeError, ValueError) as unsound:
         raise DetectorUnavailable(f"model {name}: {unsound}") from unsound
     if runtime is not None and isinstance(detector, RunsNetwork):
@@ -137,6 +145,20 @@ def _weights_file(folder: Path, card: Card) -> bytes | None:
         raise DetectorUnavailable(f"no weights at {path}: {missing.strerror}") from missing
 
 
+def _base_weights(model_store: Path, card: Card) -> Weights:
+    """Return the weights of the model that this one is a part of, none where it is whole. Raises DetectorUnavailable."""
+    if card.base is None:
+        return {}
+    folder = _folder(model_store, card.base.model)
+    base = read_card(folder)
+    content = _weights_file(folder, base)
+    if content is None or base.sha256 != card.base.sha256:
+        raise DetectorUnavailable(
+            f"model {card.model} is a part of {card.base.model} with sha256 {card.base.sha256}, not {base.sha256}"
+        )
+    return _checked_weights(card.base.model, base, content)
+
+
 def _checked_weights(name: str, card: Card, content: bytes) -> Weights:
     digest = hashlib.sha256(content).hexdigest()
     if digest != card.sha256:
@@ -151,13 +173,31 @@ def _checked_weights(name: str, card: Card, content: bytes) -> Weights:
 WEIGHTS = "weights.safetensors"
 
 
-def write_model(folder: Path, card: Card, weights: Weights) -> Path:
-    """Write the weights before the card, whose `sha256` is put in here; returns the folder."""
+def write_model(folder: Path, card: Card, weights: Weights, *, base: Detector | None = None) -> Path:
+    """Write the weights before the card, whose `sha256` is put in here; returns the folder.
+
+    With `base`, a whole model of the same store, weights that are equal to its own are left out of the file.
+    """
+    if base is not None:
+        card = card.model_copy(update={"base": _record(base)})
+        known = weights_of(base)
+        weights = {name: value for name, value in weights.items() if not _equal(value, known.get(name))}
     content = weights_content(weights)
     folder.mkdir(parents=True, exist_ok=True)
     (folder / WEIGHTS).write_bytes(content)
     write_card(folder, card.model_copy(update={"sha256": hashlib.sha256(content).hexdigest()}))
     return folder
+
+
+def _record(base: Detector) -> BaseRecord:
+    """Name a model to stand on. Raises ValueError for one without weights, or that itself stands on another."""
+    if base.card.sha256 is None or base.card.base is not None:
+        raise ValueError(f"model {base.card.model} is not whole by itself: no other can stand on it")
+    return BaseRecord(model=base.card.model, sha256=base.card.sha256)
+
+
+def _equal(value: torch.Tensor, other: torch.Tensor | None) -> bool:
+    return other is not None and torch.equal(value.cpu(), other.cpu())
 
 
 def write_card(folder: Path, card: Card) -> None:

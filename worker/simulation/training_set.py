@@ -50,8 +50,8 @@ class WalkSettings(StrictModel):
     rebuilt_scans: int = Field(3, ge=1, description="of a rebuild that are changed, at most a quarter")
     rebuilt_tiles: int = Field(8, ge=1, description="of each, at most half of those it sees well by itself")
     again_error: tuple[float, float] = Field(
-        (0.003, 0.05),
-        description="sigma of what a second registration of a scan differs by, metres and degrees",
+        (0.002, 0.02),
+        description="sigma of what a second registration of a scan differs by, metres and degrees; as measured",
     )
     magnitude: tuple[float, float] = Field((0.05, 0.50), description="metres, of a synthetic change")
     density: tuple[float, float] = Field((0.05, 0.50), description="share of the scan's points in the tile")
@@ -185,20 +185,24 @@ def _truth(walk: _Walk, after: Scene, scans: Sequence[SimulatedScan]) -> tuple[B
 
 
 def _rebuilt(walk: _Walk) -> Iterator[Observation]:
-    """Fuse the same visit anew, a few scans registered again and changed at a few tiles (paper, Section 4.2).
+    """Fuse the same visit anew, a few scans changed at a few tiles and registered again (paper, Section 4.2).
 
-    Tiles that come out as they were are left out: that pair every tile makes with itself.
+    A change ends at its tile's border, and the registration that follows it pushes some of its points across: the
+    tile beside then shows a few points far off, and has not changed. Tiles that come out as they were are left out:
+    that pair every tile makes with itself.
     """
     settings, tiles, rng = walk.settings, walk.tiles, walk.rng
     most = min(settings.rebuilt_scans, max(1, len(walk.scans) // 4))
     for _ in range(settings.rebuilds):
         rebuilt, injected = list(walk.voxels), np.zeros(len(tiles.points), bool)
         for scan in rng.choice(len(walk.scans), most, replace=False).tolist():
-            points = _registered_again(walk.scans[scan], walk.map_from_world, settings.again_error, rng)
+            pose = walk.map_from_world @ walk.scans[scan].prior
+            points = transformed(walk.scans[scan].points, pose).astype(np.float32)
             for tile in _own_tiles(walk.voxels[scan], tiles, settings, rng):
                 points = _injected(points, tiles, tile, settings, rng)
                 injected[tile] = True
-            rebuilt[scan] = Voxels.of(points, size=settings.voxel_size)
+            again = _registered_again(points, pose, settings.again_error, rng)
+            rebuilt[scan] = Voxels.of(again, size=settings.voxel_size)
         pairs = pair_tiles(tiles, merged_in_order(rebuilt).points, settings=settings.tiling)
         for tile in np.flatnonzero(pairs.observed).tolist():
             if not np.array_equal(pairs.current[tile], tiles.points[tile]):
@@ -208,14 +212,13 @@ def _rebuilt(walk: _Walk) -> Iterator[Observation]:
 
 
 def _registered_again(
-    scan: SimulatedScan, map_from_world: Matrix4, error: tuple[float, float], rng: np.random.Generator
+    points: Points, pose: Matrix4, error: tuple[float, float], rng: np.random.Generator
 ) -> Points:
-    """Move a scan to where a second registration puts it: (n, 3) map frame."""
+    """Move a scan (n, 3), map frame, that was taken at `pose`, to where a second registration puts it."""
     metres, degrees = error
-    pose = map_from_world @ scan.prior
     off = rigid(*rng.normal(0.0, metres, 3), yaw=float(rng.normal(0.0, degrees)))
     about = rigid(*pose[:3, 3])
-    moved: Points = transformed(scan.points, about @ off @ inverse(about) @ pose).astype(np.float32)
+    moved: Points = transformed(points, about @ off @ inverse(about)).astype(np.float32)
     return moved
 
 

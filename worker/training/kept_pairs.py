@@ -2,7 +2,7 @@
 
 Encoding a tile is nearly all of the work of a training step. With a frozen encoder it is done once for every
 observation, and a head then sees a thousand times as many pairs in the same time. Nothing is augmented: the
-observations differ as visits do.
+observations differ as visits do, or by noise of one level where a share of still pairs is to have some.
 """
 
 from __future__ import annotations
@@ -20,10 +20,13 @@ from worker.cloud.types import Points
 from worker.detectors.trainable import CHANGED, DIFFERENT, UNCHANGED, TrainableNetwork
 from worker.progress import Progress, no_progress
 from worker.training.dataset import TileSet
-from worker.training.pairs import PairSettings, changed
+from worker.training.pairs import PairSettings, changed, noisy
 
-#: Shares of the unchanged pairs by what they are of.
-UNCHANGED_SHARES = {"revisit": 0.50, "beside": 0.30, "untouched": 0.15, "stored": 0.05}
+#: Shares of the unchanged pairs by what they are of: of those of two visits, and of those that are still, which are
+#: as many of them as of the changed ones. Otherwise that a pair is still would say what it is.
+OF_VISITS = {"revisit": 0.625, "beside": 0.375}
+STILL = {"untouched": 0.75, "stored": 0.25}
+NOISY = " noisy"  #: behind the kind of a pair that is still but for noise
 DIFFERENT_EACH = 2  #: pairs of different tiles that are kept for each tile
 
 
@@ -114,8 +117,11 @@ KINDS: dict[str, tuple[int, bool]] = {
     "beside": (UNCHANGED, True),
     "untouched": (UNCHANGED, False),
     "stored": (UNCHANGED, False),
+    "untouched noisy": (UNCHANGED, False),
+    "stored noisy": (UNCHANGED, False),
     "whole": (CHANGED, True),
     "rebuilt": (CHANGED, False),
+    "rebuilt noisy": (CHANGED, False),
     "synthetic": (CHANGED, True),
     "different": (DIFFERENT, True),
 }
@@ -142,20 +148,28 @@ def keep_pairs(
 
 def _gathered(tiles: TileSet, settings: PairSettings, rng: np.random.Generator) -> _Gathering:
     gathering = _Gathering()
+
+    def still(kind: str, reference: int, current: int) -> None:
+        """Keep a still pair, and the same with noise."""
+        gathering.pair(kind, reference, current)
+        if settings.noisy_share:
+            cloud = noisy(gathering.clouds[current], float(rng.uniform(0.0, settings.noise)), rng)
+            gathering.pair(kind + NOISY, reference, gathering.cloud(cloud))
+
+    synthetic = _synthetic_share(settings) > 0 or not any(one.changed for one in tiles.observations)
     first = [gathering.cloud(points) for points in tiles.points_a]
     second = [gathering.cloud(points) if len(points) else None for points in tiles.points_b]
     for tile, (a, b) in enumerate(zip(first, second, strict=True)):
-        gathering.pair("stored", a, a)
+        still("stored", a, a)
         if b is not None:
             gathering.pair("revisit", a, b)
-        after = changed(
-            tiles.points_a[tile] if b is None else tiles.points_b[tile], settings, tiles.half, rng
-        )
-        gathering.pair("synthetic", a, gathering.cloud(after))
+        if synthetic:
+            before = tiles.points_a[tile] if b is None else tiles.points_b[tile]
+            gathering.pair("synthetic", a, gathering.cloud(changed(before, settings, tiles.half, rng)))
     for observation in tiles.observations:
         here, a, b = gathering.cloud(observation.points), first[observation.tile], second[observation.tile]
         if observation.rebuilt:
-            gathering.pair("rebuilt" if observation.changed else "untouched", a, here)
+            still("rebuilt" if observation.changed else "untouched", a, here)
             continue
         kind = "whole" if observation.changed else "beside"
         gathering.pair(kind, a, here)
@@ -192,16 +206,18 @@ def _compared(
 
 def _shares(kinds: dict[str, PooledPairs], settings: PairSettings) -> dict[str, float]:
     """Return the shares of all pairs, by kind; what a class lacks goes to its other kinds."""
-    synthetic = 1 - settings.edited_share - settings.rebuilt_share
-    if not {"whole", "rebuilt"} & kinds.keys():
-        synthetic = 1.0
+    visits = max(1 - settings.rebuilt_share, 0.0)
     within = {
-        **UNCHANGED_SHARES,
+        **{kind: visits * share for kind, share in OF_VISITS.items()},
+        **{kind: settings.rebuilt_share * share for kind, share in STILL.items()},
         "whole": settings.edited_share,
         "rebuilt": settings.rebuilt_share,
-        "synthetic": synthetic,
+        "synthetic": _synthetic_share(settings) if {"whole", "rebuilt"} & kinds.keys() else 1.0,
         "different": 1.0,
     }
+    for kind in ("untouched", "stored", "rebuilt"):
+        within[kind + NOISY] = settings.noisy_share * within[kind]
+        within[kind] *= 1 - settings.noisy_share
     there = {name: within[name] for name in kinds if within[name] > 0}
     total = {
         label: sum(share for name, share in there.items() if KINDS[name][0] == label)
@@ -210,3 +226,8 @@ def _shares(kinds: dict[str, PooledPairs], settings: PairSettings) -> dict[str, 
     return {
         name: settings.shares[KINDS[name][0]] * share / total[KINDS[name][0]] for name, share in there.items()
     }
+
+
+def _synthetic_share(settings: PairSettings) -> float:
+    """Return the share of changed pairs that are synthetic changes of a tile, clear of rounding."""
+    return max(round(1 - settings.edited_share - settings.rebuilt_share, 9), 0.0)

@@ -31,6 +31,7 @@ class Option:
 
 
 OPTIONS = (
+    Option("detector", str, "Whose network is trained: spicd-net, pointnet2 or kpconv."),
     Option("epochs", int, "At most so many.", 0),
     Option("minutes", float, "Wall clock of the training; the learning rate follows it.", 0),
     Option("train_pairs", int, "An epoch.", 1),
@@ -41,6 +42,8 @@ OPTIONS = (
     Option(
         "rebuilt_share", float, "Of changed pairs, those of a map with changed scans.", 0, 1, of_pairs=True
     ),
+    Option("noisy_share", float, "Of still pairs, those with noise on every point.", 0, 1, of_pairs=True),
+    Option("counts", bool, "Give the head point counts beside the Chamfer statistics.", of_pairs=True),
     Option("density", float, "Least and largest share of points that changes take.", count=2, of_pairs=True),
     Option("start_from", str, "Checkpoint whose network is trained on."),
     Option("fresh_head", bool, "Take its encoder alone, and start the head anew."),

@@ -26,11 +26,16 @@ class PairSettings:
     patch_points: int = 4096  #: points of a padded patch
     #: Ours: the Chamfer branch compares all points of both patches; the paper's is 128 of each.
     chamfer_points: int | None = None
+    counts: bool = False  #: ours: the head is given point counts beside the Chamfer statistics
     shares: tuple[float, float, float] = (0.50, 0.35, 0.15)  #: of the three classes
     #: Of unchanged pairs of one observation: sampled anew, the rest are stored patches.
     rerun_share: float = 0.7
     #: Ours: a stored patch that comes back is not augmented either, nor a change of one.
     stored_still: bool = True
+    #: Ours: of such pairs and of rebuilt maps, how many come with noise of one level on every current point, and up
+    #: to which level in metres. A head that only ever saw still pairs takes noise for another visit, and misses all.
+    noisy_share: float = 0.0
+    noise: float = 0.015
     #: Ours: of changed pairs, those of whole things added, removed or moved, where there are any.
     edited_share: float = 0.65
     #: Ours: of changed pairs, those changed in some of the scans that the map is fused of.
@@ -73,8 +78,11 @@ class Observations:
     unchanged: tuple[Points, Points]
     changed: tuple[Points, Points] | None = None  #: None: a synthetic change is due
     revisit: bool = False  #: of two visits, not one tile twice
-    #: Of the very same scans, so that nothing differs but the change: no nuisance, no noise.
+    #: Of the very same scans, so that nothing differs but the change: no nuisance, no augmentation.
     still: bool = False
+    noise: float = (
+        0.0  #: metres, of every current point: the same for a changed pair and the one that matches it
+    )
 
 
 class PairMaker:
@@ -124,7 +132,7 @@ class PairMaker:
         if label == DIFFERENT or not (observations.still and settings.stored_still):
             reference = augmented(reference, settings.augmentation, rng)
             current = augmented(current, settings.augmentation, rng)
-        return Pair(reference, current, label)
+        return Pair(reference, noisy(current, observations.noise, rng), label)
 
     def _unchanged(self, observations: Observations, rng: np.random.Generator) -> tuple[Points, Points]:
         if observations.still and self._settings.stored_still:
@@ -185,7 +193,10 @@ class PairMaker:
         a, b = tiles.points_a[i], tiles.points_b[i]
         if len(b) == 0 or rng.random() >= settings.revisit_share:
             still = rng.random() >= settings.rerun_share
-            return Observations(unchanged=(a, _stored_again(a, rng) if still else a), still=still)
+            noise = self._noise(rng) if still else 0.0
+            return Observations(
+                unchanged=(a, _stored_again(a, rng) if still else a), still=still, noise=noise
+            )
         return Observations(unchanged=(a, b) if rng.random() < 0.5 else (b, a), revisit=True)
 
     def _revisited(self, observation: Observation, rng: np.random.Generator) -> Observations:
@@ -201,12 +212,20 @@ class PairMaker:
         """Pair a rebuilt map with the map: a tile that a synthetic change was made in, and one that none was."""
         changed = self._rebuilt[int(rng.integers(len(self._rebuilt)))]
         pair = (self._tiles.points_a[changed.tile], changed.points)
+        noise = self._noise(rng)
         if not self._untouched:
-            return Observations(unchanged=(pair[0], pair[0]), changed=pair, still=True)
+            return Observations(unchanged=(pair[0], pair[0]), changed=pair, still=True, noise=noise)
         other = self._untouched[int(rng.integers(len(self._untouched)))]
         return Observations(
-            unchanged=(self._tiles.points_a[other.tile], other.points), changed=pair, still=True
+            unchanged=(self._tiles.points_a[other.tile], other.points), changed=pair, still=True, noise=noise
         )
+
+    def _noise(self, rng: np.random.Generator) -> float:
+        """Draw a level of noise for a still pair, metres; most often none. No draw where none is asked for."""
+        settings = self._settings
+        if settings.noisy_share == 0 or rng.random() >= settings.noisy_share:
+            return 0.0
+        return float(rng.uniform(0.0, settings.noise))
 
     def _sampled(
         self, first: Points, second: Points, intensity: float, rng: np.random.Generator
@@ -222,6 +241,11 @@ class PairMaker:
 def _stored_again(points: Points, rng: np.random.Generator) -> Points:
     """Return (n, 3) a stored patch as it comes from the disk (paper, Section 3.5.3)."""
     return (points + rng.normal(scale=STORED_JITTER, size=points.shape)).astype(np.float32)
+
+
+def noisy(points: Points, sigma: float, rng: np.random.Generator) -> Points:
+    """Move every point (n, 3) by noise of that many metres; nothing is drawn for none."""
+    return points if sigma == 0 else (points + rng.normal(scale=sigma, size=points.shape)).astype(np.float32)
 
 
 def changed(

@@ -23,7 +23,7 @@ from worker.cloud.types import Arrays
 from worker.detectors.card import MODEL_STORE, Card, Preprocessing
 from worker.detectors.comparison import Comparison
 from worker.detectors.detector import Detector
-from worker.detectors.store import WEIGHTS, detector_class, weights_of, write_model
+from worker.detectors.store import WEIGHTS, detector_class, open_detector, weights_of, write_model
 from worker.training.calibration import (
     PREVALENCE,
     SurveyPairs,
@@ -94,6 +94,7 @@ def publish(
     beside: Mapping[str, Detector] | None = None,
     base: str | None = None,
     preprocessing: Preprocessing | None = None,
+    stands_on: Detector | None = None,
 ) -> Path:
     """Write `model_store/<name>/<version>/`, its threshold chosen on the validation tiles; returns the folder.
 
@@ -102,7 +103,8 @@ def publish(
     what the card says of the training; `beside` are other detectors by name, measured on the validation pairs at their
     own thresholds. `base` names the one of them that was trained further: where that ranks the validation pairs no
     worse, its weights are published, with the threshold that is best here. `preprocessing` is the paper's where it is
-    left out. The training's log, where it lies beside the checkpoint, comes along.
+    left out. Weights that are those of `stands_on`, as an encoder's of which the head alone was trained, stay there.
+    The training's log, where it lies beside the checkpoint, comes along.
     """
     state = torch.load(checkpoint, map_location="cpu", weights_only=True)
     settings = state["settings"] = whole(state["settings"])
@@ -133,7 +135,9 @@ def publish(
     unknown = None if unseen is None else _pairs(load_tiles(unseen), settings)
     evaluation = _evaluation(best, threshold, others, unknown)
     final = {"threshold": threshold, "training": training, "evaluation": evaluation}
-    folder = write_model(model_store / card.name / version, card.model_copy(update=final), weights)
+    folder = write_model(
+        model_store / card.name / version, card.model_copy(update=final), weights, base=stands_on
+    )
     _take_log(checkpoint.parent / LOG, folder / LOG)
     return folder
 
@@ -246,7 +250,13 @@ def main() -> None:
     parser.add_argument("--version", default="1")
     parser.add_argument("--summary", default="SPICD-Net as the paper describes it")
     parser.add_argument("--command", default="", help="how the training was started, for the card")
-    sys.stdout.write(f"{publish(**vars(parser.parse_args()))}\n")
+    parser.add_argument(
+        "--stands-on", help="model of the store (name/version) that has the weights which are equal"
+    )
+    given = vars(parser.parse_args())
+    if given["stands_on"] is not None:
+        given["stands_on"] = open_detector(given["model_store"], given["stands_on"], "cpu")
+    sys.stdout.write(f"{publish(**given)}\n")
 
 
 if __name__ == "__main__":

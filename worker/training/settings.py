@@ -96,6 +96,7 @@ def detector_settings(settings: dict[str, Any]) -> dict[str, Any]:
     return {
         "patch_points": pairs["patch_points"],
         "chamfer_points": pairs.get("chamfer_points", SAMPLE_POINTS),
+        "counts": pairs.get("counts", False),
         "seed": settings["seed"],
     }
 

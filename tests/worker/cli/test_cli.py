@@ -27,6 +27,7 @@ from worker.pipeline.registration.results import RegistrationResult, ScanRejecte
 from worker.progress import Progress
 from worker.simulation.scenes import random_room, rigid
 from worker.simulation.scenes.furniture import crate
+from worker.simulation.training_set import TrainingSetSettings
 from worker.simulation.visits import visit
 from worker.training.dataset import TileSet, load_tiles, save_tiles
 from worker.training.settings import PAPER, TrainSettings
@@ -400,6 +401,20 @@ def test_train_simulates_the_set_that_is_not_there_and_trains_on_it(
     tiles = load_tiles(tmp_path / "tiles.npz")
     assert len(tiles) > 5
     assert set(tiles.buildings) == {0}
+
+
+def test_train_rebuilds_as_many_maps_of_each_building_as_asked_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = []
+
+    def build(settings: TrainingSetSettings, progress: Progress) -> TileSet:
+        asked.append(settings)
+        raise ValueError("asked for")
+
+    monkeypatch.setattr("worker.simulation.training_set.build_training_set", build)
+    assert run("train", str(tmp_path), "--rooms", "1", "--rebuilds", "7") == 1
+    assert [(settings.rooms, settings.walks.rebuilds) for settings in asked] == [(1, 7)]
 
 
 def test_train_keeps_defaults_but_for_what_was_given(

@@ -11,7 +11,7 @@ import torch
 from worker.detectors.card import MODEL_STORE
 from worker.detectors.comparison import Comparison
 from worker.detectors.spicd_net.detector import SpicdNet
-from worker.detectors.store import open_card, open_detector
+from worker.detectors.store import open_card, open_detector, write_model
 from worker.errors import DetectorUnavailable
 
 
@@ -118,3 +118,30 @@ def test_models_of_one_name_are_told_apart_by_their_weights_or_without_such_by_t
     assert weightless.fingerprint != other.fingerprint
     trained = open_card(MODEL_STORE, "spicd-net/1")
     assert trained.fingerprint == trained.sha256
+
+
+def test_a_model_of_which_the_head_alone_was_trained_keeps_the_rest_in_its_base(
+    model_store, network, card, pairs
+):
+    base = open_detector(model_store, "spicd-net/7", device="cpu")
+    weights = {name: value.clone() for name, value in network.state_dict().items()}
+    weights["head.classifier.6.bias"] += 1.0
+    folder = write_model(
+        model_store / "spicd-net" / "8", card.model_copy(update={"version": "8"}), weights, base=base
+    )
+    assert (folder / "weights.safetensors").stat().st_size < 1000
+    opened = open_detector(model_store, "spicd-net/8", device="cpu")
+    assert opened.weights().keys() == weights.keys()
+    assert all(torch.equal(opened.weights()[name], value) for name, value in weights.items())
+    with pytest.raises(ValueError, match="not whole by itself"):
+        write_model(model_store / "spicd-net" / "9", card, weights, base=opened)
+
+
+def test_a_model_whose_base_is_another_one_now_is_refused(model_store, network, card):
+    base = open_detector(model_store, "spicd-net/7", device="cpu")
+    eighth = card.model_copy(update={"version": "8"})
+    write_model(model_store / "spicd-net" / "8", eighth, network.state_dict(), base=base)
+    changed = {name: value + 1 for name, value in network.state_dict().items()}
+    write_model(model_store / "spicd-net" / "7", base.card, changed)
+    with pytest.raises(DetectorUnavailable, match="a part of spicd-net/7 with sha256"):
+        open_detector(model_store, "spicd-net/8")

@@ -26,7 +26,7 @@ SETTINGS = TrainSettings(
     head_learning_rate=2e-3,
     head_validation_pairs=120,
     held_out=0.2,
-    pairs=PairSettings(patch_points=256),
+    pairs=PairSettings(patch_points=256, edited_share=0.5),
 )
 
 
@@ -68,6 +68,28 @@ def test_a_set_without_further_observations_makes_up_each_class_of_what_it_has(t
     assert set(bare.kinds) == {"stored", "revisit", "synthetic", "different"}
     labels = np.bincount(bare.draw(2000, np.random.default_rng(0)).labels.numpy())
     assert labels.tolist() == pytest.approx([1000, 700, 300], abs=5)
+
+
+def test_a_share_of_the_still_pairs_is_kept_with_noise_on_every_point(tiles, network):
+    some = keep_pairs(KIND, network, tiles, replace(SETTINGS.pairs, noisy_share=0.25, noise=0.01), seed=1)
+    assert {name for name in some.kinds if name.endswith(" noisy")} == {
+        "stored noisy",
+        "untouched noisy",
+        "rebuilt noisy",
+    }
+    assert not some.kinds["stored"].statistics.any()
+    means = np.expm1(some.kinds["stored noisy"].statistics[:, 0])
+    assert means.min() > 0
+    assert means.max() < 0.03
+    drawn = some.draw(4000, np.random.default_rng(0))
+    labels = np.bincount(drawn.labels.numpy())
+    assert labels.tolist() == pytest.approx([2000, 1400, 600], abs=8)
+
+
+def test_no_synthetic_change_is_encoded_that_no_pair_is_to_show(tiles, network):
+    pairs = replace(SETTINGS.pairs, edited_share=0.65, rebuilt_share=0.35)
+    kinds = keep_pairs(KIND, network, tiles, pairs, seed=1).kinds
+    assert "synthetic" not in kinds
 
 
 def test_different_places_are_3_m_apart_or_of_two_buildings(pool, tiles):

@@ -252,6 +252,28 @@ def nearest(points: np.ndarray, others: np.ndarray) -> np.ndarray:
     return np.linalg.norm(points[:, None] - others, axis=2).min(axis=1)
 
 
+def test_a_still_pair_with_noise_has_one_level_of_it_on_its_current_points_alone(tiles):
+    settings = replace(
+        PLAIN, rerun_share=0.0, revisit_share=0.0, rebuilt_share=1.0, noisy_share=1.0, noise=0.02
+    )
+    maker = PairMaker(tiles, settings)
+    levels, stored = [], {tuple(point) for points in tiles.points_a for point in points.round(4)}
+    for seed in range(20):
+        observations = maker._observations((1, 0), np.random.default_rng(seed))
+        assert 0 < observations.noise < 0.02
+        unchanged = maker.pair(0, np.random.default_rng(seed), observations)
+        assert rows(unchanged.reference) <= stored
+        assert not rows(unchanged.current) & stored
+        levels.append(observations.noise)
+    assert max(levels) > 2 * min(levels)
+
+
+def test_no_still_pair_has_noise_where_no_share_is_asked_for(tiles):
+    maker = PairMaker(tiles, replace(PLAIN, rerun_share=0.0, revisit_share=0.0, rebuilt_share=1.0))
+    drawn = [maker._observations((1, 0), np.random.default_rng(seed)) for seed in range(20)]
+    assert {observations.noise for observations in drawn} == {0.0}
+
+
 def test_the_same_stream_gives_the_same_pairs(tiles):
     first, again = (batches(tiles, PairSettings(), count=8)[0] for _ in range(2))
     assert np.array_equal(first.points, again.points)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -22,7 +22,8 @@ from worker.benchmarks.paper.scores import (
 from worker.benchmarks.paper.site import Site, SiteSettings, build_site
 from worker.benchmarks.plots import Log
 from worker.benchmarks.timing import machine
-from worker.detectors.card import MODEL_STORE, Card
+from worker.detectors.card import MODEL_STORE, Card, Preprocessing
+from worker.detectors.detector import Detector
 from worker.metrics import PAPER_SWEEP, Confusion, best_f1, confusion
 from worker.pipeline.settings import PipelineSettings
 from worker.progress import Progress, no_progress
@@ -90,49 +91,88 @@ class PaperResult:
         return (self.detector, *self.baselines)
 
 
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class _CarriedOut:
+    """Both corridors with every experiment on them, and what the baselines make of it."""
+
+    sites: tuple[Site, Site]  #: of the test, of the validation
+    trials: tuple[tuple[Trial, ...], tuple[Trial, ...]]  #: likewise
+    baselines: tuple[MethodResult, ...]
+    seconds: float  #: to make all of it
+
+
 def evaluate(settings: PaperSettings, progress: Progress = no_progress) -> PaperResult:
     """Run all of it. Raises DetectorUnavailable, MapFailed, and ValueError for unknown experiments."""
+    (result,) = evaluate_each(settings, (settings.model,), progress)
+    return result
+
+
+def evaluate_each(
+    settings: PaperSettings, models: Sequence[str], progress: Progress = no_progress
+) -> Iterator[PaperResult]:
+    """Run all of it for several models; those that need the same voxels and tiles share corridors and experiments.
+
+    Raises as `evaluate` does, before anything is made where a model cannot be opened.
+    """
+    opened = [(model, open_model(settings.model_store, model, settings.weights)) for model in models]
+    made: dict[str, _CarriedOut] = {}
+    for model, detector in opened:
+        needs = detector.card.preprocessing.model_dump_json()
+        if needs not in made:
+            made[needs] = _carried_out(settings, detector.card.preprocessing, progress)
+        yield _measured(replace(settings, model=model), detector, made[needs], progress)
+
+
+def _carried_out(settings: PaperSettings, needs: Preprocessing, progress: Progress) -> _CarriedOut:
     begun = time.perf_counter()
     chosen = experiments(settings.only)
-    detector = open_model(settings.model_store, settings.model, settings.weights)
-    log = training_log(settings.model_store, settings.model, settings.weights)
-    needs = detector.card.preprocessing
-    by_voxels = needs.tiles == "touched"
     # The stored reference is the dense tiles, as the paper has it, whatever the detector could score besides.
     pipeline = PipelineSettings().for_model(needs.model_copy(update={"tiles": "dense"}))
-    sites, carried_out = [], []
-    for seed in (settings.site.seed, settings.validation_seed):
+
+    def made(seed: int) -> tuple[Site, tuple[Trial, ...]]:
         site = build_site(replace(settings.site, seed=seed), pipeline, progress)
-        sites.append(site)
-        carried_out.append(
-            tuple(trials(site, chosen, progress, everywhere=settings.everywhere, seen=by_voxels))
-        )
-    caches = [CachedDetector(detector=detector) for _ in sites]
+        by_voxels = needs.tiles == "touched"
+        return site, tuple(trials(site, chosen, progress, everywhere=settings.everywhere, seen=by_voxels))
+
+    (site, test), (other_site, validation) = made(settings.site.seed), made(settings.validation_seed)
+    return _CarriedOut(
+        sites=(site, other_site),
+        trials=(test, validation),
+        baselines=_baselines((test, validation), progress),
+        seconds=time.perf_counter() - begun,
+    )
+
+
+def _measured(
+    settings: PaperSettings, detector: Detector, made: _CarriedOut, progress: Progress
+) -> PaperResult:
+    begun = time.perf_counter()
+    caches = [CachedDetector(detector=detector) for _ in made.sites]
     progress(f"scoring by {settings.model}", 0.0)
     test, validation = (
         scored_by_detector(settings.measured, cache, part)
-        for cache, part in zip(caches, carried_out, strict=True)
+        for cache, part in zip(caches, made.trials, strict=True)
     )
     ours = _result(test, validation, sweep_all=False)
-    baselines = _baselines(carried_out, progress)
     disturbed: tuple[RobustnessPoint, ...] = ()
-    if settings.robustness and not by_voxels:  # what is disturbed are points of tiles, not what scans saw
-        swept = chosen_trials(carried_out[0])
-        disturbed = sweep_disturbances(sites[0], swept, caches[0], ours.threshold, progress)
+    # What is disturbed are points of tiles, not what scans saw.
+    if settings.robustness and detector.card.preprocessing.tiles != "touched":
+        swept = chosen_trials(made.trials[0])
+        disturbed = sweep_disturbances(made.sites[0], swept, caches[0], ours.threshold, progress)
     progress("embedding", 0.0)
     return PaperResult(
         settings=settings,
         card=detector.card,
-        site=sites[0],
-        validation=sites[1],
-        trials=carried_out[0],
+        site=made.sites[0],
+        validation=made.sites[1],
+        trials=made.trials[0],
         detector=ours,
-        baselines=baselines,
+        baselines=made.baselines,
         left_out=() if m3c2_is_installed() else ("M3C2",),
         robustness=disturbed,
-        embedding=embed(caches[0], carried_out[0], ours.test, ours.threshold),
-        training=log,
-        seconds=time.perf_counter() - begun,
+        embedding=embed(caches[0], made.trials[0], ours.test, ours.threshold),
+        training=training_log(settings.model_store, settings.model, settings.weights),
+        seconds=made.seconds + time.perf_counter() - begun,
         machine=machine(model=f"{detector.card.name}/{detector.card.version}"),
     )
 

@@ -20,7 +20,7 @@ from worker.benchmarks.paper.figures import pictures
 from worker.benchmarks.paper.robustness import chosen_trials
 from worker.benchmarks.paper.site import Site
 from worker.benchmarks.plots import png
-from worker.metrics import pooled, precision_recall, roc
+from worker.metrics import Confusion, pooled, precision_recall, roc
 from worker.simulation.scenes import ChangeKind
 from worker.simulation.truth import KINDS
 
@@ -42,6 +42,7 @@ def document(result: PaperResult) -> Document:
         "source": tables["source"],
         "model": settings.measured,
         "sha256": result.card.sha256,
+        "fingerprint": result.card.fingerprint,
         "settings": {
             **asdict(settings.site),
             "validation_seed": settings.validation_seed,
@@ -56,7 +57,7 @@ def document(result: PaperResult) -> Document:
             "paper": tables["table_6"]["SPICD-Net"]["threshold"],
         },
         "table_5": _experiments(result),
-        "table_6": [_method(method, number == 0) for number, method in enumerate(result.methods)],
+        "table_6": [_method(result, method, number == 0) for number, method in enumerate(result.methods)],
         "by_kind": {kind: _kind(result, kind) for kind in KINDS},
         "robustness_experiments": [trial.experiment.name for trial in chosen_trials(result.trials)],
         "robustness": [
@@ -88,8 +89,8 @@ def _experiments(result: PaperResult) -> list[Document]:
     return [*rows, {**aggregated, "paper": printed["aggregated"] if complete else None}]
 
 
-def _method(method: MethodResult, ours: bool) -> Document:
-    """Return a row of Table 6."""
+def _method(result: PaperResult, method: MethodResult, ours: bool) -> Document:
+    """Return a row of Table 6, with what it makes of removals and where nothing changed."""
     scores, truth = method.test.pooled, method.test.truth
     chosen, best = (pooled(method.counts(threshold)) for threshold in _both(method))
     return {
@@ -100,9 +101,22 @@ def _method(method: MethodResult, ours: bool) -> Document:
         "at_test_threshold": best.figures(),
         "area_under_roc": _known(roc(scores, truth).area),
         "average_precision": _known(precision_recall(scores, truth).average_precision),
+        "removals": _of_operation(result, method, method.threshold, "remove").figures(),
+        "false_positives_with_no_change": {
+            "validation_threshold": _of_operation(result, method, method.threshold, None).false_positives,
+            "test_threshold": _of_operation(result, method, method.test_threshold, None).false_positives,
+        },
         "seconds": round(method.test.seconds, 2),
         "paper": published()["table_6"].get("SPICD-Net" if ours else IN_TABLE_6.get(method.test.name, "")),
     }
+
+
+def _of_operation(
+    result: PaperResult, method: MethodResult, threshold: float, operation: ChangeKind | None
+) -> Confusion:
+    """Count a method's tiles in the experiments of one operation; None: in the one without a change."""
+    counts = zip(method.counts(threshold), result.trials, strict=True)
+    return pooled(count for count, trial in counts if trial.experiment.operation == operation)
 
 
 def _kind(result: PaperResult, kind: ChangeKind) -> Document:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -76,6 +77,11 @@ def evaluate(settings: RealBenchmarkSettings, progress: Progress = no_progress) 
         if settings.out is not None:
             draw_visits(settings.out, pair, answers[name])
     document: Document = {
+        "data": {
+            "files": _digest(settings.folder, plans),
+            "draws": settings.seeds,
+            "whole": set(places) == set(PLACES),
+        },
         "models": list(settings.models),
         "pairs": [_pair(pair, answers[name]) for name, pair in visits.items()],
         "registered": _registered(settings, detectors, plans, poses, answers, progress)
@@ -83,6 +89,13 @@ def evaluate(settings: RealBenchmarkSettings, progress: Progress = no_progress) 
         else None,
     }
     return document | {"edited": _edited(settings, detectors, visits, answers, progress)}
+
+
+def _digest(folder: Path, plans: Sequence[Plan]) -> str:
+    """Return the sha256 of the scans' own, in the order of their names."""
+    names = sorted({name for plan in plans for name in (*plan.first, *plan.second)})
+    each = (hashlib.sha256((folder / name).read_bytes()).digest() for name in names)
+    return hashlib.sha256(b"".join(each)).hexdigest()
 
 
 def _pair(visits: TwoVisits, answers: Sequence[Answer]) -> Document:
@@ -188,7 +201,9 @@ def _edited(
         "pairs": pairs,
         "models": [
             {
-                "model": model,
+                "model": detector.card.model,
+                "sha256": detector.card.sha256,
+                "fingerprint": detector.card.fingerprint,
                 **Figures.of(column).document(),
                 "groups": {
                     by: {name: list(numbers) for name, numbers in groups.items()}
@@ -196,7 +211,7 @@ def _edited(
                 },
                 "with_free_space": Figures.of([one for one in column if "ipad" not in one.place]).document(),
             }
-            for model, column in zip(settings.models, counts, strict=True)
+            for detector, column in zip(detectors, counts, strict=True)
         ],
     }
 

@@ -94,7 +94,9 @@ def _measured(
             progress("drawing", 0.0)
             documents[name]["errors"] = draw_gallery(pictures / name, parts[name], results[name], answers)
     hard = {"hard": documents["hard"]} if "hard" in documents else {}
-    return {"name": method.name, "sha256": method.sha256, **documents["test"], **hard}, results["test"]
+    fingerprint = None if method.detector is None else method.detector.card.fingerprint
+    row = {"name": method.name, "sha256": method.sha256, "fingerprint": fingerprint}
+    return {**row, **documents["test"], **hard}, results["test"]
 
 
 def visited(settings: RevisitBenchmarkSettings, progress: Progress = no_progress) -> dict[str, RevisitPart]:

@@ -42,6 +42,10 @@ class SiameseSettings(StrictModel):
         gt=0,
         description="of each patch, that are compared; null: all, where the paper takes 128",
     )
+    counts: bool = Field(
+        default=False,
+        description="whether the head is given, beside the paper's statistics, how many points are more and far",
+    )
     seed: int = Field(description="of FPS and of the Chamfer sample")
 
     @model_validator(mode="after")
@@ -204,7 +208,8 @@ class SiameseDetector(ABC):
         references, currents, clouds = zip(*items, strict=True)
         f_ref, f_cur = (self._placed(np.stack(side)) for side in (references, currents))
         before, after = ([self._placed(cloud) for cloud in side] for side in zip(*clouds, strict=True))
-        logits: Tensor = self._head(f_ref, f_cur, chamfer_statistics(before, after))
+        statistics = chamfer_statistics(before, after, counts=self._settings.counts)
+        logits: Tensor = self._head(f_ref, f_cur, statistics)
         return list(logits.softmax(dim=1).cpu().numpy())
 
     def _placed(self, array: NDArray[np.float32]) -> Tensor:

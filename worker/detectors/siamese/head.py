@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from worker.detectors.siamese.chamfer import STATISTICS
+from worker.detectors.siamese.chamfer import COUNTS, STATISTICS
 
 CHAMFER_FEATURES = 32
 CHAMFER_GATING = 0.2
@@ -13,13 +13,17 @@ CLASSES = 3
 
 
 class PairHead(nn.Module):
-    """Two descriptors and the Chamfer statistics to three logits (paper, Sections 3.6.2 to 3.6.4)."""
+    """Two descriptors and the statistics of a pair to three logits (paper, Sections 3.6.2 to 3.6.4).
 
-    def __init__(self, descriptor: int) -> None:
+    The paper's statistics are the eight of the Chamfer branch; with `counts` eight of point counts stand beside them.
+    """
+
+    def __init__(self, descriptor: int, *, counts: bool = False) -> None:
         super().__init__()
         self.descriptor = descriptor
+        self.statistics = STATISTICS + COUNTS * counts
         self.chamfer = nn.Sequential(
-            nn.Linear(STATISTICS, 64), nn.ReLU(), nn.Linear(64, CHAMFER_FEATURES), nn.ReLU()
+            nn.Linear(self.statistics, 64), nn.ReLU(), nn.Linear(64, CHAMFER_FEATURES), nn.ReLU()
         )
         self.classifier = nn.Sequential(
             nn.Linear(2 * descriptor + CHAMFER_FEATURES, 256),
@@ -32,7 +36,7 @@ class PairHead(nn.Module):
         )
 
     def forward(self, reference: Tensor, current: Tensor, statistics: Tensor) -> Tensor:
-        """(B, D), (B, D), (B, 8) -> (B, 3) logits"""
+        """(B, D), (B, D), (B, 8 or 16) -> (B, 3) logits"""
         geometry = self.chamfer(statistics)
         if self.training:
             geometry = geometry * (torch.rand(len(geometry), 1, device=geometry.device) >= CHAMFER_GATING)
@@ -46,7 +50,7 @@ class PairHead(nn.Module):
         The statistics differ by centimetres and the products are some ten, so that at first the head would
         hear of nothing but the products. Same arguments as `forward`.
         """
-        _standardise(self.chamfer[0], statistics, blocks=(STATISTICS,))
+        _standardise(self.chamfer[0], statistics, blocks=(self.statistics,))
         inputs = fused(reference, current, self.chamfer(statistics))
         _standardise(self.classifier[0], inputs, blocks=(self.descriptor, self.descriptor, CHAMFER_FEATURES))
 

@@ -43,9 +43,9 @@ class NormedLinear(nn.Module):
         self.register_buffer("running_var", torch.ones(outputs))
 
     def forward(self, x: Tensor) -> Tensor:
-        """(..., inputs) -> (..., outputs)"""
+        """(..., inputs) -> (..., outputs), in the precision of `x`"""
         weight, bias = self.folded(x)
-        return functional.linear(x, weight, bias)
+        return functional.linear(x, weight.to(x.dtype), bias.to(x.dtype))
 
     def folded(self, x: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Return weight (outputs, inputs) and bias (outputs,) with the normalisation in them.
@@ -75,13 +75,17 @@ class NormedLinear(nn.Module):
 
 
 class Moments(torch.autograd.Function):
-    """Mean (C,) and covariance (C, C) of rows (P, C), with the one product that their gradient takes."""
+    """Mean (C,) and covariance (C, C) of rows (P, C), with the one product that their gradient takes.
+
+    Of rows in bfloat16 both are float32.
+    """
 
     @staticmethod
     def forward(ctx: Any, rows: Tensor) -> tuple[Tensor, Tensor]:
-        mean = rows.mean(0)
+        exact = torch.promote_types(rows.dtype, torch.float32)
+        mean = rows.mean(0, dtype=exact)
         # Inputs are centred points or rectified unit-variance features, so this difference loses little.
-        covariance = rows.t() @ rows / len(rows) - mean[:, None] * mean
+        covariance = (rows.t() @ rows).to(exact) / len(rows) - mean[:, None] * mean
         ctx.save_for_backward(rows, mean)
         return mean, covariance
 
@@ -89,7 +93,8 @@ class Moments(torch.autograd.Function):
     def backward(ctx: Any, of_mean: Tensor, of_covariance: Tensor) -> Tensor:
         rows, mean = ctx.saved_tensors
         pull = (of_covariance + of_covariance.t()) / len(rows)
-        return torch.addmm(of_mean / len(rows) - pull @ mean, rows, pull)
+        push = of_mean / len(rows) - pull @ mean
+        return torch.addmm(push.to(rows.dtype), rows, pull.to(rows.dtype))
 
 
 class PooledLinear(NormedLinear):

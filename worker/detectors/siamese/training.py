@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from worker.cloud.patches import Patch, patch
 from worker.cloud.types import Points
-from worker.detectors.siamese.chamfer import STATISTICS, chamfer_statistics
+from worker.detectors.siamese.chamfer import COUNTS, STATISTICS, chamfer_statistics, swapped
 from worker.detectors.siamese.head import PairHead
 from worker.detectors.trainable import DIFFERENT, Pair
 from worker.progress import Progress
@@ -49,6 +49,7 @@ class SiameseTraining(ABC, Generic[B]):
     patch_points: int
     chamfer_points: int | None
     seed: int
+    counts: bool = False
 
     @abstractmethod
     def head(self, module: nn.Module) -> PairHead:
@@ -83,7 +84,7 @@ class SiameseTraining(ABC, Generic[B]):
         for batch in batches:
             same_place = torch.from_numpy(batch.labels) != DIFFERENT
             sides.append([side[same_place] for side in self.descriptors(module, batch).chunk(2)])
-            statistics.append(chamfer_statistics(*compared(batch, device_of(module)))[same_place])
+            statistics.append(self._statistics(*compared(batch, device_of(module)))[same_place])
         reference, current = (torch.cat(side) for side in zip(*sides, strict=True))
         self.head(module).initialize_from_data(reference, current, torch.cat(statistics))
 
@@ -103,15 +104,19 @@ class SiameseTraining(ABC, Generic[B]):
         return descriptors, samples
 
     def compare(self, references: Sequence[Tensor], currents: Sequence[Tensor]) -> NDArray[np.float32]:
-        """Return the Chamfer statistics (n, 8)."""
+        """Return the statistics (n, 8 or 16)."""
         if not references:
-            return np.zeros((0, STATISTICS), np.float32)
-        statistics: NDArray[np.float32] = chamfer_statistics(references, currents).numpy()
+            return np.zeros((0, STATISTICS + COUNTS * self.counts), np.float32)
+        statistics: NDArray[np.float32] = self._statistics(references, currents).numpy()
         return statistics
 
     def swapped(self, statistics: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Exchange the four of one direction for those of the other, (n, 8) -> (n, 8)."""
-        return np.roll(statistics, STATISTICS // 2, axis=1)
+        """Exchange what is of one direction for what is of the other, (n, S) -> (n, S)."""
+        exchanged: NDArray[np.float32] = swapped(torch.from_numpy(statistics)).numpy()
+        return exchanged
+
+    def _statistics(self, references: Sequence[Tensor], currents: Sequence[Tensor]) -> Tensor:
+        return chamfer_statistics(references, currents, counts=self.counts)
 
     def _samples(self, clouds: Sequence[Points], rng: np.random.Generator) -> list[Points]:
         """Return what the Chamfer branch sees of each."""

@@ -10,7 +10,7 @@ from torch import Tensor
 from worker.cloud.patches import Patch
 from worker.detectors.card import Card
 from worker.detectors.precision import Precision
-from worker.detectors.siamese.detector import SiameseDetector
+from worker.detectors.siamese.detector import SiameseDetector, SiameseSettings
 from worker.detectors.spicd_net.frozen import FrozenEncoder
 from worker.detectors.spicd_net.network import SpicdNetwork
 from worker.detectors.spicd_net.together import TogetherEncoder, level
@@ -22,27 +22,29 @@ class SpicdNet(SiameseDetector):
     def __init__(self, card: Card, network: SpicdNetwork, device: torch.device) -> None:
         super().__init__(card, network, network.head, device)
         self._spicd = network
-        self._encoder = FrozenEncoder(network.encoder)
         self._encode_with("float32", at_once=device.type == "cuda")
 
     @classmethod
     def load(cls, card: Card, weights: dict[str, Tensor], device: torch.device) -> SpicdNet:
         """Open a model. Raises RuntimeError for weights of another network, ValueError for unsound settings."""
-        network = SpicdNetwork()
+        network = SpicdNetwork(counts=card.settings_as(SiameseSettings).counts)
         network.load_state_dict(weights)
         return cls(card, network, device)
 
     def _encode_with(self, precision: Precision, *, at_once: bool) -> None:
+        """Take the encoder of a processor, which in place of bfloat16 searches in 8 bits, or that of a GPU."""
         super()._encode_with(precision, at_once=at_once)
+        searched = precision == "bfloat16" and self._device.type == "cpu"
+        self._encoder = FrozenEncoder(self._spicd.encoder, searched=searched)
         self._together = TogetherEncoder(self._spicd.encoder, precision).to(self._device) if at_once else None
 
     @torch.inference_mode()
     def _descriptors(self, patches: Sequence[Patch]) -> Tensor:
-        if self._together is not None:
-            clouds, centroids = zip(*map(self._on_device, patches), strict=True)
-            descriptors: Tensor = self._together(level(clouds), torch.stack(centroids))
-            return descriptors
-        return torch.stack([self._encoder(*self._on_device(patch)) for patch in patches])
+        clouds, centroids = zip(*map(self._on_device, patches), strict=True)
+        if self._together is None:
+            return self._encoder.encode(clouds, centroids)
+        descriptors: Tensor = self._together(level(clouds), torch.stack(centroids))
+        return descriptors
 
     def _on_device(self, patch: Patch) -> tuple[Tensor, Tensor]:
         distinct, centroid = (

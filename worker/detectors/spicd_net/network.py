@@ -81,12 +81,13 @@ class PointEncoder(nn.Module):
 
 
 class SpicdNetwork(nn.Module):
-    """Shared encoder, fusion and head."""
+    """Shared encoder, fusion and head; with `counts` the head is given those of `chamfer.py` too."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, counts: bool = False) -> None:
         super().__init__()
+        self.counts = counts
         self.encoder = PointEncoder()
-        self.head = PairHead(DESCRIPTOR)
+        self.head = PairHead(DESCRIPTOR, counts=counts)
 
     def forward(
         self, points: Tensor, sizes: list[int], chamfer_points: Tensor, chamfer_sizes: list[int]
@@ -101,7 +102,8 @@ class SpicdNetwork(nn.Module):
         f_ref, f_cur = descriptors.chunk(2)
         compared = torch.split(chamfer_points, chamfer_sizes)
         half = len(compared) // 2
-        logits = self.head(f_ref, f_cur, chamfer_statistics(compared[:half], compared[half:]))
+        statistics = chamfer_statistics(compared[:half], compared[half:], counts=self.counts)
+        logits = self.head(f_ref, f_cur, statistics)
         return PairOutput(logits, (*a3.chunk(2), *a64.chunk(2)))
 
 

@@ -39,7 +39,7 @@ class SpicdNetTraining(SiameseTraining[Batch]):
 
     def build(self, *, coarse_search: bool = False) -> SpicdNetwork:
         """Return the network before training; a coarse search is that of PooledLinear."""
-        network = SpicdNetwork()
+        network = SpicdNetwork(counts=self.counts)
         for module in network.modules():
             if isinstance(module, PooledLinear):
                 module.coarse_search = coarse_search

@@ -65,3 +65,22 @@ def test_what_cannot_be_measured_is_told_in_a_sentence(
 ) -> None:
     assert run("--quick", *words) == 1
     assert sentence in capsys.readouterr().err
+
+
+def test_several_models_share_the_corridors_and_have_a_folder_each(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["--quick", "--true-poses", "--no-robustness", "--model", "spicd-net/1", "--model", "c2c/1"]
+    assert run(*words, "--out", str(tmp_path)) == 0
+    told = [json.loads((tmp_path / name / "paper.json").read_text()) for name in ("spicd-net-1", "c2c-1")]
+    assert [one["model"] for one in told] == ["spicd-net/1", "c2c/1"]
+    cards = [open_card(MODEL_STORE, one["model"]) for one in told]
+    assert [one["fingerprint"] for one in told] == [card.fingerprint for card in cards]
+    first, second = ({row["method"]: row for row in one["table_6"]} for one in told)
+    assert first["M3C2-approx"] == second["M3C2-approx"]
+    changed = [row for row in told[1]["table_5"] if row.get("operation") == "remove"]
+    assert second["c2c/1"]["removals"] == {
+        name: value for name, value in changed[0].items() if name in second["c2c/1"]["removals"]
+    }
+    assert "c2c/1" in capsys.readouterr().out
+    assert run(*words, "--json") == 1

@@ -72,8 +72,8 @@ def test_a_survey_that_finds_the_same_points_differs_by_nothing_but_the_sample(
     same = type(pairs)(reference=pairs.reference, current=pairs.reference.points, observed=pairs.observed)
     seen = []
 
-    def noted(*clouds):
-        seen.append(chamfer_statistics(*clouds))
+    def noted(*clouds, **options):
+        seen.append(chamfer_statistics(*clouds, **options))
         return seen[0]
 
     monkeypatch.setattr(

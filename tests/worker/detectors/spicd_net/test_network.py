@@ -8,11 +8,14 @@ import pytest
 import torch
 from torch import nn
 
-from worker.detectors.siamese.chamfer import chamfer_statistics, nearest_distances
+from worker.detectors.card import MODEL_STORE
+from worker.detectors.precision import has_bfloat16
+from worker.detectors.siamese.chamfer import chamfer_statistics, nearest_distances, swapped
 from worker.detectors.siamese.head import PairHead, fused
 from worker.detectors.siamese.layers import Moments, NormedLinear, PooledLinear
 from worker.detectors.spicd_net.frozen import FrozenEncoder
 from worker.detectors.spicd_net.network import SpicdNetwork, TransformNet
+from worker.detectors.store import open_detector, weights_of
 
 SIZES = [40, 25, 60]
 
@@ -118,6 +121,59 @@ def test_the_frozen_encoder_on_distinct_points_is_the_network_on_repeated_ones(n
     assert expected.std() > 0.01  # the network tells channels apart, so that the line above says something
 
 
+with_8_bits = pytest.mark.skipif(
+    not has_bfloat16(torch.device("cpu")),
+    reason="this processor has no products in 8 bits that could be used",
+)
+
+
+@pytest.mark.parametrize("searched", [False, pytest.param(True, marks=with_8_bits)])
+def test_the_frozen_encoder_encodes_each_of_several_clouds_as_it_does_alone(network, searched):
+    clouds = [torch.rand(points, 3) - 0.5 for points in (700, 30, 256, 1)]
+    encoder = FrozenEncoder(network.encoder, searched=searched)
+    centroids = [cloud.mean(0) for cloud in clouds]
+    alone = torch.stack([encoder(*pair) for pair in zip(clouds, centroids, strict=True)])
+    assert torch.allclose(encoder.encode(clouds, centroids), alone, atol=1e-5)
+
+
+@with_8_bits
+def test_a_searched_encoder_is_all_but_the_exact_one(network):
+    clouds = [torch.rand(700, 3) - 0.5 for _ in range(4)]
+    centroids = [cloud.mean(0) for cloud in clouds]
+    exact, searched = (FrozenEncoder(network.encoder, searched=way) for way in (False, True))
+    off = (searched.encode(clouds, centroids) - exact.encode(clouds, centroids)).abs()
+    assert 0 < off.max() < 0.02
+    assert off.mean() < 1e-3
+
+
+@with_8_bits
+def test_the_scores_of_the_shipped_weights_hold_where_winners_are_searched():
+    """Tiles of walls, floors and boxes; docs/decisions/0041 has the difference on 172 simulated tiles."""
+    generator = torch.Generator().manual_seed(0)
+    walls = torch.rand(24, 900, 3, generator=generator) * torch.tensor([1.5, 1.5, 1.0]) - 0.5
+    walls[:, :300, 2], walls[:, 300:600, 0] = -0.5, -0.5
+    boxes = torch.rand(12, 400, 3, generator=generator) * 0.4
+    before = [*walls]
+    after = [torch.cat(pair) for pair in zip(walls[:12], boxes, strict=True)] + [*walls[12:]]
+    network = SpicdNetwork()
+    network.load_state_dict(weights_of(open_detector(MODEL_STORE, "spicd-net/1", "cpu")))
+    statistics = chamfer_statistics(before, after)
+    scores = []
+    with torch.inference_mode():
+        for searched in (False, True):
+            encoder = FrozenEncoder(network.eval().encoder, searched=searched)
+            sides = [encoder.encode(clouds, [c.mean(0) for c in clouds]) for clouds in (before, after)]
+            scores.append(1 - network.head(*sides, statistics).softmax(dim=1)[:, 0])
+    exact, coarse = scores
+    assert exact.max() - exact.min() > 0.2  # they tell the tiles apart
+    assert (coarse - exact).abs().max() < 2e-3
+
+
+def test_a_cloud_without_points_is_refused(network):
+    with pytest.raises(ValueError, match="at least one point"):
+        FrozenEncoder(network.encoder)(torch.empty(0, 3), torch.zeros(3))
+
+
 def test_chamfer_statistics_of_a_shifted_copy_are_the_shift():
     grid = torch.stack(torch.meshgrid(*[torch.arange(5.0)] * 3, indexing="ij"), -1).reshape(125, 3)
     shifted = grid + torch.tensor([0.0, 0.0, 0.3])
@@ -143,6 +199,26 @@ def test_clouds_of_a_batch_are_compared_pair_by_pair_whatever_their_sizes():
     together = chamfer_statistics(clouds[:2], clouds[2:])
     alone = [chamfer_statistics([clouds[i]], [clouds[i + 2]])[0] for i in range(2)]
     assert torch.equal(together, torch.stack(alone))
+
+
+def test_point_counts_by_hand_three_points_more_of_which_two_are_far():
+    before = torch.arange(20.0)[:, None] * torch.tensor([1.0, 0.0, 0.0])
+    added = torch.tensor([[0.0, 0.03, 0.0], [1.0, 0.06, 0.0], [2.0, 0.3, 0.0]])  # beyond 2.5; 5; all three
+    counts = chamfer_statistics([before], [torch.cat([before, added])], counts=True)[0, 8:]
+    expected = torch.tensor([-4.0, 1, 1, 1, 4, 4, 3, 2]).abs().log() * torch.tensor([-1.0] + [1.0] * 7)
+    assert torch.allclose(counts, expected)
+
+
+def test_of_a_pair_turned_round_every_statistic_is_turned_round():
+    a, b = torch.rand(200, 3), torch.rand(150, 3)
+    forth, back = (chamfer_statistics([one], [other], counts=True) for one, other in ((a, b), (b, a)))
+    assert torch.allclose(swapped(forth), back)
+    assert torch.allclose(swapped(forth[:, :8]), back[:, :8])
+    assert forth[0, 8] == -back[0, 8]  # fifty points fewer, fifty more
+
+
+def test_a_head_with_counts_has_sixteen_statistics_and_one_without_the_papers_eight():
+    assert [PairHead(1024, counts=counts).chamfer[0].in_features for counts in (False, True)] == [8, 16]
 
 
 def test_the_tree_finds_the_distances_of_all_pairs(monkeypatch):
