@@ -100,7 +100,7 @@ def test_a_batch_that_does_not_fit_is_halved_and_the_scores_are_the_same(
     detector.run_with(Runtime(batches=DirectBatches(FittedRuns(64, meter := Meter())), at_once=True))
     together = detector._together
     assert together is not None
-    real, sizes = together.forward, []
+    real, sizes = together.forward, list[int]()
 
     def small(points: torch.Tensor, centroids: torch.Tensor) -> torch.Tensor:
         sizes.append(len(points))
