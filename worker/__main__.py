@@ -166,13 +166,18 @@ def _require_all(settings: Settings, queue: str) -> None:
 
 
 def _require_device(settings: Settings, queue: str) -> None:
-    if queue == "inference" and settings.device == "cuda":
-        from worker.jobs.models import finds_gpu  # noqa: PLC0415  # torch takes seconds
+    if queue != "inference" or (settings.device != "cuda" and settings.inference_precision != "bfloat16"):
+        return
+    from worker.jobs.models import finds_gpu, lacks_precision  # noqa: PLC0415  # torch takes seconds
 
-        if not finds_gpu():
-            raise LaunchFailed(
-                "SPICD_DEVICE is cuda, but torch finds no CUDA GPU; set it to auto or cpu, or mend the driver"
-            )
+    if settings.device == "cuda" and not finds_gpu():
+        raise LaunchFailed(
+            "SPICD_DEVICE is cuda, but torch finds no CUDA GPU; set it to auto or cpu, or mend the driver"
+        )
+    if lacks_precision(settings):
+        raise LaunchFailed(
+            "SPICD_INFERENCE_PRECISION is bfloat16, and this machine's device does not have it; set it to auto"
+        )
 
 
 def limit_inference(settings: Settings) -> int:

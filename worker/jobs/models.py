@@ -13,7 +13,7 @@ from service.catalog.records import ModelRecord, VersionRecord
 from service.settings import Settings
 from worker.detectors.card import Card
 from worker.detectors.detector import Detector
-from worker.detectors.precision import PrecisionChoice
+from worker.detectors.precision import PrecisionChoice, chosen_precision
 from worker.detectors.running.calls import DirectBatches, FittedRuns
 from worker.detectors.running.meter import Meter
 from worker.detectors.running.runtime import Runtime
@@ -80,6 +80,15 @@ def finds_gpu() -> bool:
 def runs_on_gpu(settings: Settings) -> bool:
     """Tell whether networks of this process run on a GPU."""
     return settings.device != "cpu" and finds_gpu()
+
+
+def lacks_precision(settings: Settings) -> bool:
+    """Tell whether the device does not have the precision that is asked for."""
+    try:
+        chosen_precision(settings.inference_precision, resolve_device(settings.device), holds=True)
+    except DetectorUnavailable:
+        return True
+    return False
 
 
 @contextmanager
