@@ -53,8 +53,9 @@ def _along_the_tree(tree: cKDTree, own: NDArray[np.intp]) -> NDArray[np.intp]:
     """Return these rows as they lie in the leaves of the tree: the next point's neighbours are then mostly at hand."""
     wanted = np.zeros(tree.n, bool)
     wanted[own] = True
-    leaves = np.asarray(tree.indices)
-    return leaves[wanted[leaves]]
+    leaves = np.asarray(tree.indices, np.intp)
+    rows: NDArray[np.intp] = leaves[wanted[leaves]]
+    return rows
 
 
 def _looked_up(
@@ -103,7 +104,7 @@ def _least_axis(covariances: Floats, known: Bools) -> Floats:
     each = np.arange(len(covariances))
     length = np.sqrt(lengths[each, longest])
     unclear = length < 1e-6
-    vectors = crosses[each, longest] / np.where(unclear, 1.0, length)[:, None]
+    vectors: Floats = crosses[each, longest] / np.where(unclear, 1.0, length)[:, None]
     if unclear.any():
         vectors[unclear] = np.linalg.eigh(_whole(covariances[unclear]))[1][:, :, 0]
     vectors[~known] = (0.0, 0.0, 1.0)

@@ -81,7 +81,9 @@ def _opened_own(blob_url: str, job_id: str, card: str, device: Device) -> Detect
 
 def pipeline_settings(context: Context, record: VersionRecord, card: Card) -> PipelineSettings:
     """Return the settings that a version of a map was asked for with, and what the model needs put in its place."""
-    asked = PipelineSettings.model_validate(
-        {**record.settings, "max_scan_points": context.settings.max_scan_points}
-    )
+    of_the_service = {
+        "max_scan_points": context.settings.max_scan_points,
+        "memory_bytes": context.settings.map_memory_bytes,
+    }
+    asked = PipelineSettings.model_validate({**record.settings, **of_the_service})
     return asked.for_model(card.preprocessing)

@@ -63,7 +63,7 @@ def test_fusing_many_scans_gives_what_merging_them_one_by_one_gives(count: int) 
     assert fused.counts.tolist() == one_by_one.counts.tolist()
     assert fused.counts.sum() == sum(len(scan.points) for scan in scans)
     assert fused.points == pytest.approx(one_by_one.points, abs=1e-6)
-    assert fused.views == pytest.approx(one_by_one.views, abs=1e-9)
+    assert fused.views == pytest.approx(one_by_one.views.astype(np.float32), abs=1e-9)
 
 
 def test_no_scan_makes_no_map() -> None:
