@@ -94,7 +94,7 @@ def _walked(walk: Walk, hall: Hall) -> int:
     stops = [hall.stop(number, yaw=37.0 * number) for number in range(hall.cells**2)]
     ids = walk.upload(hall, stops, "map", seed=100)
     print(f"{len(ids)} scans made and uploaded in {time.monotonic() - begun:.0f} s", flush=True)
-    job = walk.service.post("/maps", map_id=MAP, scan_ids=ids)
+    job = walk.service.post("/maps", id=MAP, scan_ids=ids)
     try:
         walk.follow("map", job["job_id"])
         later = hall.with_crate(*_CRATE)
@@ -131,9 +131,9 @@ def _wrong_survey(service: Service, survey_id: str) -> Iterator[str]:
     if picture.status_code != 200 or not picture.content.startswith(b"\x89PNG"):
         yield f"the picture: {picture.status_code}"
     objects = service.get(f"/surveys/{survey_id}/objects")["features"]
-    middles = [np.mean(thing["properties"]["box"], axis=0) for thing in objects]
+    middles = [np.array([thing["properties"][f"center_{axis}"] for axis in "xy"]) for thing in objects]
     print(f"{len(objects)} objects", flush=True)
-    if not any(np.hypot(*(middle[:2] - _CRATE)) < 0.5 for middle in middles):
+    if not any(np.hypot(*(middle - _CRATE)) < 0.5 for middle in middles):
         yield f"the crate at {_CRATE} is not among the objects at {[m.round(1).tolist() for m in middles]}"
 
 
