@@ -74,7 +74,9 @@ class Hall:
         if not self._caster:
             self._caster.append(_scene_of(self.boxes))
         both = np.hstack([np.broadcast_to(eye, rays.shape), rays]).astype(np.float32)
-        met: Floats = self._caster[0].cast_rays(o3d.core.Tensor(both))["t_hit"].numpy().astype(np.float64)
+        met: Floats = (
+            self._caster[0].cast_rays(o3d.core.Tensor.from_numpy(both))["t_hit"].numpy().astype(np.float64)
+        )
         return met
 
 
@@ -115,5 +117,5 @@ def _scene_of(boxes: NDArray[np.float64]) -> o3d.t.geometry.RaycastingScene:
     scene = o3d.t.geometry.RaycastingScene()
     for low, high in boxes:
         mesh = o3d.t.geometry.TriangleMesh.create_box(*(high - low).tolist())
-        scene.add_triangles(mesh.translate(o3d.core.Tensor(low.astype(np.float32))))
+        scene.add_triangles(mesh.translate(o3d.core.Tensor.from_numpy(low.astype(np.float32))))
     return scene
