@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 from worker.cloud.types import Floats, Matrix4, Points
 from worker.simulation.scenes import rigid
 
-PITCH, RANGE = 10.0, 10.0  #: metres, from one stop to the next, and how far a scan sees
+PITCH, RANGE = 8.0, 10.0  #: metres, from one stop to the next, and how far a scan sees
 _HEIGHT, _EYE, _NEAR = 4.0, 1.5, 0.8  # metres; of the hall, of the scanner, and from where on it sees
 _DENSITY = 600.0  # points a square metre
 _NOISE = 0.005  # metres, sigma along the ray
 _PANELS, _THINGS = 3, 8  # of each cell
 _CLEAR = 1.2  # metres around each stop
-POINTS_A_CELL = 105_000  #: voxels of 5 cm that a stop adds to the map, about
+POINTS_A_CELL = 70_000  #: voxels of 5 cm that a stop adds to the map, about
 
 
 @dataclass(frozen=True, kw_only=True)
