@@ -230,7 +230,7 @@ class NewWebhook(TypedDict):
 
 
 class ObjectData(TypedDict):
-    """A changed thing, as its latest sighting has it."""
+    """A changed thing: what is known of it by now."""
 
     kind: Literal["appeared", "disappeared", "moved"]
     links: list[Link]
@@ -258,7 +258,12 @@ class ObjectEvent(TypedDict):
 
 
 class ObjectProperties(TypedDict):
-    """What all surveys together say of a thing; what is of one survey is that of the latest which saw it."""
+    """
+    What all surveys together say of a thing.
+
+    `kind`, `now` and `before` are of what stands: a place that the latest survey did not look at is as an earlier one told
+    it. What else is of one survey is of the latest which saw the thing.
+    """
 
     accepted_in_version: int | None
     before: Box | None
@@ -1162,7 +1167,7 @@ class MapSummaryDocument(TypedDict):
 
 
 class ObjectFeature(TypedDict):
-    """A thing over all surveys of a map; its footprint is as in its latest sighting."""
+    """A thing over all surveys of a map; its footprint is where it was seen last, or was before where it disappeared."""
 
     geometry: Footprint | None
     id: str

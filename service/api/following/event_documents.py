@@ -122,7 +122,7 @@ class ChangeWithdrawnData(Data):
 
 
 class ObjectData(Data):
-    """A changed thing, as its latest sighting has it."""
+    """A changed thing: what is known of it by now."""
 
     map_id: MapId
     object_id: str = Field(examples=["object-77aa"])

@@ -43,7 +43,7 @@ _MANY = 500  #: tiles that a query names; where there are more it reads those of
 #: Columns of an object that its surveys decide; where one changes it is told anew.
 _TOLD = (
     "kind", "status", "last_known", "transient", "first_seen", "last_seen", "last_looked", "accepted_in_version",
-    "sightings", "survey_id", "number", "probability", "min_x", "min_y", "min_z", "max_x", "max_y", "max_z",
+    "sightings", "survey_id", "number", "other_survey_id", "other_number", "probability", "min_x", "min_y", "min_z", "max_x", "max_y", "max_z",
 )  # fmt: skip
 
 
@@ -430,14 +430,27 @@ def _latest(seen: tuple[Visit, Sighting]) -> tuple[Any, ...]:
 
 
 def _write_track(row: MapObject, track: Track, sightings: Mapping[tuple[str, int], Row[Any]]) -> None:
-    visit, one = max(track.sightings, key=_latest)
-    latest = sightings[visit.survey_id, one.number]
-    place = Place.model_validate(latest.now or latest.before)
-    row.kind, row.probability = latest.kind, latest.probability
+    latest_first = sorted(track.sightings, key=_latest, reverse=True)
+    by_side = {side: next(seen for seen in latest_first if side in seen[1].parts) for side in track.sides}
+    visit, one = latest_first[0]
+    row.kind = "moved" if len(by_side) == 2 else "appeared" if "now" in by_side else "disappeared"
+    row.probability = sightings[visit.survey_id, one.number].probability
     row.survey_id, row.number = visit.survey_id, one.number
+    others = ((by.survey_id, other.number) for by, other in by_side.values() if (by, other) != (visit, one))
+    row.other_survey_id, row.other_number = next(others, (None, None))
     row.status, row.last_known, row.transient = track.status, track.last_known, track.transient
     row.first_seen, row.last_seen = track.sightings[0][0].captured_at, visit.captured_at
     row.last_looked, row.accepted_in_version = track.last_looked, track.accepted_in_version
     row.sightings = track.visits
-    row.min_x, row.min_y, row.min_z = place.bounds.min
-    row.max_x, row.max_y, row.max_z = place.bounds.max
+    bounds = _shown(by_side, sightings).bounds
+    row.min_x, row.min_y, row.min_z = bounds.min
+    row.max_x, row.max_y, row.max_z = bounds.max
+
+
+def _shown(
+    by_side: Mapping[Side, tuple[Visit, Sighting]], sightings: Mapping[tuple[str, int], Row[Any]]
+) -> Place:
+    """Return where an object is, or was where it is no more."""
+    side: Side = "now" if "now" in by_side else "before"
+    visit, one = by_side[side]
+    return Place.model_validate(getattr(sightings[visit.survey_id, one.number], side))
