@@ -242,7 +242,7 @@ class ObjectData(TypedDict):
 
 
 class ObjectEvent(TypedDict):
-    """An object is seen for the first time, is gone or there again, was taken over by a version, or is known otherwise."""
+    """An object is seen for the first time, is gone or there again, or was taken over by a version."""
 
     data: ObjectData
     datacontenttype: Literal["application/json"]
@@ -252,9 +252,7 @@ class ObjectEvent(TypedDict):
     specversion: Literal["1.0"]
     subject: str
     time: str
-    type: Literal[
-        "object.told", "object.updated", "object.gone_again", "object.seen_again", "object.accepted"
-    ]
+    type: Literal["object.told", "object.gone_again", "object.seen_again", "object.accepted"]
 
 
 class ObjectProperties(TypedDict):
@@ -303,6 +301,33 @@ class ObjectProperties(TypedDict):
     yaw_degrees: float
     z_max: float
     z_min: float
+
+
+class ObjectUpdatedData(TypedDict):
+    """A changed thing that was told before: what is known of it by now."""
+
+    kind: Literal["appeared", "disappeared", "moved"]
+    links: list[Link]
+    map_id: str
+    object_id: str
+    only_times: bool
+    probability: float
+    status: Literal["new", "still_there", "gone_again", "unknown", "accepted"]
+    survey_id: str
+
+
+class ObjectUpdatedEvent(TypedDict):
+    """Something else is known of an object than was told."""
+
+    data: ObjectUpdatedData
+    datacontenttype: Literal["application/json"]
+    id: str
+    sequence: str
+    source: str
+    specversion: Literal["1.0"]
+    subject: str
+    time: str
+    type: Literal["object.updated"]
 
 
 class ObjectWithdrawnData(TypedDict):
@@ -958,7 +983,7 @@ class ChangeData(TypedDict):
 
 
 class ChangeEvent(TypedDict):
-    """A change of a tile is seen for the first time, or what is known of it is another than was told."""
+    """A change of a tile is seen for the first time."""
 
     data: ChangeData
     datacontenttype: Literal["application/json"]
@@ -968,7 +993,35 @@ class ChangeEvent(TypedDict):
     specversion: Literal["1.0"]
     subject: str
     time: str
-    type: Literal["change.told", "change.updated"]
+    type: Literal["change.told"]
+
+
+class ChangeUpdatedData(TypedDict):
+    """A change of a tile that was told before, as it is known now."""
+
+    change_id: str
+    first_seen: str
+    last_seen: str
+    links: list[Link]
+    map_id: str
+    max_score: float
+    only_times: bool
+    survey_id: str
+    tile_id: str
+
+
+class ChangeUpdatedEvent(TypedDict):
+    """What is known of a change is another than was told."""
+
+    data: ChangeUpdatedData
+    datacontenttype: Literal["application/json"]
+    id: str
+    sequence: str
+    source: str
+    specversion: Literal["1.0"]
+    subject: str
+    time: str
+    type: Literal["change.updated"]
 
 
 class ChangeWithdrawnData(TypedDict):
@@ -1376,8 +1429,10 @@ WebhookEvent: TypeAlias = (
     | SurveyDeletedEvent
     | ModelEvent
     | ChangeEvent
+    | ChangeUpdatedEvent
     | ChangeWithdrawnEvent
     | ObjectEvent
+    | ObjectUpdatedEvent
     | ObjectWithdrawnEvent
     | MapDeletedEvent
     | PingEvent
@@ -1392,8 +1447,10 @@ CloudEvent: TypeAlias = (
     | SurveyDeletedEvent
     | ModelEvent
     | ChangeEvent
+    | ChangeUpdatedEvent
     | ChangeWithdrawnEvent
     | ObjectEvent
+    | ObjectUpdatedEvent
     | ObjectWithdrawnEvent
     | MapDeletedEvent
 )
