@@ -22,7 +22,7 @@ import type {
   VersionList,
   VersionSummaryDocument,
 } from "./documents.ts";
-import { boxOf, itemOfObject, itemOfSighting, itemOfTile, type Item } from "./items.ts";
+import { boxOf, itemOfObject, itemOfSighting, itemOfTile, joinSides, type Item } from "./items.ts";
 import type { Place } from "./link.ts";
 import { focusOf, isOpen, NOT_ASKED, type Look } from "./state.ts";
 
@@ -114,8 +114,8 @@ async function ofSurvey(app: Controller): Promise<void> {
   if (chosen?.objects) {
     const path = `surveys/${chosen.survey_id}/objects?limit=1000`;
     jobs.push(
-      app.load("sightings", () =>
-        items(app, path, (one: Feature<SightingProperties>) => itemOfSighting(one)),
+      app.load("sightings", async () =>
+        joinSides(await items(app, path, (one: Feature<SightingProperties>) => itemOfSighting(one))),
       ),
     );
   }
