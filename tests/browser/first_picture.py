@@ -124,7 +124,10 @@ def main() -> None:
         settings = Settings(data_dir=folder / "data", model_store=MODEL_STORE, min_free_bytes=0)
         with live(settings) as service:
             service.http.get("/maps")  # the first request of all has the API describe itself
-            print(f"drawn by {renderer(browser)}\n")
+            name = renderer(browser)
+            print(f"drawn by {name}\n")
+            if options.gpu and not is_gpu(name):
+                raise SystemExit("no GPU that the browser can draw with; without --gpu the processor draws")
             print("| points | as | first picture | loaded by then | all of the view | a frame | turning |")
             print("| ---: | --- | ---: | ---: | ---: | ---: | ---: |", flush=True)
             for points in options.points:
@@ -150,6 +153,13 @@ def renderer(browser: Browser) -> str:
         return str(page.evaluate(_RENDERER))
     finally:
         page.close()
+
+
+def is_gpu(name: str) -> bool:
+    """Tell whether a renderer of this name is a GPU, and not the processor or nothing."""
+    return name != "none" and not any(
+        word in name.lower() for word in ("swiftshader", "llvmpipe", "software")
+    )
 
 
 def measure(browser: Browser, service: Live, points: int) -> Run:
@@ -247,7 +257,9 @@ def _stages(runs: Sequence[Run]) -> str:
 def _parse() -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="python -m tests.browser.first_picture", description=__doc__)
     parser.add_argument("points", nargs="*", type=int, default=SIZES, help="of each map")
-    parser.add_argument("--gpu", action="store_true", help="leave the browser the machine's GPU")
+    parser.add_argument(
+        "--gpu", action="store_true", help="leave the browser the machine's GPU; ends where it has none"
+    )
     parser.add_argument("--runs", type=int, default=3, help="of each map; the median counts")
     parser.add_argument("--maps", type=Path, help="a folder that made maps stay in")
     parser.add_argument("--stages", action="store_true", help="say what of the first picture took how long")
