@@ -83,6 +83,31 @@ def test_the_keyboard_alone_leads_from_the_maps_to_the_evidence_of_an_object(
     expect(page.locator("#items")).to_be_focused()
 
 
+def test_filters_and_section_open_by_a_key_and_give_the_focus_back(opened: Opener) -> None:
+    viewer = opened(f"#map={MAP}").drawn()
+    page, keys = viewer.page, viewer.page.keyboard
+    keys.press("/")
+    expect(page.locator("#filters input").first).to_be_focused()
+    keys.press("Escape")
+    expect(page.locator("#filters")).to_have_count(0)
+    expect(page.get_by_role("button", name="Filters")).to_be_focused()
+    keys.press("x")
+    slider = page.get_by_role("slider", name="Up to, metres")
+    expect(slider).to_be_focused()
+    expect(page.get_by_role("slider", name="From, metres")).to_be_visible()
+    keys.press("ArrowLeft")
+    viewer.until("() => location.hash.includes('section=')")
+    expect(slider).to_be_focused()
+    keys.press("x")
+    expect(slider).to_have_count(0)
+    expect(page.get_by_role("button", name="Section")).to_be_focused()
+    keys.press("?")
+    for said in ("filters", "section"):
+        expect(page.locator("dialog[open] .keys")).to_contain_text(said)
+    keys.press("Escape")
+    expect(page.get_by_role("button", name="Section")).to_be_focused()
+
+
 def test_what_has_the_focus_is_seen(opened: Opener) -> None:
     viewer = opened()
     viewer.page.get_by_text("The den", exact=True).wait_for()
@@ -306,9 +331,16 @@ def test_dropped_scans_become_a_survey_whose_job_is_followed_until_its_result_is
     catalog.jobs.report(begun, message="registering", progress=0.42)
     expect(job_row).to_contain_text("42 %", timeout=20_000)
     run(job)
+    said = viewer.page.get_by_role("status").filter(has_text="is compared: no object changed")
+    expect(said).to_be_visible(timeout=20_000)
     found = viewer.page.locator(f"#visit-{survey.survey_id}")
     expect(found).to_contain_text("nothing changed", timeout=20_000)
     expect(job_row).to_have_count(0)
+    expect(found).to_have_attribute("aria-pressed", "false")
+    said.get_by_role("link", name="Show it").click()
+    expect(found).to_have_attribute("aria-pressed", "true")
+    expect(viewer.page.locator(".about")).to_contain_text("Nothing changed in")
+    expect(said).to_have_count(0)
 
 
 def test_a_visit_goes_on_without_a_file_that_was_refused(opened: Opener, serve: Callable[..., Live]) -> None:

@@ -13,6 +13,7 @@ import { Page } from "./views/page.tsx";
 
 import { KIND_COLOURS, STATE_COLOURS, TILE_COLOURS } from "../scene/colours.ts";
 import type { Scene } from "../scene/scene.ts";
+import type { Theme } from "../scene/types.ts";
 
 declare global {
   interface Window {
@@ -20,8 +21,13 @@ declare global {
   }
 }
 
-for (const [name, colour] of Object.entries({ ...STATE_COLOURS, ...TILE_COLOURS, ...KIND_COLOURS })) {
-  document.documentElement.style.setProperty(`--${name}`, colour);
+/** Give the styles the colours that the scene has. */
+function paint(theme: Theme): void {
+  const { dataset, style } = document.documentElement;
+  if (dataset["theme"] === theme) return;
+  dataset["theme"] = theme;
+  for (const [name, colour] of Object.entries({ ...STATE_COLOURS, ...TILE_COLOURS[theme], ...KIND_COLOURS }))
+    style.setProperty(`--${name}`, colour);
 }
 
 const root = document.createElement("div");
@@ -29,7 +35,7 @@ root.id = "app";
 document.body.append(root);
 
 const app = new Controller(new Api(document.baseURI), (state) => {
-  document.documentElement.dataset["theme"] = shownTheme(state);
+  paint(shownTheme(state));
   const name = state.map.value?.name ?? state.place.map;
   document.title = name ? `${name} · SPICD` : "SPICD";
   const focused = document.activeElement !== document.body;

@@ -3,7 +3,7 @@
 import { Fragment, h } from "preact";
 
 import type { SightingProperties, TileProperties } from "../documents.ts";
-import { ago, count, instant, metres, percent } from "../format.ts";
+import { ago, count, deviceWords, instant, metres, percent } from "../format.ts";
 import { whereOf, type Item } from "../items.ts";
 import type { Show } from "../link.ts";
 import { lookedAt } from "../stage.ts";
@@ -151,7 +151,7 @@ function AboutObject({ app, item }: Props & { item: Item }) {
         <SurveyLink app={app} id={item.surveyId}>
           {instant(seen.captured_at)}
         </SurveyLink>
-        {seen.device_id && `, ${seen.device_id}`}
+        {seen.device_id && `, ${deviceWords(seen.device_id)}`}
       </Fact>
       <Fact name="Compared">
         with version {seen.map_version}, by {seen.model}
@@ -302,7 +302,8 @@ function History({ app, state, item }: Props & { item: Item }) {
 }
 
 function sawIt(seen: SightingProperties): string {
-  const words = [(KINDS[seen.kind] ?? seen.kind).toLowerCase(), percent(seen.probability), seen.device_id];
+  const device = seen.device_id && deviceWords(seen.device_id);
+  const words = [(KINDS[seen.kind] ?? seen.kind).toLowerCase(), percent(seen.probability), device];
   return words.filter(Boolean).join(", ");
 }
 

@@ -5,7 +5,9 @@ import { Fragment, h } from "preact";
 import type { ScanOutcome } from "../documents.ts";
 import { count, metres, percent } from "../format.ts";
 import { capital, REASONS } from "../words.ts";
-import { Warnings } from "./parts.tsx";
+import { Folded, Warnings } from "./parts.tsx";
+
+const ASKING = "…"; // in place of a file's name until it is known
 
 interface ScansProps {
   scans: readonly ScanOutcome[];
@@ -27,7 +29,7 @@ export function Scans({ scans, names, placing }: ScansProps) {
         {waiting > 0 && `, ${waiting} ${placing ? "wait" : "not tried"}`}.
       </p>
       {refused.map((scan) => (
-        <Refused key={scan.scan_id} scan={scan} name={names[scan.scan_id] || scan.scan_id} />
+        <Refused key={scan.scan_id} scan={scan} name={names[scan.scan_id] ?? ASKING} />
       ))}
       {accepted.length > 0 && (
         <table class="scans">
@@ -46,7 +48,7 @@ export function Scans({ scans, names, placing }: ScansProps) {
                 key={scan.scan_id}
                 scan={scan}
                 sure={sure}
-                name={names[scan.scan_id] || scan.scan_id}
+                name={names[scan.scan_id] ?? ASKING}
               />
             ))}
           </tbody>
@@ -60,7 +62,9 @@ function Accepted({ scan, name, sure }: { scan: ScanOutcome; name: string; sure:
   return (
     <>
       <tr>
-        <td class="name">{name}</td>
+        <td class="name" title={scan.scan_id}>
+          {name}
+        </td>
         <td>{scan.fitness === null ? "" : percent(scan.fitness)}</td>
         <td>{scan.rmse === null ? "" : metres(scan.rmse)}</td>
         {sure && <td>{scan.confidence === null ? "not asked" : percent(scan.confidence)}</td>}
@@ -86,16 +90,15 @@ function Refused({ scan, name }: { scan: ScanOutcome; name: string }) {
   ].filter(Boolean);
   return (
     <div class="refused">
-      <strong>
+      <strong title={scan.scan_id}>
         {name}: {what}
       </strong>
       {advice && <p class="advice">{capital(advice)}.</p>}
       {(scan.detail || numbers.length > 0) && (
-        <details>
-          <summary>Figures</summary>
+        <Folded>
           {scan.detail && <p>{scan.detail}</p>}
           {numbers.length > 0 && <p class="faint">{capital(numbers.join(", "))}</p>}
-        </details>
+        </Folded>
       )}
       <Warnings warnings={scan.warnings} />
     </div>
