@@ -30,6 +30,12 @@ PHONE = {
 #: The words on buttons that a finger hardly hits.
 _SMALL = """() => [...document.querySelectorAll("button:not(.as-link), summary, select")]
   .filter((one) => one.checkVisibility() && one.offsetHeight < 24).map((one) => one.outerHTML)"""
+#: Whether the camera looks at a place, to half a metre, from nearby.
+_LOOKS_AT = """(place) => {
+  const { position, target } = window.spicd.scene.view;
+  const away = (from) => Math.hypot(...place.map((value, axis) => value - from[axis]));
+  return away(target) < 0.5 && away(position) < 8;
+}"""
 #: Drops files on the page, as a hand with a mouse does: names, and contents in base64.
 _DROP = """(files) => {
   const dataTransfer = new DataTransfer();
@@ -86,6 +92,10 @@ def test_the_keyboard_alone_leads_from_the_maps_to_the_evidence_of_an_object(
 def test_filters_and_section_open_by_a_key_and_give_the_focus_back(opened: Opener) -> None:
     viewer = opened(f"#map={MAP}").drawn()
     page, keys = viewer.page, viewer.page.keyboard
+    keys.press("?")
+    expect(page.get_by_role("button", name="Close", exact=True)).to_be_focused()
+    keys.press("Enter")
+    expect(page.locator("#items")).to_be_focused()
     keys.press("/")
     expect(page.locator("#filters input").first).to_be_focused()
     keys.press("Escape")
@@ -238,6 +248,25 @@ def test_looking_again_does_not_lead_away_from_what_is_looked_at(opened: Opener)
     viewer.page.get_by_role("button", name="Look", exact=True).click()
     viewer.rests()
     assert viewer.page.evaluate(away) <= 1.02 * before
+
+
+def test_in_split_look_leads_to_the_object_from_anywhere(opened: Opener, viewer_data: ViewerData) -> None:
+    viewer = opened(f"#map={MAP}&survey={viewer_data.surveys['objects']}").drawn()
+    viewer.page.locator("#items").get_by_text("Appeared", exact=True).click()
+    expect(viewer.page.locator(".split-words")).to_be_visible()
+    viewer.rests()
+    away = "() => { window.spicd.scene.view = { position: [-20, -30, 25], target: [-5, -8, 0] }; }"
+    viewer.page.evaluate(away)
+    viewer.page.get_by_role("button", name="Look", exact=True).click()
+    (low, high) = viewer_data.changes["appeared"][0]
+    middle = [(one + other) / 2 for one, other in zip(low, high, strict=True)]
+    viewer.until(_LOOKS_AT, middle)
+    viewer.rests()
+    x, y = viewer.seen_at(middle)
+    canvas = viewer.page.locator(".canvas").bounding_box()
+    assert canvas is not None
+    assert canvas["width"] / 2 < x < canvas["width"]  # of the right half, after
+    assert 0 < y < canvas["height"]
 
 
 def test_a_phone_shows_list_and_scene_and_nothing_beside_its_screen(

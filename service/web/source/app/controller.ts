@@ -142,11 +142,11 @@ export class Controller {
   /** Say that a comparison has ended, with the way to its survey. */
   #ended(type: string, data: CloudEvent["data"]): void {
     const { map_id: map, survey_id: survey } = data;
-    const when = instant(String(data["captured_at"]));
-    const where = this.state.place.map ? "" : ` of ${nameOf(this.state, map)}`;
+    const which = this.state.place.map ? "The" : `${nameOf(this.state, map)}: the`;
+    const what = `${which} survey of ${instant(String(data["captured_at"]))}`;
     const to = map && survey ? { map, survey } : null;
-    if (type === "survey.ready") this.tell(`The survey${where} of ${when} is compared${foundBy(data)}.`, "plain", to);
-    else this.tell(`The survey${where} of ${when} could not be compared.`, "bad", to);
+    if (type === "survey.ready") this.tell(`${what} is compared${foundBy(data)}.`, "plain", to);
+    else this.tell(`${what} could not be compared.`, "bad", to);
   }
 
   #again(): void {

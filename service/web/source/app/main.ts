@@ -10,6 +10,7 @@ import { listen } from "./keys.ts";
 import { listenForDrops } from "./drops.ts";
 import { drawing, shownTheme, Stage } from "./stage.ts";
 import { Page } from "./views/page.tsx";
+import { keepFocus } from "./views/panels.ts";
 
 import { KIND_COLOURS, STATE_COLOURS, TILE_COLOURS } from "../scene/colours.ts";
 import type { Scene } from "../scene/scene.ts";
@@ -40,16 +41,10 @@ const app = new Controller(new Api(document.baseURI), (state) => {
   document.title = name ? `${name} · SPICD` : "SPICD";
   const focused = document.activeElement !== document.body;
   render(h(Page, { app, stage, state }), root);
-  if (focused && document.activeElement === document.body) keepFocus();
+  if (focused) keepFocus();
   stage.sync(state);
 });
 const stage = new Stage(app);
-
-/** Give the focus to the list, else to what the page is about, where what had it is there no more. */
-function keepFocus(): void {
-  const next = document.getElementById("items") ?? document.getElementById("main");
-  next?.focus({ preventScroll: true });
-}
 
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => app.update({}));
 listen(app, stage);

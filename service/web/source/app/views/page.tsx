@@ -50,11 +50,10 @@ function Said({ app, notice: { text, tone, to } }: { app: Controller; notice: No
     app.go({ ...(to!.map === app.state.place.map ? {} : placeOf(to!.map)), survey: to!.survey, item: null, tab: "survey" });
   };
   return (
-    <p class={`notice ${tone}`}>
-      {text}
+    <div class={`notice ${tone}`}>
+      <span>{text}</span>
       {to && (
         <>
-          {" "}
           <a href={`#map=${to.map}&survey=${to.survey}&tab=survey`} onClick={(event) => follow(event, show)}>
             Show it
           </a>
@@ -63,7 +62,7 @@ function Said({ app, notice: { text, tone, to } }: { app: Controller; notice: No
           </button>
         </>
       )}
-    </p>
+    </div>
   );
 }
 

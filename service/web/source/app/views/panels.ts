@@ -1,4 +1,4 @@
-/** The filters and the section: opened and closed by a button or a key, with the focus where it goes on. */
+/** What opens and closes by a button or a key, with the focus where it goes on. */
 
 import type { Controller } from "../controller.ts";
 import type { State } from "../state.ts";
@@ -28,6 +28,13 @@ export function closedByEscape(event: KeyboardEvent, close: () => void): void {
   event.preventDefault();
   event.stopPropagation();
   close();
+}
+
+/** Give the focus to the list, else to what the page is about, where nothing has it. */
+export function keepFocus(): void {
+  if (document.activeElement !== document.body) return;
+  const next = document.getElementById("items") ?? document.getElementById("main");
+  next?.focus({ preventScroll: true });
 }
 
 /** Give the focus to what a selector names, once the page is drawn. */

@@ -46,7 +46,7 @@ export function Folded({ children }: { children: ComponentChildren }) {
   return (
     <details class="folded">
       <summary>Details</summary>
-      {children}
+      <div>{children}</div>
     </details>
   );
 }
