@@ -34,7 +34,7 @@ _SMALL = """() => [...document.querySelectorAll("button:not(.as-link), summary, 
 _LOOKS_AT = """(place) => {
   const { position, target } = window.spicd.scene.view;
   const away = (from) => Math.hypot(...place.map((value, axis) => value - from[axis]));
-  return away(target) < 0.5 && away(position) < 8;
+  return away(target) < 0.5 && away(position) < 15;
 }"""
 #: Drops files on the page, as a hand with a mouse does: names, and contents in base64.
 _DROP = """(files) => {
