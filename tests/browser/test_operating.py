@@ -302,6 +302,10 @@ def test_on_a_phone_nothing_lies_over_what_it_hides_and_words_open_by_a_tap(
     page.locator("#items li").first.tap()
     page.locator("summary", has_text="Judged").tap()
     expect(page.get_by_text("share of it that both visits could judge", exact=True)).to_be_visible()
+    meaning = page.get_by_text("probability that something in the tile changed")
+    expect(meaning).to_be_hidden()
+    page.locator("summary", has_text="What the columns mean").tap()
+    expect(meaning).to_be_visible()
 
 
 def test_dark_follows_the_system_until_somebody_chooses(opened: Opener) -> None:

@@ -10,7 +10,7 @@ import { lookedAt } from "../stage.ts";
 import { focusOf, showOf, type Look } from "../state.ts";
 import { KINDS, statusOf, TILE_STATES, whyStatus } from "../words.ts";
 import { follow, type Props } from "./page.tsx";
-import { Empty, Fact, Kind, Problem, Share, Waiting } from "./parts.tsx";
+import { Empty, Fact, Kind, Meanings, Problem, Share, Waiting } from "./parts.tsx";
 
 /** Share of a place that a survey has to see to say that something is gone (service/catalog/tracking.py). */
 const ENOUGH = 0.5;
@@ -212,6 +212,13 @@ function AboutTile({ app, tile }: { app: Props["app"]; tile: TileProperties }) {
   );
 }
 
+const TILE_COLUMNS: readonly (readonly [string, string])[] = [
+  ["Score", "probability that something in the tile changed"],
+  ["Seen", "share of the tile that the survey could judge"],
+  ["+", "voxels that appeared"],
+  ["−", "voxels that disappeared"],
+];
+
 /** The tiles that an object lies in, as the latest survey which saw it tells them. */
 function Tiles({ app, state, item }: Props & { item: Item }) {
   const { value } = state.looks;
@@ -223,10 +230,9 @@ function Tiles({ app, state, item }: Props & { item: Item }) {
         <thead>
           <tr>
             <th>Tile</th>
-            <th>Score</th>
-            <th>Seen</th>
-            <th title="voxels that appeared">+</th>
-            <th title="voxels that disappeared">−</th>
+            {TILE_COLUMNS.map(([word, meaning]) => (
+              <th title={meaning}>{word}</th>
+            ))}
           </tr>
         </thead>
         <tbody>
@@ -239,6 +245,7 @@ function Tiles({ app, state, item }: Props & { item: Item }) {
           ))}
         </tbody>
       </table>
+      <Meanings of={TILE_COLUMNS} />
     </section>
   );
 }

@@ -4,8 +4,8 @@ import type { Controller } from "../controller.ts";
 import type { State } from "../state.ts";
 
 /** Whether the filters are to be seen, which are a part of the list. */
-export function seesFilters({ filtersOpen, place }: State): boolean {
-  return filtersOpen && place.tab === "changes" && !place.embed;
+export function seesFilters({ filtersOpen, panel, place }: State): boolean {
+  return filtersOpen && place.tab === "changes" && panel !== "low" && !place.embed;
 }
 
 /** Open the filters and go there, or close them and go back to their button. */

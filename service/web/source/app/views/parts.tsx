@@ -42,12 +42,28 @@ export function Problem({ problem, again }: { problem: ProblemDocument; again?: 
 }
 
 /** What experts ask for, folded under its summary. */
-export function Folded({ children }: { children: ComponentChildren }) {
+export function Folded({ summary, children }: { summary?: string; children: ComponentChildren }) {
   return (
     <details class="folded">
-      <summary>Details</summary>
+      <summary>{summary ?? "Details"}</summary>
       <div>{children}</div>
     </details>
+  );
+}
+
+/** What the columns of a table mean, opened by a click, tap or key: each with its word. */
+export function Meanings({ of }: { of: readonly (readonly [string, string])[] }) {
+  return (
+    <Folded summary="What the columns mean">
+      <dl class="meanings">
+        {of.map(([word, meaning]) => (
+          <>
+            <dt>{word}</dt>
+            <dd>{meaning}</dd>
+          </>
+        ))}
+      </dl>
+    </Folded>
   );
 }
 

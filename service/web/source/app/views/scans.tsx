@@ -5,9 +5,16 @@ import { Fragment, h } from "preact";
 import type { ScanOutcome } from "../documents.ts";
 import { count, metres, percent } from "../format.ts";
 import { capital, REASONS } from "../words.ts";
-import { Folded, Warnings } from "./parts.tsx";
+import { Folded, Meanings, Warnings } from "./parts.tsx";
 
 const ASKING = "…"; // in place of a file's name until it is known
+
+const COLUMNS: readonly (readonly [string, string])[] = [
+  ["Fitness", "share of its points that lie on the map"],
+  ["RMSE", "root mean square distance of those points"],
+  ["Sure", "how sure it is that it stands where it was taken"],
+  ["±", "where it stands, one sigma in the direction that is held worst"],
+];
 
 interface ScansProps {
   scans: readonly ScanOutcome[];
@@ -19,6 +26,7 @@ export function Scans({ scans, names, placing }: ScansProps) {
   const refused = scans.filter(({ accepted }) => accepted === false);
   const accepted = scans.filter((scan) => scan.accepted);
   const sure = accepted.some(({ confidence }) => confidence !== null); // it is not asked of the scans of a map
+  const columns = COLUMNS.filter(([word]) => sure || word !== "Sure");
   const waiting = scans.length - refused.length - accepted.length;
   return (
     <section>
@@ -36,10 +44,9 @@ export function Scans({ scans, names, placing }: ScansProps) {
           <thead>
             <tr>
               <th>Scan</th>
-              <th title="share of its points that lie on the map">Fitness</th>
-              <th title="root mean square distance of those points">RMSE</th>
-              {sure && <th title="that it stands where it was taken">Sure</th>}
-              <th title="where it stands, one sigma in the direction that is held worst">±</th>
+              {columns.map(([word, meaning]) => (
+                <th title={meaning}>{word}</th>
+              ))}
             </tr>
           </thead>
           <tbody>
@@ -54,6 +61,7 @@ export function Scans({ scans, names, placing }: ScansProps) {
           </tbody>
         </table>
       )}
+      {accepted.length > 0 && <Meanings of={columns} />}
     </section>
   );
 }
