@@ -189,6 +189,7 @@ export class Scene {
 
   setTheme(theme: Theme): void {
     this.#eyeDome.setTheme(theme, this.#uniforms);
+    this.#marks.setTheme(theme);
     this.#container.dataset["theme"] = theme;
     this.#invalidate();
   }
