@@ -74,7 +74,7 @@ load: $(INSTALLED) ## 20 robots at 200 kB/s, 50 surveys, 5 dashboards against a 
 soak: $(INSTALLED) ## two hours of light work; fails where a process grows
 	$(BIN)/python -m tests.breaking.soak
 
-big-maps: $(INSTALLED) ## memory and time of made maps of 1, 5 and 20 million points, from fusing to the tileset: half an hour
+big-maps: $(INSTALLED) ## memory and time of made maps of 1, 5 and 20 million points, from fusing to the tileset: a quarter of an hour
 	$(BIN)/python -m tests.breaking.big_maps
 
 openapi: $(INSTALLED) ## write openapi/openapi.json anew

@@ -39,7 +39,7 @@ def sighting_feature(
 def object_feature(
     thing: Thing, *, history: Mapping[str, Any], geometry: dict[str, Any] | None = None
 ) -> dict[str, Any]:
-    """Return an object over all surveys, as its latest sighting `thing` tells it.
+    """Return an object over all surveys; `thing` is what stands of it.
 
     `history` holds its other properties: `object_id`, `first_seen` and `last_seen` (RFC 3339) among them.
     """

@@ -124,10 +124,11 @@ class Settings(BaseSettings):
         ge=0,
         description="of the data folder's disk; uploads and jobs that would leave less are refused; 0: off",
     )
-    tileset_memory_bytes: int = Field(
+    map_memory_bytes: int = Field(
         256 * 1024**2,
         ge=16 * 1024**2,
-        description="about what a step may take to write a tileset; a larger cloud is cut into more parts on the disk",
+        description="about what a step may take, beside a cloud itself, to fuse its scans or to write its tileset; "
+        "what is more goes to the disk",
     )
     job_timeout_s: int = Field(3600, gt=0, description="longest time of one step of a job")
     max_waiting_jobs: int = Field(

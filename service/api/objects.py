@@ -107,7 +107,8 @@ class Move(Document):
         description="metres, from the earlier center to the later one", examples=[[1.2, 0.0, 0.0]]
     )
     yaw_degrees: float | None = Field(
-        description="counter-clockwise; null where the thing is round", examples=[90.0]
+        description="counter-clockwise; null where the thing is round, or no survey compared both places",
+        examples=[90.0],
     )
 
 
@@ -158,7 +159,11 @@ class SightingProperties(Document):
 
 
 class ObjectProperties(SightingProperties):
-    """What all surveys together say of a thing; what is of one survey is that of the latest which saw it."""
+    """What all surveys together say of a thing.
+
+    `kind`, `now` and `before` are of what stands: a place that the latest survey did not look at is as an earlier one told
+    it. What else is of one survey is of the latest which saw the thing.
+    """
 
     status: ObjectStatus = Field(
         description="`new`: seen by the latest survey for the first time; `still_there`: by the latest and an earlier "
@@ -196,7 +201,7 @@ class SightingFeature(GeoJsonFeature):
 
 
 class ObjectFeature(GeoJsonFeature):
-    """A thing over all surveys of a map; its footprint is as in its latest sighting."""
+    """A thing over all surveys of a map; its footprint is where it was seen last, or was before where it disappeared."""
 
     id: str = Field(examples=["object-7d21"])
     properties: ObjectProperties
@@ -206,7 +211,7 @@ class ObjectHistory(ObjectFeature):
     """A thing over all surveys of a map, with each sighting of it."""
 
     crs: features.NamedCrs | None = Field(None, description="with `crs=map` alone")
-    sightings: list[SightingFeature] = Field(description="in order of time")
+    sightings: list[SightingFeature] = Field(description="one of each survey that saw it, in order of time")
     links: list[Link]
 
 
@@ -241,7 +246,7 @@ class FgObjectFeature(ObjectFeature):
 class FgObjectHistory(FgObjectFeature):
     """A thing over all surveys of a map, with each sighting of it, in JSON-FG."""
 
-    sightings: list[FgSightingFeature] = Field(description="in order of time")
+    sightings: list[FgSightingFeature] = Field(description="one of each survey that saw it, in order of time")
     links: list[Link]
 
 
@@ -291,7 +296,7 @@ class SightingsRequest(FeaturesRequest):
 class ObjectsRequest(FeaturesRequest):
     """Which objects of a map."""
 
-    kind: Annotated[ObjectKind | None, Field(description="as its latest sighting tells it")] = None
+    kind: Annotated[ObjectKind | None, Field(description="by what is known of both places")] = None
     status: Annotated[ObjectStatus | None, Field(description="as of the latest survey")] = None
     last_known: Annotated[
         ObjectStatus | None, Field(description="as of the latest survey that looked there")
@@ -476,7 +481,7 @@ def _sighting(record: SightingRecord, form: Form) -> dict[str, Any]:
 
 
 def _object(record: MapObjectRecord, form: Form) -> dict[str, Any]:
-    """Return an object as its latest sighting has it, likewise."""
+    """Return an object as it stands, likewise."""
     thing = record.latest.thing.model_dump()
     history = _shared(record.latest) | plain(record.model_dump(exclude={"latest"}))
     return object_feature(thing, history=history, geometry=form.geometry(*ring_of(thing)))

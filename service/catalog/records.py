@@ -306,7 +306,9 @@ class Motion(Record):
     """How a thing was moved, now_from_before: turned about its upright axis, then shifted."""
 
     translation: Vector3  #: metres, from the earlier center to the later one
-    yaw: float | None  #: radians, counter-clockwise; None: the shape is round
+    yaw: (
+        float | None
+    )  #: radians, counter-clockwise; None: the shape is round, or no survey compared both places
 
 
 class ObjectRecord(Record):
@@ -334,6 +336,20 @@ class ObjectRecord(Record):
                 f"object {self.number}: {self.kind} does not go with (now, before, motion) = {told}"
             )
         return self
+
+    def with_side_of(self, other: ObjectRecord) -> ObjectRecord:
+        """Return this thing with the side that `other` tells of it and this does not: one that moved.
+
+        Nobody has laid the two shapes on each other where `other` is no move: then the turn is not known.
+        """
+        now, before = self.now or other.now, self.before or other.before
+        if now is None or before is None:
+            return self
+        east, north, up = (there - here for here, there in zip(before.center, now.center, strict=True))
+        known = self.motion or other.motion
+        motion = Motion(translation=(east, north, up), yaw=known.yaw if known else None)
+        told = {"kind": "moved", "now": now, "before": before, "motion": motion}
+        return self.model_copy(update=told)
 
 
 class Tileset(Record):

@@ -238,10 +238,13 @@ def new_uses(scans: Iterable[ScanRecord], poses: Mapping[str, Matrix]) -> tuple[
     return tuple(ScanOutcome(scan_id=scan.scan_id, pose=poses.get(scan.scan_id, scan.pose)) for scan in scans)
 
 
-def put_in_place(kind: type[Row], rows: list[Row], scan_id: str, parts: Mapping[str, Matrix | None]) -> None:
+def put_in_place(
+    kind: type[Row], rows: list[Row], scan_id: str, parts: Mapping[str, Matrix | None], *, keep: bool
+) -> None:
     """Put scans, with their poses by id, in the place of the one that they were taken out of; `rows` are all of one use.
 
-    Does nothing where that is not among the rows, as when it was done already; a scan that is among them stays as it is.
+    `keep` leaves that one behind them, as of a file of which not all can be read. Does nothing where that is not among the
+    rows, as when it was done already; a scan that is among them stays as it is.
     """
     old = next((row for row in rows if row.scan_id == scan_id), None)
     if old is None:
@@ -250,11 +253,12 @@ def put_in_place(kind: type[Row], rows: list[Row], scan_id: str, parts: Mapping[
     uses = [ScanOutcome(scan_id=part, pose=pose) for part, pose in parts.items() if part not in known]
     for row in rows:
         row.ordinal += len(uses) if row.ordinal > old.ordinal else 0
-    new = [
-        kind(scan_id=use.scan_id, ordinal=old.ordinal + n, **outcome_columns(use))
-        for n, use in enumerate(uses)
-    ]
-    rows.remove(old)
+    place = old.ordinal
+    if keep:
+        old.ordinal += len(uses)
+    else:
+        rows.remove(old)
+    new = [kind(scan_id=use.scan_id, ordinal=place + n, **outcome_columns(use)) for n, use in enumerate(uses)]
     rows.extend(new)
 
 

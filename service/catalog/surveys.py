@@ -144,14 +144,16 @@ class Surveys:
         created, key = Survey.created, Survey.survey_id
         return self._database.page(query, created, key, SurveySummary.of_row, after=after, limit=limit)
 
-    def take_apart(self, key: str, scan_id: str, parts: Mapping[str, Matrix | None]) -> None:
+    def take_apart(
+        self, key: str, scan_id: str, parts: Mapping[str, Matrix | None], *, keep: bool = False
+    ) -> None:
         """Put the scans that one of the survey's was taken apart into in its place, with their poses.
 
-        `key` is the id of the survey. Raises NotFound.
+        `keep` leaves that one behind them: it has more, which cannot be read. `key` is the id of the survey. Raises NotFound.
         """
         with self._database.write() as session:
             row = _row(session, key)
-            put_in_place(tables.SurveyScan, row.scans, scan_id, parts)
+            put_in_place(tables.SurveyScan, row.scans, scan_id, parts, keep=keep)
             row.updated = now()
 
     def save_outcomes(

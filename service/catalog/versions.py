@@ -147,14 +147,16 @@ class Versions:
         created, key = MapVersion.created, MapVersion.job_id
         return self._database.page(query, created, key, VersionSummary.of_row, after=after, limit=limit)
 
-    def take_apart(self, key: str, scan_id: str, parts: Mapping[str, Matrix | None]) -> None:
+    def take_apart(
+        self, key: str, scan_id: str, parts: Mapping[str, Matrix | None], *, keep: bool = False
+    ) -> None:
         """Put the scans that one of a version's was taken apart into in its place, with their poses.
 
         `key` is the id of the job that builds the version. Raises NotFound, also where it was deleted since.
         """
         with self._database.write() as session:
             row = _row_of_job(session, key)
-            put_in_place(tables.VersionScan, row.scans, scan_id, parts)
+            put_in_place(tables.VersionScan, row.scans, scan_id, parts, keep=keep)
             row.updated = now()
 
     def save_outcomes(self, job_id: str, outcomes: Iterable[ScanOutcome]) -> None:

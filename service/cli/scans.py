@@ -35,6 +35,7 @@ def add(
     terminal: Terminal = ctx.obj
     if pose is not None and len(files) > 1:
         raise ClientError("one pose belongs to one scan; add the files one at a time")
+    terminal.require_whole(files)
     start = read_pose(pose) if pose else None
     about = {"device_id": device_id, "captured_at": captured_at, "pose": start, "frame": frame}
     terminal.ask(lambda client: [terminal.upload(client, file, **about) for file in files], _table)

@@ -28,6 +28,7 @@ from rich.progress import (
 from service.cli.tables import stage
 from service.client import Client, ClientError, Document, JobFailed, OnProgress, Pose
 from service.resumable import OnSent, default_memory
+from service.robots.scan_files import FileNotWhole, require_whole
 from service.robots.sidecars import SidecarError, read_pose_text, read_sidecar
 
 T = TypeVar("T")
@@ -162,11 +163,29 @@ class Terminal:
         if seconds >= NOTED_WAIT_S:
             self.note(f"{why}; next attempt in {seconds:.0f} s")
 
+    def require_whole(self, files: Sequence[Path]) -> None:
+        """Raise ClientError for files that cannot be a scan, by their headers, before anything of them is sent."""
+        wrong = []
+        for path in files:
+            try:
+                require_whole(path)
+            except FileNotWhole as error:
+                wrong.append(f"{path}: {error}")
+            except OSError as error:
+                wrong.append(f"{path}: the file cannot be read ({error.strerror or error})")
+        if wrong:
+            rest = [f"none of the {len(files)} files is sent"] if len(files) > 1 else []
+            raise ClientError("; ".join(wrong + rest))
+
     def scan_ids(self, client: Client, names: Sequence[str], **about: Any) -> list[str]:
-        """Return ids of the named scans: files are uploaded first, other names are taken as ids."""
+        """Return ids of the named scans: files are uploaded first, other names are taken as ids.
+
+        Raises ClientError, also where one of the files is cut off; then none of them is sent.
+        """
         wrong = [name for name in names if not Path(name).is_file() and not _ID.fullmatch(name)]
         if wrong:
             raise ClientError(f"{', '.join(wrong)}: no such file, and not the id of a scan")
+        self.require_whole([Path(name) for name in names if Path(name).is_file()])
         return [
             self.upload(client, Path(name), **about)["scan_id"] if Path(name).is_file() else name
             for name in names

@@ -230,7 +230,7 @@ class NewWebhook(TypedDict):
 
 
 class ObjectData(TypedDict):
-    """A changed thing, as its latest sighting has it."""
+    """A changed thing: what is known of it by now."""
 
     kind: Literal["appeared", "disappeared", "moved"]
     links: list[Link]
@@ -242,7 +242,7 @@ class ObjectData(TypedDict):
 
 
 class ObjectEvent(TypedDict):
-    """An object is seen for the first time, is gone or there again, was taken over by a version, or is known otherwise."""
+    """An object is seen for the first time, is gone or there again, or was taken over by a version."""
 
     data: ObjectData
     datacontenttype: Literal["application/json"]
@@ -252,13 +252,16 @@ class ObjectEvent(TypedDict):
     specversion: Literal["1.0"]
     subject: str
     time: str
-    type: Literal[
-        "object.told", "object.updated", "object.gone_again", "object.seen_again", "object.accepted"
-    ]
+    type: Literal["object.told", "object.gone_again", "object.seen_again", "object.accepted"]
 
 
 class ObjectProperties(TypedDict):
-    """What all surveys together say of a thing; what is of one survey is that of the latest which saw it."""
+    """
+    What all surveys together say of a thing.
+
+    `kind`, `now` and `before` are of what stands: a place that the latest survey did not look at is as an earlier one told
+    it. What else is of one survey is of the latest which saw the thing.
+    """
 
     accepted_in_version: int | None
     before: Box | None
@@ -298,6 +301,33 @@ class ObjectProperties(TypedDict):
     yaw_degrees: float
     z_max: float
     z_min: float
+
+
+class ObjectUpdatedData(TypedDict):
+    """A changed thing that was told before: what is known of it by now."""
+
+    kind: Literal["appeared", "disappeared", "moved"]
+    links: list[Link]
+    map_id: str
+    object_id: str
+    only_times: bool
+    probability: float
+    status: Literal["new", "still_there", "gone_again", "unknown", "accepted"]
+    survey_id: str
+
+
+class ObjectUpdatedEvent(TypedDict):
+    """Something else is known of an object than was told."""
+
+    data: ObjectUpdatedData
+    datacontenttype: Literal["application/json"]
+    id: str
+    sequence: str
+    source: str
+    specversion: Literal["1.0"]
+    subject: str
+    time: str
+    type: Literal["object.updated"]
 
 
 class ObjectWithdrawnData(TypedDict):
@@ -953,7 +983,7 @@ class ChangeData(TypedDict):
 
 
 class ChangeEvent(TypedDict):
-    """A change of a tile is seen for the first time, or what is known of it is another than was told."""
+    """A change of a tile is seen for the first time."""
 
     data: ChangeData
     datacontenttype: Literal["application/json"]
@@ -963,7 +993,35 @@ class ChangeEvent(TypedDict):
     specversion: Literal["1.0"]
     subject: str
     time: str
-    type: Literal["change.told", "change.updated"]
+    type: Literal["change.told"]
+
+
+class ChangeUpdatedData(TypedDict):
+    """A change of a tile that was told before, as it is known now."""
+
+    change_id: str
+    first_seen: str
+    last_seen: str
+    links: list[Link]
+    map_id: str
+    max_score: float
+    only_times: bool
+    survey_id: str
+    tile_id: str
+
+
+class ChangeUpdatedEvent(TypedDict):
+    """What is known of a change is another than was told."""
+
+    data: ChangeUpdatedData
+    datacontenttype: Literal["application/json"]
+    id: str
+    sequence: str
+    source: str
+    specversion: Literal["1.0"]
+    subject: str
+    time: str
+    type: Literal["change.updated"]
 
 
 class ChangeWithdrawnData(TypedDict):
@@ -1162,7 +1220,7 @@ class MapSummaryDocument(TypedDict):
 
 
 class ObjectFeature(TypedDict):
-    """A thing over all surveys of a map; its footprint is as in its latest sighting."""
+    """A thing over all surveys of a map; its footprint is where it was seen last, or was before where it disappeared."""
 
     geometry: Footprint | None
     id: str
@@ -1371,8 +1429,10 @@ WebhookEvent: TypeAlias = (
     | SurveyDeletedEvent
     | ModelEvent
     | ChangeEvent
+    | ChangeUpdatedEvent
     | ChangeWithdrawnEvent
     | ObjectEvent
+    | ObjectUpdatedEvent
     | ObjectWithdrawnEvent
     | MapDeletedEvent
     | PingEvent
@@ -1387,8 +1447,10 @@ CloudEvent: TypeAlias = (
     | SurveyDeletedEvent
     | ModelEvent
     | ChangeEvent
+    | ChangeUpdatedEvent
     | ChangeWithdrawnEvent
     | ObjectEvent
+    | ObjectUpdatedEvent
     | ObjectWithdrawnEvent
     | MapDeletedEvent
 )

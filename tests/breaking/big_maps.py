@@ -53,6 +53,10 @@ def main(arguments: list[str] | None = None) -> int:
         with TemporaryDirectory(dir=options.folder, prefix="big-map-") as folder:
             print(json.dumps(run(int(options.points[0] * 1e6), Path(folder), colors=options.colors)))
         return 0
+    if options.through_service:
+        from tests.breaking import big_service
+
+        return int(bool(sum(big_service.run(points, options.folder) for points in options.points)))
     tables = [_in_a_process(points, options) for points in options.points]
     print(_table(tables))
     highest = max(peak for table in tables for _, _, peak in table["stages"])
@@ -210,6 +214,9 @@ def _parse(arguments: list[str] | None) -> argparse.Namespace:
         "--folder", type=Path, default=Path(gettempdir()), help="where the files lie meanwhile"
     )
     parser.add_argument("--most-mb", type=float, default=0, help="of a stage; 0: no limit")
+    parser.add_argument(
+        "--through-service", action="store_true", help="scans of a hall, uploaded, and a survey of it"
+    )
     parser.add_argument("--alone", action="store_true", help=argparse.SUPPRESS)
     return parser.parse_args(arguments)
 

@@ -79,9 +79,10 @@ def opened(browser: Browser, served: Live, serve: object) -> Iterator[Opener]:
     with contextlib.ExitStack() as stack:
 
         def opened(
-            fragment: str = "", *, url: str | None = None, path: str = "/", **options: object
+            fragment: str = "", *, url: str | None = None, path: str = "/", first: str = "", **options: object
         ) -> ViewerPage:
             page, watch = stack.enter_context(watched_page(browser, url or served.url, **options))
+            page.add_init_script(first)  # runs before the page's own
             viewer = ViewerPage(page, watch)
             page.goto(path + fragment)
             return viewer

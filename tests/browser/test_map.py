@@ -15,6 +15,32 @@ KINDS: tuple[ObjectKind, ...] = ("appeared", "disappeared", "moved")
 ABOVE = "view=3.6,2.6,11,3.6,2.61,0"  #: of the camera: over the middle of the room, looking down
 SMALL = {"viewport": {"width": 900, "height": 640}}
 
+#: Notes when the scene says that its first points are on the screen.
+_NOTES_DRAWN = """
+const waiting = setInterval(() => {
+  if (!window.spicd?.scene) return;
+  clearInterval(waiting);
+  window.spicd.scene.on("drawn", () => (window.firstDrawn ??= performance.now()));
+}, 1);
+"""
+_TILES_ASKED = """() => performance.getEntriesByType("resource")
+  .filter(({ name }) => name.endsWith(".glb")).map(({ startTime }) => startTime)"""
+_WIDTH = "() => window.spicd.scene.canvas.width"
+#: Moves the camera a dozen times on a machine that takes 150 ms for a frame; returns the least width that was drawn.
+_MOVED_SLOWLY = """() => new Promise((done) => {
+  const { scene } = window.spicd, { position, target } = scene.view;
+  let [moves, least] = [0, Infinity];
+  const step = () => {
+    least = Math.min(least, scene.canvas.width);
+    if (++moves > 12) return done(least);
+    scene.view = { target, position: [position[0] + 0.05 * moves, position[1], position[2]] };
+    const end = performance.now() + 150;
+    while (performance.now() < end);
+    requestAnimationFrame(step);
+  };
+  requestAnimationFrame(step);
+})"""
+
 
 @pytest.fixture
 def survey(viewer_data: ViewerData) -> str:
@@ -110,6 +136,30 @@ def test_a_map_of_more_than_a_million_points_is_read_a_piece_at_a_time(opened: O
     pieces = [url for url in viewer.watch.requests if ".glb" in url]
     assert len(pieces) >= 1
     assert not any("cloud.ply" in url for url in viewer.watch.requests)
+
+
+def test_nothing_finer_is_asked_for_before_the_coarsest_points_of_a_large_map_are_on_the_screen(
+    opened: Opener, served: Live
+) -> None:
+    points = office_points(200_000)
+    put_map(served.services.catalog, "block", points, tileset=True, ply=False, counted=1_500_000)
+    viewer = opened("#map=block", first=_NOTES_DRAWN, **SMALL)
+    shown = viewer.until("() => window.firstDrawn")
+    viewer.rests()
+    asked = viewer.page.evaluate(_TILES_ASKED)
+    assert len(asked) > 1  # there are finer ones
+    assert [at for at in asked if at < shown] == [min(asked)]
+
+
+def test_while_the_camera_moves_a_slow_machine_draws_fewer_pixels_and_at_rest_all_again(
+    opened: Opener,
+) -> None:
+    viewer = opened(f"#map={MAP}&show=reference", **SMALL).drawn()
+    viewer.rests()
+    whole = viewer.page.evaluate(_WIDTH)
+    least = viewer.page.evaluate(_MOVED_SLOWLY)
+    assert least == pytest.approx(whole / 2, abs=1)
+    viewer.until(f"() => ({_WIDTH})() === {whole}")
 
 
 def test_a_map_with_colours_is_shown_in_them(opened: Opener) -> None:

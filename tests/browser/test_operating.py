@@ -30,6 +30,12 @@ PHONE = {
 #: The words on buttons that a finger hardly hits.
 _SMALL = """() => [...document.querySelectorAll("button:not(.as-link), summary, select")]
   .filter((one) => one.checkVisibility() && one.offsetHeight < 24).map((one) => one.outerHTML)"""
+#: Whether the camera looks at a place, to half a metre, from nearby.
+_LOOKS_AT = """(place) => {
+  const { position, target } = window.spicd.scene.view;
+  const away = (from) => Math.hypot(...place.map((value, axis) => value - from[axis]));
+  return away(target) < 0.5 && away(position) < 15;
+}"""
 #: Drops files on the page, as a hand with a mouse does: names, and contents in base64.
 _DROP = """(files) => {
   const dataTransfer = new DataTransfer();
@@ -81,6 +87,35 @@ def test_the_keyboard_alone_leads_from_the_maps_to_the_evidence_of_an_object(
     page.get_by_label("Close the details").focus()
     keys.press("Escape")
     expect(page.locator("#items")).to_be_focused()
+
+
+def test_filters_and_section_open_by_a_key_and_give_the_focus_back(opened: Opener) -> None:
+    viewer = opened(f"#map={MAP}").drawn()
+    page, keys = viewer.page, viewer.page.keyboard
+    keys.press("?")
+    expect(page.get_by_role("button", name="Close", exact=True)).to_be_focused()
+    keys.press("Enter")
+    expect(page.locator("#items")).to_be_focused()
+    keys.press("/")
+    expect(page.locator("#filters input").first).to_be_focused()
+    keys.press("Escape")
+    expect(page.locator("#filters")).to_have_count(0)
+    expect(page.get_by_role("button", name="Filters")).to_be_focused()
+    keys.press("x")
+    slider = page.get_by_role("slider", name="Up to, metres")
+    expect(slider).to_be_focused()
+    expect(page.get_by_role("slider", name="From, metres")).to_be_visible()
+    keys.press("ArrowLeft")
+    viewer.until("() => location.hash.includes('section=')")
+    expect(slider).to_be_focused()
+    keys.press("x")
+    expect(slider).to_have_count(0)
+    expect(page.get_by_role("button", name="Section")).to_be_focused()
+    keys.press("?")
+    for said in ("filters", "section"):
+        expect(page.locator("dialog[open] .keys")).to_contain_text(said)
+    keys.press("Escape")
+    expect(page.get_by_role("button", name="Section")).to_be_focused()
 
 
 def test_what_has_the_focus_is_seen(opened: Opener) -> None:
@@ -215,6 +250,25 @@ def test_looking_again_does_not_lead_away_from_what_is_looked_at(opened: Opener)
     assert viewer.page.evaluate(away) <= 1.02 * before
 
 
+def test_in_split_look_leads_to_the_object_from_anywhere(opened: Opener, viewer_data: ViewerData) -> None:
+    viewer = opened(f"#map={MAP}&survey={viewer_data.surveys['objects']}").drawn()
+    viewer.page.locator("#items").get_by_text("Appeared", exact=True).click()
+    expect(viewer.page.locator(".split-words")).to_be_visible()
+    viewer.rests()
+    away = "() => { window.spicd.scene.view = { position: [-20, -30, 25], target: [-5, -8, 0] }; }"
+    viewer.page.evaluate(away)
+    viewer.page.get_by_role("button", name="Look", exact=True).click()
+    (low, high) = viewer_data.changes["appeared"][0]
+    middle = [(one + other) / 2 for one, other in zip(low, high, strict=True)]
+    viewer.until(_LOOKS_AT, middle)
+    viewer.rests()
+    x, y = viewer.seen_at(middle)
+    canvas = viewer.page.locator(".canvas").bounding_box()
+    assert canvas is not None
+    assert canvas["width"] / 2 < x < canvas["width"]  # of the right half, after
+    assert 0 < y < canvas["height"]
+
+
 def test_a_phone_shows_list_and_scene_and_nothing_beside_its_screen(
     opened: Opener, viewer_data: ViewerData
 ) -> None:
@@ -248,6 +302,10 @@ def test_on_a_phone_nothing_lies_over_what_it_hides_and_words_open_by_a_tap(
     page.locator("#items li").first.tap()
     page.locator("summary", has_text="Judged").tap()
     expect(page.get_by_text("share of it that both visits could judge", exact=True)).to_be_visible()
+    meaning = page.get_by_text("probability that something in the tile changed")
+    expect(meaning).to_be_hidden()
+    page.locator("summary", has_text="What the columns mean").tap()
+    expect(meaning).to_be_visible()
 
 
 def test_dark_follows_the_system_until_somebody_chooses(opened: Opener) -> None:
@@ -306,9 +364,16 @@ def test_dropped_scans_become_a_survey_whose_job_is_followed_until_its_result_is
     catalog.jobs.report(begun, message="registering", progress=0.42)
     expect(job_row).to_contain_text("42 %", timeout=20_000)
     run(job)
+    said = viewer.page.get_by_role("status").filter(has_text="is compared: no object changed")
+    expect(said).to_be_visible(timeout=20_000)
     found = viewer.page.locator(f"#visit-{survey.survey_id}")
     expect(found).to_contain_text("nothing changed", timeout=20_000)
     expect(job_row).to_have_count(0)
+    expect(found).to_have_attribute("aria-pressed", "false")
+    said.get_by_role("link", name="Show it").click()
+    expect(found).to_have_attribute("aria-pressed", "true")
+    expect(viewer.page.locator(".about")).to_contain_text("Nothing changed in")
+    expect(said).to_have_count(0)
 
 
 def test_a_visit_goes_on_without_a_file_that_was_refused(opened: Opener, serve: Callable[..., Live]) -> None:

@@ -22,7 +22,6 @@ from service.resumable import Memory, Persistence, upload
 from tests.support.api_process import ROOT, ApiProcess
 from tests.support.bad_link import bad_link
 from tests.support.processes import until
-from tests.support.samples import ply
 from tests.support.tools import TESTS, needs_tools, run
 
 SIZE = 6_000_000
@@ -40,7 +39,8 @@ def api(tmp_path: Path) -> Iterator[ApiProcess]:
 @pytest.fixture
 def scan(tmp_path: Path) -> Path:
     path = tmp_path / "hall.ply"
-    path.write_bytes(ply("random") + random.Random(7).randbytes(SIZE))
+    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {SIZE}\nproperty uchar x\nend_header\n"
+    path.write_bytes(header.encode() + random.Random(7).randbytes(SIZE))
     return path
 
 

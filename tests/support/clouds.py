@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import struct
 from collections.abc import Sequence
 from pathlib import Path
@@ -41,6 +42,15 @@ def write_e57(
             name = f"station {index + 1}" if names is None else names[index]
             file.write_scan_raw(data, name=name, **known)
     return path
+
+
+def damage_station(path: Path, number: int) -> None:
+    """Change a byte of the points of one station, so that the checksum of its page does not hold."""
+    content = bytearray(path.read_bytes())
+    _, xml = split_xml(bytes(content))
+    offsets = [int(word) for word in re.findall(rb'<points [^>]*fileOffset="(\d+)"', xml)]
+    content[offsets[number] + 2048] ^= 0xFF  # not on the page of the header
+    path.write_bytes(content)
 
 
 def write_e57_nodes(path: Path, fields: dict[str, tuple[Any, np.ndarray]], extra: Any = None) -> Path:

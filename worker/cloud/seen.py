@@ -13,6 +13,7 @@ from typing import Protocol, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from worker.cloud.fusing import FusedCloud
 from worker.cloud.sight import Sights, Verdicts
 from worker.cloud.types import Bools, Floats, Points
 from worker.cloud.voxels import Voxels, fused
@@ -58,13 +59,13 @@ class Seen:
         return cls.of_voxels(fused(voxels()) or nothing, sights)
 
     @classmethod
-    def of_voxels(cls, voxels: Voxels, sights: Iterable[Sights | None]) -> Self:
+    def of_voxels(cls, voxels: Voxels | FusedCloud, sights: Iterable[Sights | None]) -> Self:
         """Put the fused returns of a visit and its scans' range images together."""
         return cls(
             voxel_size=voxels.size,
             keys=voxels.keys,
             points=voxels.points,
-            hits=voxels.counts.astype(np.int32),
+            hits=voxels.counts.astype(np.int32, copy=False),
             sights=Sights.joined(sights),
         )
 

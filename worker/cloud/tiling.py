@@ -159,9 +159,11 @@ def _spanned(points: Points, origin: Floats, size: Floats) -> TileGrid:
 
 def cut(points: Points, grid: TileGrid, *, min_points: int) -> Tiles:
     """Sort points (N, 3) of the map frame into tiles; those with fewer than `min_points` are left out."""
-    located = grid.locate(points)
+    located = grid.locate(points).astype(np.int32)  # there are no more than `_MOST_TILES`
     order = np.argsort(located, kind="stable")
-    cells, starts = np.unique(located[order], return_index=True)
+    located = located[order]
+    starts = np.flatnonzero(np.r_[len(located) > 0, located[1:] != located[:-1]])
+    cells = located[starts].astype(np.int64)
     parts = np.split(points[order].astype(np.float32, copy=False), starts[1:])
     # without a point there is no cell and one empty part
     dense = [

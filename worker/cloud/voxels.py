@@ -78,14 +78,20 @@ class Voxels:
         end = 0
         for (one, more), size in zip(_runs(self, other), sizes, strict=True):
             here = slice(end, end := end + size)
-            run = _summed(
-                self.size,
-                np.concatenate([one.keys, more.keys]),
-                np.concatenate([one.counts, more.counts]),
-                np.concatenate([one.sums[:, :width], more.sums[:, :width]]),
-            )
+            run = Voxels.added([one, more])
             keys[here], counts[here], sums[here] = run.keys, run.counts, run.sums
         return Voxels(size=self.size, keys=keys, counts=counts, sums=sums)
+
+    @classmethod
+    def added(cls, parts: Sequence[Voxels]) -> Voxels:
+        """Add all parts, of which there is at least one, at once; colours are kept only where all have them."""
+        width = min(part.sums.shape[1] for part in parts)
+        return _summed(
+            parts[0].size,
+            np.concatenate([part.keys for part in parts]),
+            np.concatenate([part.counts for part in parts]),
+            np.concatenate([part.sums[:, :width] for part in parts]),
+        )
 
     @property
     def points(self) -> Points:
@@ -164,20 +170,38 @@ def _shared(keys: NDArray[np.int64], others: NDArray[np.int64]) -> int:
 
 
 def fused(parts: Iterable[Voxels]) -> Voxels | None:
-    """Merge all parts, a few of which are held at once; None where there is none.
+    """Merge all parts, a few of which are held at once; None where there is none."""
+    return next(merged_runs(parts, most=None), None)
 
-    Sums of like size are merged, as in a merge sort: each voxel is sorted log(parts) times, not once a part.
+
+def merged_runs(parts: Iterable[Voxels], *, most: int | None) -> Iterator[Voxels]:
+    """Merge parts as they come; yield what was merged whenever more than `most` voxels are held, and the rest.
+
+    All that is yielded but the last has more than half as many voxels. Sums of like size are merged, as in a merge sort: each voxel is sorted log(parts) times, not once a part.
     """
     stack: list[Voxels] = []
     for part in parts:
         stack.append(part)
+        del part  # held by the stack alone from here on
         while len(stack) > 1 and len(stack[-2].keys) < 2 * len(stack[-1].keys):
-            last = stack.pop()
-            stack[-1] = stack[-1].merged(last)
+            _merge_last(stack)
+        if most is not None and sum(len(held.keys) for held in stack) > most:
+            _merge_all(stack)
+            if len(stack[0].keys) > most // 2:  # less where scans saw the same
+                yield stack.pop()
+    if stack:
+        _merge_all(stack)
+        yield stack.pop()
+
+
+def _merge_all(stack: list[Voxels]) -> None:
     while len(stack) > 1:
-        last = stack.pop()
-        stack[-1] = stack[-1].merged(last)
-    return stack[0] if stack else None
+        _merge_last(stack)
+
+
+def _merge_last(stack: list[Voxels]) -> None:
+    last = stack.pop()
+    stack[-1] = stack[-1].merged(last)
 
 
 def merged_in_order(parts: Sequence[Voxels]) -> Voxels:

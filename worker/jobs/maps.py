@@ -28,10 +28,10 @@ def register_map(context: Context) -> None:
     """Build a fused, tiled map of scans: the first version of it, or a later one."""
     versions, job_id = context.catalog.versions, context.job.job_id
     given = versions.of_job(job_id).scans
-    take_stations_apart(context, job_id, given, versions.take_apart, stage="reading")
+    refused = take_stations_apart(context, job_id, given, versions.take_apart, stage="reading")
     version = versions.of_job(job_id)
     card = card_of(context, version.model)
-    made = make_version(context, version, pipeline_settings(context, version, card))
+    made = make_version(context, version, pipeline_settings(context, version, card), refused=refused)
     tileset = _put_map(context, made.built, card)
     context.catalog.versions.save_result(
         context.job.job_id,

@@ -116,10 +116,8 @@ def _opening(context: Context, model: str) -> tuple[Hashable, Callable[[], Detec
         store, device = settings.model_store, settings.device
         return (store, model, device), lambda: open_detector(store, model, device, runtime)
     card = Card.model_validate(own.card)
-    url, job_id = (
-        settings.resolved_blob_url(),
-        own.job_id,
-    )  # by its job: a name may come again once its map is deleted
+    url, job_id = settings.resolved_blob_url(), own.job_id
+    # by its job: a name and a number may come again once their map is deleted
     key = (url, job_id, card.model_dump_json(), settings.device)
     return key, lambda: make_detector(card, _own_weights(url, job_id), settings.device, runtime)
 
@@ -163,7 +161,9 @@ def _own_weights(blob_url: str, job_id: str) -> bytes:
 
 def pipeline_settings(context: Context, record: VersionRecord, card: Card) -> PipelineSettings:
     """Return the settings that a version of a map was asked for with, and what the model needs put in its place."""
-    asked = PipelineSettings.model_validate(
-        {**record.settings, "max_scan_points": context.settings.max_scan_points}
-    )
+    of_the_service = {
+        "max_scan_points": context.settings.max_scan_points,
+        "memory_bytes": context.settings.map_memory_bytes,
+    }
+    asked = PipelineSettings.model_validate({**record.settings, **of_the_service})
     return asked.for_model(card.preprocessing)

@@ -29,18 +29,25 @@ from worker.pipeline.settings import PipelineSettings
 
 
 def scan_files(
-    context: Context, scans: Sequence[ScanOutcome], stack: ExitStack, settings: PipelineSettings
+    context: Context,
+    scans: Sequence[ScanOutcome],
+    stack: ExitStack,
+    settings: PipelineSettings,
+    *,
+    refused: Mapping[str, str],
 ) -> tuple[ScanFile, ...]:
     """Return the uploads of one visit as local files for as long as the stack is open, less their carrier.
 
-    The pose is that of the scan's use in this map or survey, whatever the upload says by now.
+    `refused` has, by the id of a scan, why it is not read (`stations.take_stations_apart`). The pose is that of the
+    scan's use in this map or survey, whatever the upload says by now.
     """
     files = []
     for outcome in scans:
         scan = context.catalog.scans.get(outcome.scan_id)
         path = stack.enter_context(context.catalog.blobs.local(scan.key))
         pose = None if outcome.pose is None else np.array(outcome.pose, np.float64)
-        files.append(ScanFile(name=scan.filename, path=path, pose=pose))
+        why = refused.get(outcome.scan_id)
+        files.append(ScanFile(name=scan.filename, path=path, pose=pose, refused=why))
     return with_carrier(files, settings.carrier, max_points=settings.max_scan_points)
 
 

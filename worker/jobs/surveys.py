@@ -60,14 +60,16 @@ READ_WHOLE = 1_000_000  #: points of a survey's cloud that viewers read as one P
 def register_survey(context: Context) -> None:
     """Fuse the scans to one cloud in the map's frame; a survey with no accepted scan fails here."""
     given, surveys = _asked(context)[0], context.catalog.surveys
-    take_stations_apart(context, given.survey_id, given.scans, surveys.take_apart, stage="registering")
+    refused = take_stations_apart(
+        context, given.survey_id, given.scans, surveys.take_apart, stage="registering"
+    )
     survey, version, settings = _asked(context)
     reference = kept_reference(context, version)
     seen = None
     with suppress(MapFailed):  # without what the map's scans saw, poses are judged by surfaces alone
         seen = kept_seen(context, version, voxel_size=settings.registration.voxel_size)
     with ExitStack() as stack:
-        files = scan_files(context, survey.scans, stack, settings)
+        files = scan_files(context, survey.scans, stack, settings, refused=refused)
         try:
             located = locate_survey(
                 files, reference, settings=settings, reference_seen=seen, progress=context.report

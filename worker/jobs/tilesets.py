@@ -32,7 +32,7 @@ def put_tileset(
         pieces,
         scratch=folder,
         address=lambda at: address(at.sha256, at.offset, at.length),
-        settings=TilesetSettings(memory_bytes=context.settings.tileset_memory_bytes),
+        settings=TilesetSettings(memory_bytes=context.settings.map_memory_bytes),
         progress=progress,
     )
     context.catalog.blobs.put_file(contents, binary, move=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -98,19 +98,26 @@ def kept_alarms(
     return calibration
 
 
-def make_version(context: Context, version: VersionRecord, settings: PipelineSettings) -> Made:
-    """Build a version. What became of its scans is recorded also where that fails."""
+def make_version(
+    context: Context, version: VersionRecord, settings: PipelineSettings, *, refused: Mapping[str, str]
+) -> Made:
+    """Build a version. What became of its scans is recorded also where that fails.
+
+    `refused` has, by the id of a scan, why it is not read.
+    """
     if version.base_version is None:
-        return _first(context, version, settings)
+        return _first(context, version, settings, refused)
     base = context.catalog.versions.get(version.map_id, version.base_version)
     if version.survey_id is None:
-        return _extended(context, version, base, settings)
+        return _extended(context, version, base, settings, refused)
     return _renewed(context, version, base, version.survey_id, settings)
 
 
-def _first(context: Context, version: VersionRecord, settings: PipelineSettings) -> Made:
+def _first(
+    context: Context, version: VersionRecord, settings: PipelineSettings, refused: Mapping[str, str]
+) -> Made:
     with ExitStack() as stack:
-        files = scan_files(context, version.scans, stack, settings)
+        files = scan_files(context, version.scans, stack, settings, refused=refused)
         with _recorded_anyway(context, version.scans):
             pairs = StoredPairCache(context.catalog.blobs, context.job.job_id)
             try:
@@ -123,11 +130,15 @@ def _first(context: Context, version: VersionRecord, settings: PipelineSettings)
 
 
 def _extended(
-    context: Context, version: VersionRecord, base: VersionRecord, settings: PipelineSettings
+    context: Context,
+    version: VersionRecord,
+    base: VersionRecord,
+    settings: PipelineSettings,
+    refused: Mapping[str, str],
 ) -> Made:
     older, further = _kept(base), _further(version, base)
     with ExitStack() as stack:
-        files = scan_files(context, further, stack, settings)
+        files = scan_files(context, further, stack, settings, refused=refused)
         with _recorded_anyway(context, further):
             kept = _kept_map(context, base, settings)
             built = extend_map(kept, files, settings=settings, progress=context.report)

@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from worker.cloud.fusing import FusedCloud
 from worker.cloud.seen import Seen
 from worker.cloud.sight import Sights
 from worker.cloud.tiling import TileGrid, Tiles, grid_over, grown, pair_tiles, touched_tiles
 from worker.cloud.types import Arrays
-from worker.cloud.voxels import Voxels
 from worker.detectors.comparison import Comparison, SeenScan, Side
 from worker.detectors.detector import Detection, Detector
 from worker.errors import MapFailed, RegistrationFailed
@@ -140,7 +140,7 @@ def locate_survey(
     progress("tiling", 0.0)
     sights: list[Sights | None] = []
     accepted = watched(accepted_scans(files, outcomes, settings), sights)
-    fused = fuse(accepted, voxel_size=reference.voxel_size)
+    fused = fuse(accepted, voxel_size=reference.voxel_size, memory_bytes=settings.memory_bytes)
     displaced = displaced_tiles(registered.held, reference.grid)
     current, seen = replace(current_map(fused), displaced=displaced), Seen.of_voxels(fused, sights)
     comparison = compare(
@@ -250,7 +250,7 @@ def watched(scans: Iterable[RegisteredScan], sights: list[Sights | None]) -> Ite
 
 def fused_scans(
     scans: Iterable[RegisteredScan], count: int, settings: PipelineSettings, progress: Progress
-) -> Voxels:
+) -> FusedCloud:
     """Fuse the scans, of which there are about `count`."""
 
     def reported() -> Iterator[RegisteredScan]:
@@ -259,11 +259,11 @@ def fused_scans(
             yield scan
         progress("fusing", 1.0)
 
-    return fuse(reported(), voxel_size=settings.registration.voxel_size)
+    return fuse(reported(), voxel_size=settings.registration.voxel_size, memory_bytes=settings.memory_bytes)
 
 
 def tiled_map(
-    fused: Voxels,
+    fused: FusedCloud,
     grid: TileGrid | None,
     outcomes: Sequence[ScanResult],
     settings: PipelineSettings,

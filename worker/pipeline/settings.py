@@ -5,6 +5,7 @@ from __future__ import annotations
 from pydantic import Field
 
 from worker.cloud.carrier import CarrierSettings
+from worker.cloud.fusing import MEMORY_BYTES
 from worker.cloud.settings import StrictModel
 from worker.cloud.tiling import TilingSettings
 from worker.detectors.card import Preprocessing
@@ -24,6 +25,11 @@ class PipelineSettings(StrictModel):
     tiling: TilingSettings = Field(default_factory=TilingSettings)
     objects: ObjectSettings = Field(default_factory=ObjectSettings)
     max_scan_points: int = Field(50_000_000, gt=0)
+    memory_bytes: int = Field(
+        MEMORY_BYTES,
+        gt=0,
+        description="about what fusing may take beside the fused cloud; the rest goes to the disk",
+    )
     alarms_per_survey: float = Field(
         0.1, gt=0, description="false objects in a survey of a place without any change, in the mean"
     )

@@ -110,6 +110,15 @@ class ChangeData(Data):
     max_score: Score
 
 
+class ChangeUpdatedData(ChangeData):
+    """A change of a tile that was told before, as it is known now."""
+
+    only_times: bool = Field(
+        description="true: nothing is new but when it was seen last; webhooks that name no types do not get it",
+        examples=[True],
+    )
+
+
 class ChangeWithdrawnData(Data):
     """A change that no visit sees any more, or that turned out to be part of another."""
 
@@ -122,7 +131,7 @@ class ChangeWithdrawnData(Data):
 
 
 class ObjectData(Data):
-    """A changed thing, as its latest sighting has it."""
+    """A changed thing: what is known of it by now."""
 
     map_id: MapId
     object_id: str = Field(examples=["object-77aa"])
@@ -130,6 +139,15 @@ class ObjectData(Data):
     status: ObjectStatus
     survey_id: str = Field(description="of the latest sighting", examples=["survey-91c4"])
     probability: Score
+
+
+class ObjectUpdatedData(ObjectData):
+    """A changed thing that was told before: what is known of it by now."""
+
+    only_times: bool = Field(
+        description="true: nothing is new but when it was seen last, or looked at; webhooks that name no types do not get it",
+        examples=[True],
+    )
 
 
 class ObjectWithdrawnData(Data):
@@ -217,11 +235,19 @@ class ModelEvent(Envelope):
 
 
 class ChangeEvent(Envelope):
-    """A change of a tile is seen for the first time, or what is known of it is another than was told."""
+    """A change of a tile is seen for the first time."""
 
-    type: Literal["change.told", "change.updated"]
+    type: Literal["change.told"]
     sequence: Sequence
     data: ChangeData
+
+
+class ChangeUpdatedEvent(Envelope):
+    """What is known of a change is another than was told."""
+
+    type: Literal["change.updated"]
+    sequence: Sequence
+    data: ChangeUpdatedData
 
 
 class ChangeWithdrawnEvent(Envelope):
@@ -233,13 +259,19 @@ class ChangeWithdrawnEvent(Envelope):
 
 
 class ObjectEvent(Envelope):
-    """An object is seen for the first time, is gone or there again, was taken over by a version, or is known otherwise."""
+    """An object is seen for the first time, is gone or there again, or was taken over by a version."""
 
-    type: Literal[
-        "object.told", "object.updated", "object.gone_again", "object.seen_again", "object.accepted"
-    ]
+    type: Literal["object.told", "object.gone_again", "object.seen_again", "object.accepted"]
     sequence: Sequence
     data: ObjectData
+
+
+class ObjectUpdatedEvent(Envelope):
+    """Something else is known of an object than was told."""
+
+    type: Literal["object.updated"]
+    sequence: Sequence
+    data: ObjectUpdatedData
 
 
 class ObjectWithdrawnEvent(Envelope):
@@ -273,8 +305,10 @@ AnyEvent = (
     | SurveyDeletedEvent
     | ModelEvent
     | ChangeEvent
+    | ChangeUpdatedEvent
     | ChangeWithdrawnEvent
     | ObjectEvent
+    | ObjectUpdatedEvent
     | ObjectWithdrawnEvent
     | MapDeletedEvent
 )

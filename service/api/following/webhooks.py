@@ -42,7 +42,12 @@ class WebhookRequest(Request):
     url: Url
     types: Annotated[
         tuple[EventType, ...] | None,
-        Field(min_length=1, description="left out: all", examples=[["change.told", "change.withdrawn"]]),
+        Field(
+            min_length=1,
+            description="left out: all, less `change.updated` and `object.updated` with `only_times`, which say with each "
+            "visit that nothing is new; named they come too",
+            examples=[["change.told", "change.withdrawn"]],
+        ),
     ] = None
     map: Annotated[
         Id | None,
@@ -55,7 +60,8 @@ class WebhookChange(Request):
 
     url: Url | None = None
     types: Annotated[
-        tuple[EventType, ...] | None, Field(description="an empty list: all", examples=[["change.told"]])
+        tuple[EventType, ...] | None,
+        Field(description="an empty list: as left out of a new one", examples=[["change.told"]]),
     ] = None
     status: Annotated[
         Literal["active", "disabled"] | None,

@@ -23,7 +23,7 @@ T = TypeVar("T")
 
 def read_feed(
     session: Session,
-    matching: Select[Any, Any, Any],
+    matching: Select[*tuple[Any, ...]],
     table: type[TileChange] | type[MapObject],
     record: Callable[..., T],
     *,

@@ -40,10 +40,16 @@ from service.catalog.sql.tables import (
 )
 
 _MANY = 500  #: tiles that a query names; where there are more it reads those of the whole map
+SAME_SCORE = 0.01  #: scores that differ by less are one: nobody would act on it
+SAME_PLACE = (
+    0.1  #: metres; a thing whose box differs by less, by what could be seen of it, stands where it stood
+)
+_STATE = ("kind", "status", "last_known", "transient", "first_seen", "accepted_in_version")
+_BOX = ("min_x", "min_y", "min_z", "max_x", "max_y", "max_z")
 #: Columns of an object that its surveys decide; where one changes it is told anew.
 _TOLD = (
-    "kind", "status", "last_known", "transient", "first_seen", "last_seen", "last_looked", "accepted_in_version",
-    "sightings", "survey_id", "number", "probability", "min_x", "min_y", "min_z", "max_x", "max_y", "max_z",
+    *_STATE, "last_seen", "last_looked", "sightings", "survey_id", "number", "other_survey_id", "other_number",
+    "probability", *_BOX,
 )  # fmt: skip
 
 
@@ -129,7 +135,7 @@ def _rewrite_tiles(session: Session, map_id: str, accepted: Sequence[Acceptance]
         rows.setdefault(row.tile_id, []).append(row)
     links: list[dict[str, Any]] = []
     new: list[TileChange] = []
-    updated: list[TileChange] = []
+    updated: list[tuple[TileChange, bool]] = []  #: and whether nothing but its times is new
     for tile_id in sorted(looks.keys() | rows.keys()):
         before = rows.get(tile_id, [])
         told_by = {row.survey_id for row in before}
@@ -152,13 +158,13 @@ def _rewrite_tiles(session: Session, map_id: str, accepted: Sequence[Acceptance]
             if row.change_id not in facts:
                 new.append(row)
             elif facts[row.change_id] != (_facts(row), frozenset(stay.survey_ids)):
-                updated.append(row)
+                updated.append((row, _stays_so(facts[row.change_id][0], _facts(row))))
     if links:
         session.execute(update(SurveyTile), links)
     for row in sorted(new, key=_surest_first):
         _tell_change(session, row, "change.told", "published")
-    for row in sorted(updated, key=_surest_first):
-        _tell_change(session, row, "change.updated", "updated")
+    for row, only_times in sorted(updated, key=lambda one: _surest_first(one[0])):
+        _tell_change(session, row, "change.updated", "updated", only_times=only_times)
 
 
 def _surest_first(row: TileChange) -> tuple[Any, ...]:
@@ -168,6 +174,12 @@ def _surest_first(row: TileChange) -> tuple[Any, ...]:
 def _facts(row: TileChange) -> tuple[Any, ...]:
     """Return what is told of a change, beside which visits saw it."""
     return row.survey_id, row.first_seen, row.last_seen, row.max_score
+
+
+def _stays_so(before: tuple[Any, ...], after: tuple[Any, ...]) -> bool:
+    """Tell whether two `_facts` differ in nothing but when the change was seen last, and by less than the score says."""
+    (teller, first, _, score), (teller_now, first_now, _, score_now) = before, after
+    return (teller, first) == (teller_now, first_now) and abs(score_now - score) < SAME_SCORE
 
 
 def _changes_of(map_id: str) -> Select[TileChange]:
@@ -248,7 +260,7 @@ def _links(
     ]
 
 
-def _tell_change(session: Session, row: TileChange, event: EventType, column: Column) -> None:
+def _tell_change(session: Session, row: TileChange, event: EventType, column: Column, **more: bool) -> None:
     tell(
         session,
         event,
@@ -262,6 +274,7 @@ def _tell_change(session: Session, row: TileChange, event: EventType, column: Co
         first_seen=rfc3339(row.first_seen),
         last_seen=rfc3339(row.last_seen),
         max_score=row.max_score,
+        **more,
     )
 
 
@@ -286,7 +299,8 @@ def _rewrite_objects(session: Session, map_id: str, accepted: Sequence[Acceptanc
     ]
     tracks = track_objects(_visits(session, map_id, sightings), taken, ids=list(rows))
     named = {track.object_id or new_id("object"): track for track in tracks}
-    quiet: list[MapObject] = []  # what is known of them changed, and not what became of them
+    # what is known of them changed, and not what became of them; and whether a further look alone is new
+    quiet: list[tuple[MapObject, bool]] = []
     for object_id, track in named.items():
         row = rows.get(object_id)
         before = None if row is None else _told_of(row)
@@ -298,9 +312,9 @@ def _rewrite_objects(session: Session, map_id: str, accepted: Sequence[Acceptanc
         if event is not None:
             _tell_object(session, row, event)
         elif _told_of(row) != before or any(one.object_id != object_id for _, one in track.sightings):
-            quiet.append(row)
-    for row in quiet:
-        _tell_object(session, row, "object.updated")
+            quiet.append((row, before is not None and _stands_so(before, _told_of(row))))
+    for row, only_times in quiet:
+        _tell_object(session, row, "object.updated", only_times=only_times)
     for object_id, row in rows.items():
         if object_id not in named:
             tell(session, "object.withdrawn", object_id, map_id=map_id, object_id=object_id)
@@ -309,7 +323,7 @@ def _rewrite_objects(session: Session, map_id: str, accepted: Sequence[Acceptanc
     return tracks
 
 
-def _tell_object(session: Session, row: MapObject, event: EventType) -> None:
+def _tell_object(session: Session, row: MapObject, event: EventType, **more: bool) -> None:
     """Tell an object that is new, or anew one that was known."""
     tell(
         session,
@@ -323,7 +337,15 @@ def _tell_object(session: Session, row: MapObject, event: EventType) -> None:
         status=row.status,
         survey_id=row.survey_id,
         probability=row.probability,
+        **more,
     )
+
+
+def _stands_so(before: Mapping[str, Any], after: Mapping[str, Any]) -> bool:
+    """Tell whether an object is what and where it was, and a further look alone is new."""
+    same = all(before[name] == after[name] for name in _STATE)
+    moved = max(abs(before[name] - after[name]) for name in _BOX)
+    return same and moved < SAME_PLACE and abs(before["probability"] - after["probability"]) < SAME_SCORE
 
 
 def _told_of(row: MapObject) -> dict[str, Any]:
@@ -430,14 +452,27 @@ def _latest(seen: tuple[Visit, Sighting]) -> tuple[Any, ...]:
 
 
 def _write_track(row: MapObject, track: Track, sightings: Mapping[tuple[str, int], Row[Any]]) -> None:
-    visit, one = max(track.sightings, key=_latest)
-    latest = sightings[visit.survey_id, one.number]
-    place = Place.model_validate(latest.now or latest.before)
-    row.kind, row.probability = latest.kind, latest.probability
+    latest_first = sorted(track.sightings, key=_latest, reverse=True)
+    by_side = {side: next(seen for seen in latest_first if side in seen[1].parts) for side in track.sides}
+    visit, one = latest_first[0]
+    row.kind = "moved" if len(by_side) == 2 else "appeared" if "now" in by_side else "disappeared"
+    row.probability = sightings[visit.survey_id, one.number].probability
     row.survey_id, row.number = visit.survey_id, one.number
+    others = ((by.survey_id, other.number) for by, other in by_side.values() if (by, other) != (visit, one))
+    row.other_survey_id, row.other_number = next(others, (None, None))
     row.status, row.last_known, row.transient = track.status, track.last_known, track.transient
     row.first_seen, row.last_seen = track.sightings[0][0].captured_at, visit.captured_at
     row.last_looked, row.accepted_in_version = track.last_looked, track.accepted_in_version
     row.sightings = track.visits
-    row.min_x, row.min_y, row.min_z = place.bounds.min
-    row.max_x, row.max_y, row.max_z = place.bounds.max
+    bounds = _shown(by_side, sightings).bounds
+    row.min_x, row.min_y, row.min_z = bounds.min
+    row.max_x, row.max_y, row.max_z = bounds.max
+
+
+def _shown(
+    by_side: Mapping[Side, tuple[Visit, Sighting]], sightings: Mapping[tuple[str, int], Row[Any]]
+) -> Place:
+    """Return where an object is, or was where it is no more."""
+    side: Side = "now" if "now" in by_side else "before"
+    visit, one = by_side[side]
+    return Place.model_validate(getattr(sightings[visit.survey_id, one.number], side))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from typing import Any, Literal
@@ -32,11 +32,16 @@ _SIGHTINGS = (
     .join(_SURVEY, _SURVEY.survey_id == _SIGHTING.survey_id)
     .outerjoin(_OBJECT, _OBJECT.object_id == _SIGHTING.object_id)
 )
-#: Every object with its latest sighting.
+_OTHER = aliased(tables.SurveyObject)
+#: Every object with its latest sighting, and the one that tells its other side.
 _LATEST = (
-    select(_SIGHTING, _SURVEY, _OBJECT)
+    select(_SIGHTING, _OTHER, _SURVEY, _OBJECT)
     .join(_SURVEY, _SURVEY.survey_id == _SIGHTING.survey_id)
     .join(_OBJECT, and_(_OBJECT.survey_id == _SIGHTING.survey_id, _OBJECT.number == _SIGHTING.number))
+    .outerjoin(
+        _OTHER,
+        and_(_OTHER.survey_id == _OBJECT.other_survey_id, _OTHER.number == _OBJECT.other_number),
+    )
 )
 
 
@@ -117,7 +122,7 @@ class Objects:
         with self._database.read() as session:
             matched = session.scalar(count) or 0
             read: list[tuple[MapObjectRecord, Values]] = [
-                (_record(*row[:3]), tuple(row[3:])) for row in session.execute(rows)
+                (_record(*row[:4]), tuple(row[4:])) for row in session.execute(rows)
             ]
         items = tuple(record for record, _ in read[:limit])
         return ObjectPage(
@@ -138,7 +143,7 @@ class Objects:
             )
 
     def get(self, map_id: str, object_id: str) -> tuple[MapObjectRecord, tuple[SightingRecord, ...]]:
-        """Return one object and every sighting of it, in order of time. Raises NotFound."""
+        """Return one object and the sighting of each survey that saw it, in order of time. Raises NotFound."""
         this = (_OBJECT.map_id == map_id, _OBJECT.object_id == object_id)
         seen = _SIGHTINGS.where(*this, _SURVEY.status == "ready")
         seen = seen.order_by(_SURVEY.captured_at, _SURVEY.survey_id, _SIGHTING.number)
@@ -148,7 +153,10 @@ class Objects:
                 raise NotFound(
                     f"no object {object_id!r} of map {map_id!r}; GET /maps/{map_id}/objects lists them"
                 )
-            return _record(*latest), tuple(_sighting(*row) for row in session.execute(seen))
+            by_survey: dict[str, list[SightingRecord]] = {}
+            for row in session.execute(seen):
+                by_survey.setdefault(row[1].survey_id, []).append(_sighting(*row))
+            return _record(*latest), tuple(_one(sightings) for sightings in by_survey.values())
 
     def of_survey(
         self,
@@ -214,7 +222,7 @@ def _meets(thing: ObjectRecord, bounds: Bounds) -> bool:
 
 def _matching(
     wanted: ObjectFilter,
-) -> Select[tables.SurveyObject, tables.Survey, tables.MapObject]:
+) -> Select[tables.SurveyObject, tables.SurveyObject, tables.Survey, tables.MapObject]:
     query = _LATEST.where(_OBJECT.map_id == wanted.map_id)
     if wanted.kind is not None:
         query = query.where(_OBJECT.kind == wanted.kind)
@@ -253,11 +261,29 @@ def _seen_by(wanted: ObjectFilter) -> Any:
     return seen
 
 
-def _record(latest: tables.SurveyObject, survey: tables.Survey, row: tables.MapObject) -> MapObjectRecord:
+def _record(
+    latest: tables.SurveyObject,
+    other: tables.SurveyObject | None,
+    survey: tables.Survey,
+    row: tables.MapObject,
+) -> MapObjectRecord:
     own: dict[str, Any] = {
         name: getattr(row, name) for name in MapObjectRecord.model_fields if name != "latest"
     }
-    return MapObjectRecord(**own, latest=_sighting(latest, survey, row))
+    sighting = _sighting(latest, survey, row)
+    if other is not None:
+        thing = sighting.thing.with_side_of(ObjectRecord.of_row(other))
+        sighting = sighting.model_copy(update={"thing": thing})
+    return MapObjectRecord(**own, latest=sighting)
+
+
+def _one(of_survey: Sequence[SightingRecord]) -> SightingRecord:
+    """Return what one survey says of an object: where it told its sides as two things, the one that is there, with both."""
+    shown, *others = sorted(of_survey, key=lambda seen: seen.thing.now is None)
+    thing = shown.thing
+    for other in others:
+        thing = thing.with_side_of(other.thing)
+    return shown.model_copy(update={"thing": thing})
 
 
 def _sighting(row: tables.SurveyObject, survey: tables.Survey, of: tables.MapObject | None) -> SightingRecord:

@@ -5,6 +5,8 @@ docs/decisions/0018-objects-over-time.md.
 
 A sighting has a part *now*, where a thing stands that the map does not have there, or a part *before*, where the map
 has a thing that is gone; of what moved it has both. Sightings are one object where parts of the same side are alike.
+A side of an object stands until a visit that looked there finds it as in the map: what was not looked at stays as it
+was told.
 """
 
 from __future__ import annotations
@@ -12,7 +14,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections import Counter
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass, field
 from datetime import datetime
 from typing import Literal
@@ -77,6 +79,7 @@ class Track:
 
     object_id: str | None  #: None: a new one, which the caller names
     sightings: tuple[tuple[Visit, Sighting], ...]  #: in order of time; one visit may have two, one a side
+    sides: frozenset[Side]  #: that stand; once it has gone again, those that stood when it was seen last
     status: ObjectStatus
     last_known: ObjectStatus  #: as the latest visit that looked there tells it
     transient: bool  #: it comes and goes
@@ -203,14 +206,19 @@ def _trails(visits: Sequence[Visit], accepted: Sequence[Accepted]) -> list[_Trai
     known = _Trails()
     for visit in visits:
         matched = _matched(_matches(known, visit, accepted))
-        going_on: set[int] = set()
-        # one that has no choice goes first
-        for n in sorted(range(len(visit.sightings)), key=lambda n: (len(matched.get(n, {})), n)):
-            number = _joined(known, matched.get(n, {}), going_on)
+        going_on: dict[int, set[Side]] = {}
+        for n in sorted(range(len(visit.sightings)), key=lambda n: _turn(n, matched.get(n, {}))):
+            sides = visit.sightings[n].parts.keys()
+            number = _joined(known, matched.get(n, {}), sides, going_on)
             known.add(number, visit, visit.sightings[n])
             if number is not None:
-                going_on.add(number)
+                going_on.setdefault(number, set()).update(sides)
     return sorted((trail for trail in known.trails if trail.sightings), key=_begin)
+
+
+def _turn(n: int, matched: Mapping[Side, int]) -> tuple[int, bool, int]:
+    """Return when a sighting takes its turn: one that has no choice first, of those what stands where it stood."""
+    return len(matched), "now" not in matched, n
 
 
 def _begin(trail: _Trail) -> tuple[datetime, str, int]:
@@ -261,18 +269,27 @@ def _matched(matches: Iterable[_Match]) -> dict[int, dict[Side, int]]:
     return matched
 
 
-def _joined(known: _Trails, matched: Mapping[Side, int], going_on: Collection[int]) -> int | None:
-    """Return the trail that a sighting goes on from, None for a new one; `matched` holds the better match first.
+def _joined(
+    known: _Trails,
+    matched: Mapping[Side, int],
+    sides: Set[Side],
+    going_on: Mapping[int, Set[Side]],
+) -> int | None:
+    """Return the trail that a sighting with these sides goes on from, None for a new one.
 
-    What was told as one thing that came and another that went, and is told as one that moved, becomes one trail.
-    Where the sides lead to two things that both have moved, it is one that no sighting of this visit went on from.
+    `matched` holds the better match first, `going_on` the sides that this visit has told of trails so far. What was told
+    as one thing that came and another that went, and is told as one that moved, becomes one trail. Where the sides lead
+    to two things that both have moved, it is one that no sighting of this visit went on from. Two sightings of a visit
+    are of one trail only where each tells the other side of it: a thing does not stand in two places.
     """
     found = list(dict.fromkeys(matched.values()))
     if len(found) == 2 and not known.trails[found[0]].parts.keys() & known.trails[found[1]].parts.keys():
         older, newer = sorted(found)
         known.take_over(older, newer)
         return older
-    return next((number for number in found if number not in going_on), found[0] if found else None)
+    free = [number for number in found if number not in going_on]
+    other_side = [number for number in found if not going_on.get(number, set()) & sides]
+    return next(iter(free + other_side), None)
 
 
 def _named(trails: Sequence[_Trail], ids: Sequence[str]) -> dict[int, str]:
@@ -296,13 +313,14 @@ def _track(
     newest = max(visit.map_version for visit, _ in trail.sightings)
     taken = [one.version for one in accepted if one.version > newest and _holds(one, trail.parts)]
     version = min(taken, default=None)
-    verdicts = _verdicts(trail, visits, version)
+    verdicts, sides = _verdicts(trail, visits, accepted, version)
     looks = [(visit, verdict) for visit, verdict in verdicts if verdict != "not_looked"]
     last_known = _status([verdict for _, verdict in looks])
     status: ObjectStatus = "unknown" if verdicts[-1][1] == "not_looked" else last_known
     return Track(
         object_id=object_id,
         sightings=tuple(trail.sightings),
+        sides=sides,
         status=status if version is None else "accepted",
         last_known=last_known if version is None else "accepted",
         transient=comes_and_goes([verdict for _, verdict in looks]),
@@ -311,24 +329,55 @@ def _track(
     )
 
 
-def _verdicts(trail: _Trail, visits: Sequence[Visit], accepted_in: int | None) -> list[tuple[Visit, Verdict]]:
-    """Return what each visit from the first sighting on says; none that was compared with a map that has the thing."""
-    seen: dict[str, list[Sighting]] = {}
+def _verdicts(
+    trail: _Trail, visits: Sequence[Visit], accepted: Sequence[Accepted], accepted_in: int | None
+) -> tuple[list[tuple[Visit, Verdict]], frozenset[Side]]:
+    """Return what each visit from the first sighting on says, and the sides that stand in the end.
+
+    A visit that was compared with a map which has the thing, from version `accepted_in` on, has no say.
+    """
+    seen: dict[str, list[Parts]] = {}
     for visit, sighting in trail.sightings:
-        seen.setdefault(visit.survey_id, []).append(sighting)
-    parts: dict[Side, Part] = {}
+        seen.setdefault(visit.survey_id, []).append(sighting.parts)
+    standing = _Standing()
     verdicts: list[tuple[Visit, Verdict]] = []
     for visit in visits[visits.index(trail.sightings[0][0]) :]:
-        for sighting in seen.get(visit.survey_id, ()):
-            parts |= sighting.parts
         if accepted_in is not None and visit.map_version >= accepted_in:
-            continue  # asked a map that has the thing
-        if visit.survey_id in seen:
-            verdicts.append((visit, "seen"))
-        else:
-            looked = all(_observed(part, visit) >= MIN_LOOK for part in parts.values())
-            verdicts.append((visit, "gone" if looked else "not_looked"))
-    return verdicts
+            continue
+        verdicts.append((visit, standing.after(visit, seen.get(visit.survey_id, ()), accepted)))
+    return verdicts, frozenset(standing.sides)
+
+
+@dataclass(kw_only=True, slots=True)
+class _Standing:
+    """Which sides of an object stand, visit after visit."""
+
+    sides: set[Side] = field(default_factory=set)  #: that stood when it was seen last
+    open: set[Side] = field(
+        default_factory=set
+    )  #: of these, those that no look has found as in the map since
+    parts: dict[Side, Part] = field(default_factory=dict)
+    versions: dict[Side, int] = field(default_factory=dict)  #: of the map, that each was told against
+
+    def after(self, visit: Visit, seen: Sequence[Parts], accepted: Sequence[Accepted]) -> Verdict:
+        """Take in what a visit says, whose sightings of the object have these parts; return whether it is there."""
+        self.open -= {side for side in self.open if self._in_map(side, visit.map_version, accepted)}
+        looked = {side for side in self.sides if _observed(self.parts[side], visit) >= MIN_LOOK}
+        asked = set(self.open or self.sides)
+        self.open -= looked
+        for parts in seen:
+            self.open |= parts.keys()
+            self.parts |= parts
+            self.versions |= dict.fromkeys(parts, visit.map_version)
+        if seen:
+            self.sides = set(self.open)
+            return "seen"
+        return "gone" if asked <= looked else "not_looked"
+
+    def _in_map(self, side: Side, version: int, accepted: Sequence[Accepted]) -> bool:
+        """Tell whether a version of the map has what was told of a side against an earlier one."""
+        part, told = {side: self.parts[side]}, self.versions[side]
+        return any(told < taken.version <= version and _holds(taken, part) for taken in accepted)
 
 
 def _observed(part: Part, visit: Visit) -> float:

@@ -179,7 +179,9 @@ def _next(row: Webhook) -> Select[Event]:
         types=None if row.types is None else cast("list[EventType]", row.types),
         maps=None if row.map_id is None else (row.map_id,),
     )
-    return select(Event).where(Event.sequence > row.position, *wanted.conditions()).order_by(Event.sequence)
+    query = select(Event).where(Event.sequence > row.position, *wanted.conditions()).order_by(Event.sequence)
+    # one that named no types is not told with each visit that all is as it was
+    return query if row.types is not None else query.where(Event.data["only_times"].as_boolean().is_not(True))
 
 
 def _count(session: Session, row: Webhook) -> int:

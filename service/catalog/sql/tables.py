@@ -340,7 +340,11 @@ class SurveyObject(Base):
 
 
 class MapObject(Base):
-    """A changed thing of a map over all of its surveys, as far as its latest sighting and the latest look tell."""
+    """A changed thing of a map over all of its surveys, as far as its latest sighting and the latest look tell.
+
+    Of what moved the latest sighting may tell one side alone; then another one, of the same survey or an earlier one,
+    tells the other side.
+    """
 
     __tablename__ = "map_objects"
 
@@ -357,6 +361,8 @@ class MapObject(Base):
     sightings: Mapped[int]
     survey_id: Mapped[str]
     number: Mapped[int]
+    other_survey_id: Mapped[str | None]
+    other_number: Mapped[int | None]
     probability: Mapped[float]
     min_x: Mapped[float]
     min_y: Mapped[float]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from datetime import timedelta
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -152,6 +153,29 @@ def test_an_object_over_time_has_an_interval_and_each_of_its_sightings(
         "2026-03-01",
         "2026-03-02",
     ]
+
+
+def test_what_moved_stays_so_after_a_visit_that_tells_a_part_of_it(tmp_path: Path) -> None:
+    """A desk is moved; then told as gone there and come here; then seen here by a visit that looked nowhere else."""
+    with running(settings_in(tmp_path), RememberingQueue()) as client:
+        catalog = catalog_of(client)
+        add_map(catalog)
+        first = visit(catalog, 0, thing(1, now=DESK, before=DESK_BEFORE))
+        second = visit(catalog, 1, thing(1, before=DESK_BEFORE), thing(2, now=DESK))
+        at = NOON + timedelta(days=2)
+        third, _ = add_survey(catalog, LOOKED[12:13], captured_at=at, objects=[thing(1, now=DESK)])
+        (listed,) = properties(client, kind="moved")
+        assert properties(client, kind="appeared") == []
+        found = client.get(f"/maps/lobby/objects/{listed['object_id']}").json()
+    assert found["properties"] == listed
+    assert (listed["sightings"], listed["survey_id"], listed["before"]["center"]) == (
+        3,
+        third,
+        [7.0, 3.4, 0.375],
+    )
+    assert (listed["moved_y"], listed["moved_yaw_degrees"]) == (pytest.approx(-2.4), None)
+    told = [(one["properties"]["survey_id"], one["properties"]["kind"]) for one in found["sightings"]]
+    assert told == [(first, "moved"), (second, "moved"), (third, "appeared")]
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,7 @@ from sqlalchemy import inspect
 from service.catalog.catalog import Catalog, open_catalog
 from service.catalog.files import blob_keys
 from service.catalog.findings.changes import ChangeFilter
+from service.catalog.findings.objects import ObjectFilter
 from service.catalog.sql.database import Database, WrongRevision
 from service.settings import Settings
 from service.up.embedded_redis import LaunchFailed
@@ -123,6 +124,27 @@ def test_what_a_version_of_the_last_build_took_over_is_known(old: Settings) -> N
     told = catalog.changes.page(ChangeFilter(map_id="lobby")).items
     catalog.close()
     assert [change.survey_id for change in told] == [survey_id, "survey-1"]
+
+
+def test_what_moved_and_was_told_as_appeared_is_moved_again(old: Settings) -> None:
+    """Before 0019 an object was of the kind that its latest sighting told, though nobody had looked at the other place."""
+    catalog = open_catalog(old)
+    start = catalog.surveys.get("survey-1").captured_at
+    seen = [thing(1, now=place(1, 1), before=place(4, 1)), thing(1, now=place(1, 1))]
+    for day, one in enumerate(seen, 1):
+        add_survey(catalog, [tile(0, 0)], captured_at=start + timedelta(days=day), objects=[one])
+    catalog.close()
+    run(
+        old,
+        """UPDATE map_objects SET kind = 'appeared';
+        ALTER TABLE map_objects DROP COLUMN other_survey_id;
+        ALTER TABLE map_objects DROP COLUMN other_number;
+        UPDATE alembic_version SET version_num = '0018'""",
+    )
+    catalog = open_catalog(old)
+    (found,) = catalog.objects.page(ObjectFilter(map_id="lobby")).items
+    catalog.close()
+    assert (found.latest.thing.kind, found.latest.thing.before) == ("moved", seen[0].before)
 
 
 def test_the_model_and_the_jobs_of_the_last_build_are_there(opened: Catalog) -> None:

@@ -20,6 +20,18 @@ def test_the_scans_of_a_file_stand_in_its_place_in_a_version(catalog: Catalog) -
     catalog.scans.delete(file)  # nothing rests on it any more
 
 
+def test_a_file_that_has_more_is_kept_behind_its_scans(catalog: Catalog) -> None:
+    add_map(catalog)
+    first, file, last, one, two = (
+        add_scan(catalog, name).scan_id for name in ("first", "file", "last", "one", "two")
+    )
+    survey, _ = catalog.surveys.create("lobby", scan_ids=[first, file, last], model=MODEL)
+    for _ in range(2):  # a step may run twice
+        catalog.surveys.take_apart(survey.survey_id, file, {one: MOVED, two: MOVED}, keep=True)
+        scans = catalog.surveys.get(survey.survey_id).scans
+        assert [scan.scan_id for scan in scans] == [first, one, two, file, last]
+
+
 def test_a_scan_that_a_survey_names_beside_its_file_is_there_once(catalog: Catalog) -> None:
     add_map(catalog)
     file, one, two = (add_scan(catalog, name).scan_id for name in ("file", "one", "two"))

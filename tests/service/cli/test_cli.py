@@ -101,6 +101,10 @@ class Service:
         return json.loads(self.requests[number].content)
 
 
+#: A PLY of one point.
+WHOLE = b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n0\n"
+
+
 @pytest.fixture
 def service(monkeypatch: pytest.MonkeyPatch) -> Service:
     service = Service()
@@ -121,13 +125,13 @@ def test_scans_add_streams_the_file_with_what_is_said_of_it(
     service: Service, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     service.on("POST /scans", SCAN, status=201)
-    (tmp_path / "hall.pcd").write_bytes(b"# .PCD v.7")
+    (tmp_path / "hall.pcd").write_bytes(WHOLE)
     (tmp_path / "pose.txt").write_text("1 0 0 2.5\n0 1 0 0\n0 0 1 0\n0 0 0 1\n")
     pose = ["--pose", str(tmp_path / "pose.txt")]
     assert spicd("scans", "add", str(tmp_path / "hall.pcd"), "--device-id", "robot-7", *pose) == 0
     request = service.requests[0]
-    assert request.content == b"# .PCD v.7"
-    assert request.headers["content-length"] == "10"
+    assert request.content == WHOLE
+    assert request.headers["content-length"] == str(len(WHOLE))
     assert "transfer-encoding" not in request.headers
     query = dict(request.url.params)
     assert json.loads(query.pop("pose")) == [[1, 0, 0, 2.5], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
@@ -135,12 +139,31 @@ def test_scans_add_streams_the_file_with_what_is_said_of_it(
     assert "scan-1" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("words", [["scans", "add"], ["maps", "create"], ["surveys", "submit", "lobby"]])
+def test_a_file_that_is_cut_off_or_empty_is_refused_before_any_is_sent(
+    service: Service, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str]
+) -> None:
+    service.on("POST /scans", SCAN, status=201)
+    contents = {"whole.ply": WHOLE, "cut.ply": WHOLE[:-2], "empty.pcd": b""}
+    for name, content in contents.items():
+        (tmp_path / name).write_bytes(content)
+    assert spicd(*words, *(str(tmp_path / name) for name in contents)) == 1
+    assert service.requests == []
+    said = capsys.readouterr().err
+    assert (
+        f"{tmp_path}/cut.ply: the file is cut off: its header declares 1 points, 0 of them are there; copy"
+        in said
+    )
+    assert f"{tmp_path}/empty.pcd: the file is empty (0 bytes); copy or record it again" in said
+    assert "none of the 3 files is sent" in said
+
+
 def test_maps_create_uploads_files_and_takes_other_names_as_ids(
     service: Service, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     service.on("POST /scans", SCAN, status=201)
     service.on("POST /maps", {"map_id": "lobby", "job_id": "job-1"}, status=202)
-    (tmp_path / "hall.ply").write_bytes(b"ply\n")
+    (tmp_path / "hall.ply").write_bytes(WHOLE)
     assert spicd("maps", "create", "scan-0", str(tmp_path / "hall.ply"), "--id", "lobby", "--json") == 0
     assert service.body() == {"id": "lobby", "scan_ids": ["scan-0", "scan-1"]}
     assert json.loads(capsys.readouterr().out) == {"map_id": "lobby", "job_id": "job-1"}
@@ -197,7 +220,7 @@ def test_versions_add_uploads_further_scans_waits_and_shows_the_version(
     service.on("POST /maps/lobby/versions", accepted, status=202)
     service.on("GET /jobs/job-1", job("successful", 100))
     service.on("GET /maps/lobby/versions/2", VERSION)
-    (tmp_path / "hall.ply").write_bytes(b"ply\n")
+    (tmp_path / "hall.ply").write_bytes(WHOLE)
     assert spicd("versions", "add", "lobby", str(tmp_path / "hall.ply"), "--wait") == 0
     assert service.body(1) == {"scan_ids": ["scan-1"]}
     shown = capsys.readouterr().out
@@ -253,7 +276,7 @@ def test_names_that_look_like_markup_are_printed_as_they_are(
     service.on("GET /models", {"models": [{"name": "m", "version": "1", "summary": name}]})
     service.on("POST /scans", {**SCAN, "filename": name}, status=201)
     file = tmp_path / f"{name.replace('/', '')}.ply"
-    file.write_bytes(b"ply\n")
+    file.write_bytes(WHOLE)
     calls = (["maps", "list"], ["maps", "show", "lobby"], ["models"], ["scans", "add", str(file)])
     for words in calls:
         assert spicd(*words) == 0
@@ -292,7 +315,7 @@ def test_a_file_that_cannot_be_read_is_one_sentence(
     def refuse(path: Path, *_: Any) -> Any:
         raise PermissionError(errno.EACCES, "Permission denied", str(path))
 
-    (tmp_path / "hall.ply").write_bytes(b"ply\n")
+    (tmp_path / "hall.ply").write_bytes(WHOLE)
     monkeypatch.setattr(Path, "open", refuse)
     service.on("POST /scans", SCAN, status=201)
     assert spicd("maps", "create", str(tmp_path / "hall.ply")) == 1

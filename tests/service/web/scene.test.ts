@@ -9,6 +9,7 @@ import { around, edgesOf, entryOf, holds, solidOf } from "../../../service/web/s
 import { KIND_COLOURS, STATE_COLOURS } from "../../../service/web/source/scene/colours.ts";
 import { readGlb } from "../../../service/web/source/scene/glb.ts";
 import { boundsOf, levelsOf } from "../../../service/web/source/scene/heights.ts";
+import { Pace } from "../../../service/web/source/scene/pace.ts";
 import { readPly } from "../../../service/web/source/scene/ply.ts";
 import { FAINT, GONE, MARKED, OWN, RAMP, cloudOf, spacingOf, spread, tintsOfBytes } from "../../../service/web/source/scene/points.ts";
 
@@ -162,4 +163,20 @@ test("the box around boxes reaches as far as they do", () => {
 test("kinds have the colours that the picture and the coloured cloud have", () => {
   assert.deepEqual(KIND_COLOURS, EXPECTED.kinds);
   assert.deepEqual(STATE_COLOURS, EXPECTED.states);
+});
+
+test("where frames are slow, less is drawn while the camera moves; where they are fast, everything", () => {
+  const slow = new Pace();
+  slow.begins();
+  for (let frame = 0; frame < 4; frame++) slow.took(900);
+  assert.ok(slow.share < 0.03, `${slow.share}`);
+  assert.equal(slow.sharpness, 0.5);
+  for (let frame = 0; frame < 60; frame++) slow.took(10);
+  assert.deepEqual([slow.share, slow.sharpness], [1, 0.5]); // the number of pixels does not rise within a move
+  slow.begins();
+  assert.deepEqual([slow.share, slow.sharpness], [1, 1]);
+  const fast = new Pace();
+  fast.begins();
+  for (let frame = 0; frame < 4; frame++) fast.took(16);
+  assert.deepEqual([fast.share, fast.sharpness], [1, 1]);
 });

@@ -1,41 +1,19 @@
-"""What the steps of an inference worker share, by the settings and by whether there is a GPU."""
+"""What a step takes of the service's settings."""
 
 from __future__ import annotations
 
-import pytest
+from types import SimpleNamespace
+from typing import Any
 
 from service.settings import Settings
-from worker.detectors.running.calls import DirectBatches
-from worker.detectors.running.shared import SharedBatches
-from worker.jobs import models
-from worker.jobs.models import networks
+from tests.support.running_service import ROOT
+from worker.detectors.store import open_card
+from worker.jobs.models import pipeline_settings
 
 
-@pytest.mark.parametrize(
-    ("gpu", "asked", "concurrency", "kind"),
-    [
-        (False, None, 1, DirectBatches),
-        (True, None, 4, SharedBatches),
-        (False, 3, 3, SharedBatches),
-        (True, 1, 1, DirectBatches),
-    ],
-)
-def test_a_processor_runs_one_step_at_a_time_and_a_gpu_several(
-    monkeypatch: pytest.MonkeyPatch, gpu: bool, asked: int | None, concurrency: int, kind: type
-) -> None:
-    monkeypatch.setattr(models, "finds_gpu", lambda: gpu)
-    shared = networks(Settings(inference_concurrency=asked))
-    assert shared.concurrency == concurrency
-    assert isinstance(shared.runtime.batches, kind)
-
-
-def test_they_are_made_once_and_have_the_precision_that_is_asked_for() -> None:
-    settings = Settings(device="cpu", inference_precision="float32")
-    assert networks(settings) is networks(settings)
-    assert networks(settings).runtime.precision == "float32"
-    assert networks(settings).tells() == {"models": 0, "model_bytes": 0}
-
-
-def test_a_worker_that_leaves_the_gpu_alone_takes_one_step_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(models, "finds_gpu", lambda: True)
-    assert networks(Settings(device="cpu")).concurrency == 1
+def test_memory_and_points_are_bounded_by_the_service_whatever_a_map_asked_for() -> None:
+    context: Any = SimpleNamespace(settings=Settings(map_memory_bytes=20 << 20, max_scan_points=1000))
+    version: Any = SimpleNamespace(settings={"memory_bytes": 1 << 40, "max_scan_points": 1 << 40})
+    card = open_card(ROOT / "model_store", "voxel-net/1")
+    settings = pipeline_settings(context, version, card)
+    assert (settings.memory_bytes, settings.max_scan_points) == (20 << 20, 1000)

@@ -121,7 +121,7 @@ def test_a_scan_is_registered_from_the_pose_of_its_use_and_not_from_that_of_its_
     settings = PipelineSettings.model_validate({})
     with ExitStack() as stack:
         context: Any = SimpleNamespace(catalog=catalog)
-        one, other = scan_files(context, asked, stack, settings)
+        one, other = scan_files(context, asked, stack, settings, refused={})
     assert one.pose is not None
     np.testing.assert_array_equal(one.pose, moved)
     assert other.pose is None

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from worker.benchmarks.trajectory import scan_files
+from worker.cloud.fusing import FusedCloud
 from worker.cloud.poses import transformed
 from worker.cloud.tiling import Tiles, cut, grid_over
 from worker.cloud.types import Matrix4, Points
@@ -97,7 +98,7 @@ def _mapped(
     size = pipeline.registration.voxel_size
     clouds = [transformed(points, pose).astype(np.float32) for points, pose in scans]
     voxels = tuple(Voxels.of(points, size=size) for points in clouds)
-    whole = merged_in_order(voxels)
+    whole = FusedCloud.of(merged_in_order(voxels))
     grid = grid_over(whole.points, tile_size=pipeline.tiling.tile_size, voxel_size=size)
     tiles = cut(whole.points, grid, min_points=pipeline.tiling.min_points)
     reference = (

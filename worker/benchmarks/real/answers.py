@@ -13,11 +13,12 @@ from numpy.typing import NDArray
 
 from worker.benchmarks.documents import Document
 from worker.benchmarks.real.visits import RealScan, TwoVisits
+from worker.cloud.fusing import fused_cloud
 from worker.cloud.seen import Seen
 from worker.cloud.tiling import TileGrid, grid_over
 from worker.cloud.types import Floats, Indices
 from worker.cloud.voxel_keys import Keys, packed, rows_of
-from worker.cloud.voxels import Voxels, fused
+from worker.cloud.voxels import Voxels
 from worker.detectors.comparison import Comparison
 from worker.detectors.detector import Detector
 from worker.pipeline.alarms import calibrated, visits_of
@@ -145,16 +146,16 @@ def comparison_of(
 ) -> Comparison:
     """Fuse both visits and set them side by side, with what their scans saw. Raises ValueError for no scan."""
     size = settings.registration.voxel_size
-    sums = [
-        fused(Voxels.of(scan.points, size=size, origin=scan.sensor_origin) for scan in visit)
+    clouds = [
+        fused_cloud(Voxels.of(scan.points, size=size, origin=scan.sensor_origin) for scan in visit)
         for visit in (first, second)
     ]
-    if sums[0] is None or sums[1] is None:
+    if clouds[0] is None or clouds[1] is None:
         raise ValueError("a visit without a scan cannot be compared")
-    grid = grid_over(sums[0].points, tile_size=settings.tiling.tile_size, voxel_size=size)
+    grid = grid_over(clouds[0].points, tile_size=settings.tiling.tile_size, voxel_size=size)
     return compare(
-        reference_map(sums[0], grid=grid, settings=settings.registration),
-        CurrentMap(points=sums[1].points, colors=None),
+        reference_map(clouds[0], grid=grid, settings=settings.registration),
+        CurrentMap(points=clouds[1].points, colors=None),
         settings=settings,
         reference_seen=Seen.of(first, voxel_size=size),
         current_seen=Seen.of(second, voxel_size=size),

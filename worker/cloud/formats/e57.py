@@ -61,6 +61,7 @@ class Station:
     pose: Matrix4 | None  #: (4, 4) file_from_station, rigid, metres; None where the file has none
     fields: dict[str, Field]
     color_limits: tuple[tuple[float, float], ...] | None  #: of red, green, blue; None: no colour is read
+    refused: str = ""  #: why it cannot be read; what it declares is not known then
 
     @property
     def position(self) -> tuple[str, ...]:
@@ -79,16 +80,21 @@ def looks_like_e57(head: bytes) -> bool:
 
 
 def read_stations(buffer: mmap.mmap) -> tuple[Station, ...]:
-    """Return the scans of a file that hold points, each held against the file's size. Raises ScanError."""
+    """Return the scans of a file that hold points, each held against the file's size.
+
+    One that cannot be what it declares is `refused`, for the others may be sound. Raises ScanError where none of them is.
+    """
     root = _xml(buffer)
     data = _child(root, "data3D")
     children = list(data) if data is not None and data.get("type") == "Vector" else []
     if len(children) > MOST_STATIONS:
         raise ScanError(f"it holds {len(children)} scans, at most {MOST_STATIONS} are read; split the file")
-    stations = [_station(child, index, buffer) for index, child in enumerate(children)]
-    there = tuple(station for station in stations if station is not None and station.n)
+    stations = [_station_or_refusal(child, index, buffer) for index, child in enumerate(children)]
+    there = tuple(one for one in stations if one is not None and (one.n or one.refused))
     if not there:
         raise ScanError(f"no points are in it: it holds {len(children)} scans, all empty")
+    if all(station.refused for station in there):
+        raise ScanError(there[0].refused)
     return there
 
 
@@ -99,6 +105,8 @@ def read_e57(path: str, station: Station, store: ColumnStore, *, max_points: int
     """
     from pye57 import libe57  # noqa: PLC0415 - most scans are not E57
 
+    if station.refused:
+        raise ScanError(station.refused)
     check_point_count(station.n, max_points=max_points)
     store.allocate(station.n, colors=station.color_limits is not None)
     try:
@@ -227,6 +235,26 @@ def _child(parent: Element | None, name: str) -> Element | None:
     return parent.find(f"{space}}}{name}" if space else name)
 
 
+def _station_or_refusal(scan: Element, index: int, buffer: mmap.mmap) -> Station | None:
+    """Read one scan, or why that cannot be; None where it has no points."""
+    try:
+        return _station(scan, index, buffer)
+    except ScanError as error:
+        return Station(
+            index=index,
+            name=_name(scan),
+            n=0,
+            pose=None,
+            fields={},
+            color_limits=None,
+            refused=str(error),
+        )
+
+
+def _name(scan: Element) -> str:
+    return "".join(letter for letter in (_text(scan, "name") or "") if letter.isprintable())[:100]
+
+
 def _station(scan: Element, index: int, buffer: mmap.mmap) -> Station | None:
     """Read one scan; None where it has no points."""
     points = _child(scan, "points")
@@ -235,14 +263,13 @@ def _station(scan: Element, index: int, buffer: mmap.mmap) -> Station | None:
     if (scan.get("type"), points.get("type")) != ("Structure", "CompressedVector"):
         raise ScanError(f"scan {index + 1} is a {scan.get('type')!r} with points of {points.get('type')!r}")
     n = _count(points, "recordCount")
-    name = "".join(letter for letter in (_text(scan, "name") or "") if letter.isprintable())[:100]
     prototype = _child(points, "prototype")
     fields = {
         child.tag.rpartition("}")[2]: _field(child) for child in (prototype if prototype is not None else ())
     }
     station = Station(
         index=index,
-        name=name,
+        name=_name(scan),
         n=n,
         pose=_pose(_child(scan, "pose")),
         fields=fields,

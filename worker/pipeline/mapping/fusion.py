@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+from worker.cloud.fusing import MEMORY_BYTES, FusedCloud, fused_cloud
 from worker.cloud.tiling import TileGrid, Tiles, cut
 from worker.cloud.types import Bools, Colors, Indices, Normals, Points
-from worker.cloud.voxels import Voxels, fused
 from worker.errors import MapFailed
 from worker.pipeline.registration.results import RegisteredScan
 from worker.pipeline.registration.settings import RegistrationSettings
@@ -43,31 +43,32 @@ class CurrentMap:
     displaced: Indices | None = None  #: (T, 3) tiles in which walls, floor or ceiling do not lie on the map's
 
 
-def fuse(scans: Iterable[RegisteredScan], *, voxel_size: float) -> Voxels:
+def fuse(
+    scans: Iterable[RegisteredScan], *, voxel_size: float, memory_bytes: int = MEMORY_BYTES
+) -> FusedCloud:
     """Average the points of all scans in each voxel of the map frame; the points of one scan in memory at a time.
 
-    Raises MapFailed where there is no scan.
+    What takes more than about `memory_bytes` beside the answer is written aside. Raises MapFailed where there is no scan.
     """
-    voxels = fused(scan.voxels(voxel_size) for scan in scans)
-    if voxels is None:
+    cloud = fused_cloud((scan.voxels(voxel_size) for scan in scans), memory_bytes=memory_bytes)
+    if cloud is None:
         raise MapFailed("no scan is left to fuse; see the reasons listed with the scans")
-    return voxels
+    return cloud
 
 
-def reference_map(voxels: Voxels, *, grid: TileGrid, settings: RegistrationSettings) -> ReferenceMap:
+def reference_map(cloud: FusedCloud, *, grid: TileGrid, settings: RegistrationSettings) -> ReferenceMap:
     """Return the fused cloud with the normals that surveys will need, computed once."""
-    points = voxels.points
-    normals, oriented = oriented_normals(voxels, points, settings)
+    normals, oriented = oriented_normals(cloud.points, cloud.views, settings)
     return ReferenceMap(
-        points=points,
+        points=cloud.points,
         normals=normals,
         oriented=oriented,
-        colors=voxels.colors,
-        voxel_size=voxels.size,
+        colors=cloud.colors,
+        voxel_size=cloud.size,
         grid=grid,
     )
 
 
-def current_map(voxels: Voxels) -> CurrentMap:
+def current_map(cloud: FusedCloud) -> CurrentMap:
     """Return what a survey's scans were fused to, as those of the map are (paper, Section 3.9.1)."""
-    return CurrentMap(points=voxels.points, colors=voxels.colors)
+    return CurrentMap(points=cloud.points, colors=cloud.colors)

@@ -38,10 +38,17 @@ class ScanFile:
     pose: Matrix4 | None = None  #: (4, 4) map_from_sensor as the client believes it, e.g. by odometry
     station: int | None = None  #: of the scans of an E57, from 0 on; None: the only one
     carrier: Carrier | None = None  #: whose returns are cut; None: nobody looked for one
+    refused: str | None = None  #: why it is not read; None: it is
+
+    def read_whole(self, *, max_points: int) -> Scan:
+        """Read the file with the carrier's returns; raises ScanError, whose message names it."""
+        if self.refused is not None:
+            raise ScanError(self.refused)
+        return read_scan(self.path, name=self.name, max_points=max_points, station=self.station)
 
     def read(self, *, max_points: int) -> Scan:
         """Read the file, less the carrier's returns; raises ScanError, whose message names it."""
-        scan = read_scan(self.path, name=self.name, max_points=max_points, station=self.station)
+        scan = self.read_whole(max_points=max_points)
         if self.carrier is None:
             return scan
         cut = self.carrier.hits(transformed(scan.points, inverse(scan.sensor_pose)))
@@ -105,7 +112,7 @@ def with_carrier(
 
 def _returns(file: ScanFile, *, max_points: int) -> Floats:
     """Return the points (N, 3) of a file, metres, sensor frame; nothing else of it is held. Raises ScanError."""
-    scan = read_scan(file.path, name=file.name, max_points=max_points, station=file.station)
+    scan = file.read_whole(max_points=max_points)
     return transformed(scan.points, inverse(scan.sensor_pose))
 
 

@@ -9,12 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from worker.cloud.normals import AT_ONCE, estimate_normals
+from worker.cloud.normals import estimate_normals
 from worker.cloud.types import Bools, Floats, Matrix4, Normals, Points
 from worker.cloud.voxels import Voxels
 from worker.pipeline.registration.settings import RegistrationSettings
 from worker.threads import query_threads
 
+_AT_ONCE = 1_000_000  # points whose normals are turned together
 _WORTH_A_THREAD = 4000  # points of a query; SciPy starts its threads anew for each
 _DEGENERACY_VOXEL, _DEGENERACY_RADIUS = 0.2, 0.5  # metres
 
@@ -55,21 +56,25 @@ class Surface:
 def surface_of(voxels: Voxels, settings: RegistrationSettings) -> Surface:
     """Make a target of ICP of the voxels: normals of Table 1, turned to the side they were seen from."""
     points = voxels.points
-    return Surface.of(points, *oriented_normals(voxels, points, settings))
+    return Surface.of(points, *oriented_normals(points, voxels.views, settings))
 
 
-def oriented_normals(voxels: Voxels, points: Points, settings: RegistrationSettings) -> tuple[Normals, Bools]:
-    """Return the normals (M, 3) of the voxels' points (M, 3), and of each whether it points to the side that was seen."""
+def oriented_normals(
+    points: Points, views: NDArray[Any], settings: RegistrationSettings
+) -> tuple[Normals, Bools]:
+    """Return the normals (M, 3) of points (M, 3), and of each whether it points to the side that was seen.
+
+    `views` (M, 3) are mean directions to the sensors.
+    """
     normals = estimate_normals(
         points, radius=settings.normal_radius, max_neighbors=settings.normal_max_neighbors
     )
     oriented = np.empty(len(points), bool)
-    for start in range(0, len(points), AT_ONCE):
-        some = slice(start, start + AT_ONCE)
-        views = voxels.run(start, start + AT_ONCE).views
-        normals[some][np.einsum("ij,ij->i", normals[some], views) < 0] *= -1
+    for start in range(0, len(points), _AT_ONCE):
+        some = slice(start, start + _AT_ONCE)
+        normals[some][np.einsum("ij,ij->i", normals[some], views[some]) < 0] *= -1
         # seen from nowhere known, or from both sides: a board thinner than a voxel
-        oriented[some] = np.linalg.norm(views, axis=1) > 0.3
+        oriented[some] = np.linalg.norm(views[some], axis=1) > 0.3
     return normals, oriented
 
 

@@ -3,14 +3,16 @@
 import { Api, ApiError, problemOf } from "./api.ts";
 import type { CloudEvent, Counts } from "./documents.ts";
 import { follow, type Line } from "./follow.ts";
-import { count } from "./format.ts";
+import { count, instant } from "./format.ts";
 import { NOWHERE, readPlace, TILES_OF, writePlace, type Place, type Show } from "./link.ts";
 import * as loads from "./loads.ts";
+import { scansIn, sentenceOf, withNames } from "./problems.ts";
 import {
   firstState,
   isOpen,
   nothingOfAMap,
   type Loaded,
+  type Notice,
   type Question,
   type State,
   type Theme,
@@ -22,6 +24,7 @@ const THEME = "spicd-theme"; // in localStorage
 const JOBS_BUSY_MS = 1500;
 const JOBS_IDLE_MS = 15_000;
 const SETTLE_MS = 300; // events come in bunches
+const SAID_MS = { plain: 5000, bad: 12_000, link: 30_000 }; // for so long a notice stays
 
 export class Controller {
   state: State;
@@ -128,13 +131,22 @@ export class Controller {
       this.tell("This map was deleted.", "bad");
     }
     for (const { type, data } of events) {
-      if (type === "survey.ready") this.tell(`A survey is ready${foundBy(data)}.`);
-      if (type === "survey.failed") this.tell("A survey failed; the timeline says why.", "bad");
+      if (type === "survey.ready" || type === "survey.failed") this.#ended(type, data);
       if (type === "version.ready" && map)
         this.tell(`Version ${String(data["version"])} of the map is ready.`);
     }
     clearTimeout(this.#refresh);
     this.#refresh = setTimeout(() => this.#again(), SETTLE_MS);
+  }
+
+  /** Say that a comparison has ended, with the way to its survey. */
+  #ended(type: string, data: CloudEvent["data"]): void {
+    const { map_id: map, survey_id: survey } = data;
+    const which = this.state.place.map ? "The" : `${nameOf(this.state, map)}: the`;
+    const what = `${which} survey of ${instant(String(data["captured_at"]))}`;
+    const to = map && survey ? { map, survey } : null;
+    if (type === "survey.ready") this.tell(`${what} is compared${foundBy(data)}.`, "plain", to);
+    else this.tell(`${what} could not be compared.`, "bad", to);
   }
 
   #again(): void {
@@ -184,7 +196,9 @@ export class Controller {
     try {
       await act();
     } catch (error) {
-      this.tell(problemOf(error).detail, "bad");
+      const said = sentenceOf(problemOf(error));
+      await loads.names(this, scansIn(said));
+      this.tell(withNames(said, this.state.names), "bad");
     }
   }
 
@@ -193,10 +207,15 @@ export class Controller {
   }
 
   /** Say something for a while, also to who does not see the page. */
-  tell(text: string, tone: "plain" | "bad" = "plain"): void {
+  tell(text: string, tone: Notice["tone"] = "plain", to: Notice["to"] = null): void {
     clearTimeout(this.#notice);
-    this.update({ notice: { text, tone } });
-    this.#notice = setTimeout(() => this.update({ notice: null }), tone === "bad" ? 12_000 : 5000);
+    this.update({ notice: { text, tone, to } });
+    this.#notice = setTimeout(() => this.unsay(), to ? SAID_MS.link : SAID_MS[tone]);
+  }
+
+  /** Take away what was said last. */
+  unsay(): void {
+    this.update({ notice: null });
   }
 
   /** Take a key, or forget it, and ask for everything again. */
@@ -219,6 +238,10 @@ function foundBy({ objects, counts }: CloudEvent["data"]): string {
   if (objects) return `: ${kinds(objects as Counts) || "no object changed"}`;
   const { changed = 0 } = (counts ?? {}) as Counts;
   return changed ? `: ${count(changed, "changed tile")}` : "";
+}
+
+function nameOf({ maps }: State, id: string | undefined): string {
+  return maps.value?.find(({ map_id }) => map_id === id)?.name ?? id ?? "a map";
 }
 
 function isStep(from: Place, to: Place): boolean {

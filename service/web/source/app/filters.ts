@@ -1,6 +1,6 @@
 /** Which items the list and the scene show. */
 
-import { percent } from "./format.ts";
+import { deviceWords, percent } from "./format.ts";
 import type { Item } from "./items.ts";
 import { KINDS, STATUSES } from "./words.ts";
 
@@ -56,18 +56,33 @@ export function daysOf(instants: readonly string[]): string[] {
   return [...new Set(days)].sort().reverse();
 }
 
-/** Say what is filtered by, for people: `moved, since Mon 16 Nov`; empty where nothing is. */
-export function filterWords(filters: Filters, now = new Date()): string {
+/** One thing that is filtered by: in words, and what takes it away again. */
+export interface SetFilter {
+  words: string;
+  without: Partial<Filters>;
+}
+
+/** Return what is filtered by, each with its words: `first seen since Mon 16 Nov`. */
+export function setFilters(filters: Filters, now = new Date()): SetFilter[] {
   const { kinds, statuses, device, since, minScore, inSection } = filters;
-  return [
-    kinds.map((kind) => (KINDS[kind] ?? kind).toLowerCase()).join(" or "),
-    statuses.map((status) => (STATUSES[status] ?? status).toLowerCase()).join(" or "),
-    since && `first seen ${since === "today" || beginOf(since) ? periodWords(since, now) : "at any time"}`,
-    device && `by ${device}`,
-    minScore > 0 && `at least ${percent(minScore)}`,
-    inSection && "at the heights that are shown",
-  ]
-    .filter(Boolean)
+  const named = (values: string[], words: Record<string, string>) =>
+    values.map((value) => (words[value] ?? value).toLowerCase()).join(" or ");
+  const period = beginOf(since, now) ? periodWords(since, now) : "at any time";
+  const all: SetFilter[] = [
+    { words: named(kinds, KINDS), without: { kinds: [] } },
+    { words: named(statuses, STATUSES), without: { statuses: [] } },
+    { words: since && `first seen ${period}`, without: { since: "" } },
+    { words: device && deviceWords(device), without: { device: "" } },
+    { words: minScore > 0 ? `at least ${percent(minScore)}` : "", without: { minScore: 0 } },
+    { words: inSection ? "at the heights that are shown" : "", without: { inSection: false } },
+  ];
+  return all.filter(({ words }) => words);
+}
+
+/** Say what is filtered by, for people: `moved, first seen since Mon 16 Nov`; empty where nothing is. */
+export function filterWords(filters: Filters, now = new Date()): string {
+  return setFilters(filters, now)
+    .map(({ words }) => words)
     .join(", ");
 }
 
@@ -130,14 +145,7 @@ function isKind({ kind }: Item, wanted: string): boolean {
 
 /** Count how many filters are set. */
 export function active(filters: Filters): number {
-  return [
-    filters.kinds.length,
-    filters.statuses.length,
-    filters.device,
-    filters.since,
-    filters.minScore,
-    filters.inSection,
-  ].filter(Boolean).length;
+  return setFilters(filters).length;
 }
 
 /** Return `chosen` with a value added, or without it where it was there. */

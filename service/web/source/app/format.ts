@@ -16,6 +16,17 @@ export function height(z: number): string {
   return `${z.toFixed(2).replace("-", "−")} m`;
 }
 
+/** Write the heights of a section: `0 to 1.03 m`. */
+export function heights([low, high]: readonly [number, number]): string {
+  const plain = (z: number) => String(Math.round(z * 100) / 100).replace("-", "−");
+  return `${plain(low)} to ${plain(high)} m`;
+}
+
+/** Name a device beside other words, so that `robot-7` is known for one. */
+export function deviceWords(id: string): string {
+  return `device ${id}`;
+}
+
 /** Write a share or a probability; what is nearly sure does not read as sure, nor what is nearly nothing as nothing. */
 export function percent(share: number | null | undefined): string {
   if (share == null) return "not told";

@@ -43,7 +43,7 @@ export function boxOf(place: Box): SceneBox {
   };
 }
 
-/** Return an object of `/maps/{id}/objects`, as its latest sighting has it. */
+/** Return an object of `/maps/{id}/objects`, as it stands. */
 export function itemOfObject(feature: Feature<ObjectProperties>): Item {
   const known = feature.properties;
   const item = itemOfSighting(feature);
@@ -79,6 +79,17 @@ export function itemOfSighting(feature: Feature<SightingProperties>): Item {
     history: null,
     tile: null,
   };
+}
+
+/** Return what a survey saw, of an object whose places it told as two things one item: it moved. */
+export function joinSides(items: readonly Item[]): Item[] {
+  const known = new Map<string, Item>();
+  for (const item of items) {
+    const other = known.get(item.id);
+    const [shown, left] = other && !item.sighting?.now ? [other, item] : [item, other];
+    known.set(item.id, left ? { ...shown, kind: "moved", from: left.box } : shown);
+  }
+  return [...known.values()];
 }
 
 /** Return a changed tile of `/maps/{id}/changes` or `/surveys/{id}/tiles`. */

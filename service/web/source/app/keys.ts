@@ -5,6 +5,7 @@ import type { Stage } from "./stage.ts";
 import { sectionOf, shownItems } from "./state.ts";
 import { newUpload, nextTheme, share } from "./views/page.tsx";
 import { rowId } from "./views/changes.tsx";
+import { openFilters, openSection, seesFilters } from "./views/panels.ts";
 import { neighbour } from "./views/timeline.tsx";
 
 export const KEYS: readonly (readonly [string, string])[] = [
@@ -15,6 +16,8 @@ export const KEYS: readonly (readonly [string, string])[] = [
   ["[ ]", "survey before, survey after"],
   ["1 2 3 4", "reference, survey, both, split"],
   ["t", "look from above"],
+  ["/", "filters: open and close"],
+  ["x", "section, which cuts by height: open and close"],
   ["c", "cut the ceiling, or not"],
   ["u", "add a survey, or a map in the list of maps"],
   ["s", "copy a link to this view"],
@@ -47,6 +50,8 @@ export function act(key: string, app: Controller, stage: Stage): boolean {
     "3": () => app.go({ show: "both" }),
     "4": () => app.go({ show: "split" }),
     t: () => stage.topDown(),
+    "/": () => openFilters(app, !seesFilters(state)),
+    x: () => openSection(app, !state.sectionOpen),
     c: () => cutCeiling(app),
     s: () => void share(app),
   };
@@ -60,7 +65,8 @@ export function listen(app: Controller, stage: Stage): void {
   addEventListener("keydown", (event) => {
     if (event.ctrlKey || event.metaKey || event.altKey || event.defaultPrevented) return;
     const target = event.target as HTMLElement;
-    if (target.closest("dialog, input:not([type=checkbox]), select, textarea")) return;
+    if (target.closest("dialog, input:not([type=checkbox], [type=range]), select, textarea")) return;
+    if (target.matches("[type=range]") && event.key.length > 1) return; // arrows move it
     const isControl = target.closest("button, a, input, summary") !== null;
     if (isControl && (event.key === "Enter" || event.key === " ")) return;
     if (

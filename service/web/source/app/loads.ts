@@ -22,14 +22,14 @@ import type {
   VersionList,
   VersionSummaryDocument,
 } from "./documents.ts";
-import { boxOf, itemOfObject, itemOfSighting, itemOfTile, type Item } from "./items.ts";
+import { boxOf, itemOfObject, itemOfSighting, itemOfTile, joinSides, type Item } from "./items.ts";
 import type { Place } from "./link.ts";
 import { focusOf, isOpen, NOT_ASKED, type Look } from "./state.ts";
 
 const AT_ONCE = 4;
 const MOST_LOOKS = 8; // surveys that are asked whether they saw the place of an object
 const MOST_LATE = 20; // surveys that came last, of which the latest is looked for
-const MOST_NAMES = 80;
+const MOST_NAMES = 100; // as many scans as a document has
 const FAILED_FOR_MS = 24 * 3_600_000; // for so long a failed job is shown
 
 /** Ask for the list of maps, then for the latest survey of each. */
@@ -57,7 +57,7 @@ export async function map(app: Controller): Promise<void> {
     app.load("versions", () => versionsOf(app, id)),
   ]);
   if (app.state.map.value.status === "ready") await Promise.all([objects(app), ofSurvey(app), ofItem(app)]);
-  if (app.state.place.tab === "map") await ofTab(app);
+  else await namesShown(app);
 }
 
 /** Ask for what another survey, object, tab or filter needs. */
@@ -67,7 +67,6 @@ export function follow(app: Controller, before: Place): void {
   if (place.filters.device !== before.filters.device) void objects(app);
   if (place.item !== before.item) void ofItem(app);
   void ofSurvey(app);
-  void ofTab(app);
 }
 
 async function surveysOf(app: Controller, id: string): Promise<SurveySummaryDocument[]> {
@@ -101,7 +100,7 @@ async function items<F>(app: Controller, path: string, read: (feature: F) => Ite
   return features.map(read);
 }
 
-/** Ask for what the survey in focus tells: itself, what it saw, its tiles. */
+/** Ask for what the survey in focus tells: itself, what it saw, its tiles, and the names of its scans. */
 async function ofSurvey(app: Controller): Promise<void> {
   const { place, surveys, survey } = app.state;
   const focus = focusOf(app.state);
@@ -114,14 +113,15 @@ async function ofSurvey(app: Controller): Promise<void> {
   if (chosen?.objects) {
     const path = `surveys/${chosen.survey_id}/objects?limit=1000`;
     jobs.push(
-      app.load("sightings", () =>
-        items(app, path, (one: Feature<SightingProperties>) => itemOfSighting(one)),
+      app.load("sightings", async () =>
+        joinSides(await items(app, path, (one: Feature<SightingProperties>) => itemOfSighting(one))),
       ),
     );
   }
   if (place.list === "tiles" && (!place.survey || chosen?.status === "ready")) jobs.push(changes(app));
   if (focus?.status === "ready") jobs.push(...place.tiles.map((state) => tiles(app, focus.survey_id, state)));
   await Promise.all(jobs);
+  await namesShown(app);
 }
 
 async function changes(app: Controller): Promise<void> {
@@ -194,32 +194,29 @@ async function looksAt(app: Controller, { properties, sightings }: ObjectHistory
   return others.map((survey) => ({ survey, share: looks.get(survey.survey_id) ?? null }));
 }
 
-/** Ask for what the open tab shows beside: the names of scans. */
-async function ofTab(app: Controller): Promise<void> {
+/** Ask for the names of the scans that are listed: the map's, also where it could not be built, or the survey's. */
+async function namesShown(app: Controller): Promise<void> {
   const { place, map: shown, survey } = app.state;
-  if (place.tab === "map") {
-    await names(
-      app,
-      (shown.value?.scans ?? []).map(({ scan_id }) => scan_id),
-    );
-  }
-  if (place.tab === "survey")
-    await names(
-      app,
-      (survey.value?.scans ?? []).map(({ scan_id }) => scan_id),
-    );
+  const ofMap = place.tab === "map" || shown.value?.status !== "ready";
+  const scans = ofMap ? shown.value?.scans : place.tab === "survey" ? survey.value?.scans : [];
+  await names(
+    app,
+    (scans ?? []).map(({ scan_id }) => scan_id),
+  );
 }
 
 /** Ask for the file names of scans, of each once; a scan that cannot be looked at keeps its id. */
 export async function names(app: Controller, ids: string[]): Promise<void> {
-  const missing = ids.filter((id) => !(id in app.state.names)).slice(0, MOST_NAMES);
-  if (missing.length)
-    app.update({ names: { ...app.state.names, ...Object.fromEntries(missing.map((id) => [id, ""])) } });
+  const missing = ids.filter((id) => !(id in app.state.names) && !asked.has(id)).slice(0, MOST_NAMES);
+  for (const id of missing) asked.add(id);
   await eachOf(missing, async (id) => {
-    const { filename } = await app.api.get<ScanDocument>(`scans/${id}`);
-    app.update({ names: { ...app.state.names, [id]: filename } });
+    const scan = await app.api.get<ScanDocument>(`scans/${id}`).catch(() => null);
+    asked.delete(id);
+    app.update({ names: { ...app.state.names, [id]: scan?.filename ?? id } });
   });
 }
+
+const asked = new Set<string>(); // scans whose names are on their way
 
 /** Ask for the jobs that wait or run, and those that failed lately. */
 export async function jobs(app: Controller): Promise<void> {

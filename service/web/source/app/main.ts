@@ -10,9 +10,11 @@ import { listen } from "./keys.ts";
 import { listenForDrops } from "./drops.ts";
 import { drawing, shownTheme, Stage } from "./stage.ts";
 import { Page } from "./views/page.tsx";
+import { keepFocus } from "./views/panels.ts";
 
 import { KIND_COLOURS, STATE_COLOURS, TILE_COLOURS } from "../scene/colours.ts";
 import type { Scene } from "../scene/scene.ts";
+import type { Theme } from "../scene/types.ts";
 
 declare global {
   interface Window {
@@ -20,8 +22,13 @@ declare global {
   }
 }
 
-for (const [name, colour] of Object.entries({ ...STATE_COLOURS, ...TILE_COLOURS, ...KIND_COLOURS })) {
-  document.documentElement.style.setProperty(`--${name}`, colour);
+/** Give the styles the colours that the scene has. */
+function paint(theme: Theme): void {
+  const { dataset, style } = document.documentElement;
+  if (dataset["theme"] === theme) return;
+  dataset["theme"] = theme;
+  for (const [name, colour] of Object.entries({ ...STATE_COLOURS, ...TILE_COLOURS[theme], ...KIND_COLOURS }))
+    style.setProperty(`--${name}`, colour);
 }
 
 const root = document.createElement("div");
@@ -29,21 +36,15 @@ root.id = "app";
 document.body.append(root);
 
 const app = new Controller(new Api(document.baseURI), (state) => {
-  document.documentElement.dataset["theme"] = shownTheme(state);
+  paint(shownTheme(state));
   const name = state.map.value?.name ?? state.place.map;
   document.title = name ? `${name} · SPICD` : "SPICD";
   const focused = document.activeElement !== document.body;
   render(h(Page, { app, stage, state }), root);
-  if (focused && document.activeElement === document.body) keepFocus();
+  if (focused) keepFocus();
   stage.sync(state);
 });
 const stage = new Stage(app);
-
-/** Give the focus to the list, else to what the page is about, where what had it is there no more. */
-function keepFocus(): void {
-  const next = document.getElementById("items") ?? document.getElementById("main");
-  next?.focus({ preventScroll: true });
-}
 
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => app.update({}));
 listen(app, stage);

@@ -97,6 +97,13 @@ export interface Question {
   act: () => Promise<void>;
 }
 
+/** Something that is said for a while. */
+export interface Notice {
+  text: string;
+  tone: "plain" | "bad";
+  to: { map: string; survey: string } | null; // the survey that it is about
+}
+
 export type Theme = "system" | "light" | "dark";
 
 export interface State {
@@ -125,7 +132,7 @@ export interface State {
   filtersOpen: boolean;
   sectionOpen: boolean;
   panel: "low" | "half" | "full"; // of a small screen
-  notice: { text: string; tone: "plain" | "bad" } | null;
+  notice: Notice | null;
 }
 
 export function firstState(place: Place, theme: Theme, hasKey: boolean): State {
@@ -247,8 +254,10 @@ export function focusOf(state: State): SurveySummaryDocument | null {
   return surveys.findLast(({ status }) => status === "ready") ?? null;
 }
 
-/** Return which clouds are asked for. */
+/** Return which clouds are asked for: of a survey without a result there is none beside the map's. */
 export function showOf(state: State): Show {
+  const focus = focusOf(state);
+  if (focus && focus.status !== "ready") return "reference";
   return state.place.show ?? (state.place.item ? "split" : state.place.survey ? "both" : "reference");
 }
 

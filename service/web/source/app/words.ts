@@ -5,7 +5,6 @@ import type {
   Counts,
   JobDocument,
   MapSummaryDocument,
-  ProblemDocument,
   SurveySummaryDocument,
 } from "./documents.ts";
 
@@ -102,7 +101,6 @@ function failedSaying({ placement, problem }: SurveySummaryDocument): Saying {
     tone: "failed",
     short: placement?.state === "refused" ? "not registered" : "failed",
     long,
-    ...(problem ? { more: problem.detail } : {}),
   };
 }
 
@@ -224,21 +222,21 @@ export function capital(text: string): string {
 /** Why a scan was left out or what is odd about it, and what to do; docs/reasons.md has the same list. */
 export const REASONS: Record<string, [string, string]> = {
   unreadable: ["cannot be read", "write the file again"],
-  damaged: ["points as in a damaged file", "send the scan as the sensor gave it"],
+  damaged: ["looks like a damaged file", "send the scan as the sensor gave it"],
   too_few_points: ["too few points", "scan for longer"],
-  degenerate: ["its surfaces leave a motion free", "scan where there are more surfaces, in more directions"],
+  degenerate: ["too few surfaces to tell where it stands", "scan where there are more surfaces, in more directions"],
   too_little_overlap: [
     "the map covers too little of it",
     "scan more of the mapped place, or extend the map first",
   ],
   no_fit: ["lies nowhere on the map", "check that it is the right map; give a pose prior"],
   other_place: ["another place", "check that it is the right map"],
-  ambiguous: ["fits at two poses or more", "give a pose prior, or scan more of the mapped place"],
+  ambiguous: ["fits in two places or more", "give a pose prior, or scan more of the mapped place"],
   mirrored: [
     "its mirror image fits",
     "look for an axis that is turned round on the way from the sensor to the file",
   ],
-  wrong_scale: ["fits after scaling", "write metres; calibrate the sensor"],
+  wrong_scale: ["too large or too small", "write metres; calibrate the sensor"],
   other_up_axis: ["another axis is up", "write the file with z up"],
   wrong_prior: ["the given pose is far off", "send the scan without a pose, or with a better one"],
   moved_while_scanning: ["the sensor moved", "stand still while a scan is taken"],
@@ -254,28 +252,3 @@ export const REASONS: Record<string, [string, string]> = {
   no_sensor_place: ["nothing tells where the sensor stood", "write the sensor's place into the file, or send PLY or PCD"],
   clock: ["its time cannot be right", "set the device's clock"],
 };
-
-const ADVICE: Record<string, string> = {
-  no_answer:
-    "See that the service runs and the network reaches it. What was sent is kept; it goes on by itself.",
-  unauthorized: "Enter an API key; whoever runs the service makes one with `spicd keys add`.",
-  forbidden: "Ask whoever runs the service for a key that may do this, or for this map.",
-  scan_unreadable: "Write the file again as PLY, PCD, E57, LAS or LAZ and send that.",
-  too_large: "Send fewer or smaller files, or have SPICD_MAX_UPLOAD_BYTES raised.",
-  disk_full: "Delete surveys or maps that nobody needs, or have the disk enlarged; then send it again.",
-  queue_full: "Wait until some jobs are done, then send it again.",
-  not_found: "It may have been deleted. Go back to the list of maps.",
-  not_ready: "Wait for its job; a failed one says why.",
-  registration_failed: "Check that it is the right map, give pose priors, or scan more of the mapped place.",
-  internal: "Tell whoever runs the service the id of the job, or the instance that is named here.",
-};
-
-/** Return the stable code of a problem: what stands behind the last colon of its type. */
-export function codeOf(problem: ProblemDocument): string {
-  return problem.type.split(":").at(-1) ?? "";
-}
-
-/** Say what to do about a problem; empty where its detail is all that is known. */
-export function adviceOn(problem: ProblemDocument): string {
-  return ADVICE[codeOf(problem)] ?? (problem.status && problem.status >= 500 ? "Try again in a moment." : "");
-}

@@ -1,6 +1,6 @@
 /** One colour for each kind and state: those of the picture and the coloured cloud (Okabe and Ito, 2008). */
 
-import type { Kind } from "./types.ts";
+import type { Kind, Theme } from "./types.ts";
 
 /** As in `worker/pipeline/results/object_marks.py`; for CSS and for the scene. */
 export const KIND_COLOURS: Readonly<Record<string, string>> = {
@@ -18,7 +18,10 @@ export const STATE_COLOURS: Readonly<Record<string, string>> = {
 };
 
 /** Of a tile as a box: that of a changed one is no object's, so that it is not taken for what appeared. */
-export const TILE_COLOURS: Readonly<Record<string, string>> = { changed: "#808080" };
+export const TILE_COLOURS: Readonly<Record<Theme, Readonly<Record<string, string>>>> = {
+  light: { changed: "#2b3038" },
+  dark: { changed: "#b9c0c9", unchanged: "#666d76" },
+};
 
 /** Of a kind or state that this release does not know. */
 export const OTHER_COLOUR = "#999999";
@@ -29,8 +32,8 @@ export function colourOfKind(kind: Kind): string {
 }
 
 /** Return the colour of the box of a tile in that state, as CSS has it. */
-export function colourOfState(state: string): string {
-  return TILE_COLOURS[state] ?? STATE_COLOURS[state] ?? OTHER_COLOUR;
+export function colourOfState(state: string, theme: Theme): string {
+  return TILE_COLOURS[theme][state] ?? STATE_COLOURS[state] ?? OTHER_COLOUR;
 }
 
 /** Of points that moved while the visit lasted: `PointKind.MOVING` in `worker/pipeline/results/export.py`. */

@@ -27,6 +27,8 @@ export interface LoadedLayer {
   readonly drawable: boolean;
   /** Fetch and drop parts for what a camera sees. */
   update(camera: PerspectiveCamera, renderer: WebGLRenderer): void;
+  /** Take note that a frame is on the screen, with all that had come. */
+  drawn(): void;
   /** Draw what the visit saw; and, of a survey, what the map has and the survey has not. */
   show(present: boolean, lost: boolean): void;
   /** Draw a part of the points alone, 0..1. */
@@ -98,6 +100,8 @@ export class FileLayer implements LoadedLayer {
   }
 
   update(): void {}
+
+  drawn(): void {}
 
   show(present: boolean, lost: boolean): void {
     [this.#present.visible, this.#lost.visible] = [present, lost];

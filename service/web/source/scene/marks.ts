@@ -20,7 +20,7 @@ import type { DepthModes, PerspectiveCamera, Ray, WebGLRenderer } from "three";
 import { centreOf, edgesOf, entryOf, solidOf } from "./boxes.ts";
 import type { Solid } from "./boxes.ts";
 import { colourOfKind, colourOfState } from "./colours.ts";
-import type { Box, Mark, Point, TileMark } from "./types.ts";
+import type { Box, Mark, Point, Theme, TileMark } from "./types.ts";
 
 /** Halves of the split view that a box is drawn in, as bits. */
 const BEFORE = 1;
@@ -124,6 +124,7 @@ export class Marks {
   #marks: Mark[] = [];
   #tiles: TileMark[] = [];
   #selected: string | null = null;
+  #theme: Theme = "light";
   readonly #group = new Group();
   readonly #shared = { size: { value: new Vector2() }, ratio: { value: 1 }, side: { value: BOTH } };
   readonly #meshes: Mesh<InstancedBufferGeometry, RawShaderMaterial>[];
@@ -151,6 +152,11 @@ export class Marks {
 
   select(id: string | null): void {
     this.#selected = id;
+    this.#rebuild();
+  }
+
+  setTheme(theme: Theme): void {
+    this.#theme = theme;
     this.#rebuild();
   }
 
@@ -188,7 +194,9 @@ export class Marks {
   #rebuild(): void {
     const strength = (id: string) => (this.#selected === null || this.#selected === id ? 1 : DIMMED);
     const marks = this.#marks.map((mark) => partsOf(mark, strength(mark.id), mark.id === this.#selected));
-    const tiles = this.#tiles.map((tile) => partsOfTile(tile, strength(tile.id), tile.id === this.#selected));
+    const tiles = this.#tiles.map((tile) =>
+      partsOfTile(tile, colourOfState(tile.state, this.#theme), strength(tile.id), tile.id === this.#selected),
+    );
     const faces = facesOf([...tiles, ...marks].flatMap((part) => part.faces));
     const lines = linesOf([...tiles, ...marks].flatMap((part) => part.lines));
     for (const [i, mesh] of this.#meshes.entries()) {
@@ -245,9 +253,8 @@ function partsOf({ box, kind, from, muted }: Mark, strength: number, selected: b
 }
 
 /** Return what is drawn of a tile: nothing where nothing changed, else a faint box. */
-function partsOfTile({ box, state, score }: TileMark, strength: number, selected: boolean): Parts {
+function partsOfTile({ box, state, score }: TileMark, colour: string, strength: number, selected: boolean): Parts {
   if (state === "unchanged" && !selected) return { lines: [], faces: [] };
-  const colour = colourOfState(state);
   const alpha = strength * (state === "changed" ? 0.5 + 0.5 * (score ?? 0.5) : 0.5);
   const [width, fill] = selected ? [3, 0.16] : [1.2, 0.06];
   const lines = edgesOf(solidOf(box, -0.02)).map((edge) => ({ ...edge, colour, alpha, width, dashed: state !== "changed", sides: BOTH }));

@@ -9,6 +9,7 @@ import { Rig } from "./camera.ts";
 import { FileLayer, fetchWhole } from "./layers.ts";
 import type { LoadedLayer } from "./layers.ts";
 import { Marks } from "./marks.ts";
+import { Pace } from "./pace.ts";
 import { EyeDome, pointUniforms } from "./shading.ts";
 import type { Box, CloudSource, Layer, Mark, Point, SceneOptions, Shown, Theme, TileMark, View } from "./types.ts";
 
@@ -18,7 +19,6 @@ type Listener = (id: string | null) => void;
 const CLICK = 5; // CSS pixels that a pointer may go for it to be a click
 const AROUND = 1.4; // metres around what is flown to
 const REST_MS = 180; // without a change: the camera has come to rest
-const SMOOTH_MS = 40; // of a frame, aimed at while the camera moves
 const SPARED = 4; // times as long as a frame takes, between frames while tiles come
 const MOST_PIXEL_RATIO = 2;
 
@@ -43,10 +43,12 @@ export class Scene {
   #viewChosen = false;
   #frame = 0;
   #rest: ReturnType<typeof setTimeout> | undefined;
+  readonly #pace = new Pace();
   #moving = false;
-  #lastFrame = 0;
+  #movingMs = 0; // of a frame while the camera moves
   #frameMs = 0; // of a frame with all points
-  #share = 1; // of the points, while the camera moves
+  #sharpness = 1;
+  #blank = true; // no cloud has come yet, and none was refused
   #announced = false;
   #drawnAt = 0;
   #refreshing: ReturnType<typeof setTimeout> | undefined;
@@ -60,8 +62,8 @@ export class Scene {
     this.#renderer = new WebGLRenderer({ antialias: false, powerPreference: "high-performance" });
     this.#renderer.outputColorSpace = LinearSRGBColorSpace;
     this.#renderer.autoClear = false;
-    this.#renderer.setPixelRatio(Math.min(devicePixelRatio, MOST_PIXEL_RATIO));
     const canvas = this.canvas;
+    canvas.style.opacity = "0"; // it is black until the first frame
     canvas.tabIndex = 0;
     canvas.className = "scene-canvas";
     canvas.setAttribute("role", "application");
@@ -84,6 +86,15 @@ export class Scene {
 
   /** Load a cloud into a layer, in place of what was there. Rejects where it cannot be read, or was aborted. */
   async load(layer: Layer, source: CloudSource, progress: (share: number) => void, signal?: AbortSignal): Promise<void> {
+    try {
+      await this.#put(layer, source, progress, signal);
+    } finally {
+      this.#blank = false;
+      this.#invalidate();
+    }
+  }
+
+  async #put(layer: Layer, source: CloudSource, progress: (share: number) => void, signal: AbortSignal | undefined): Promise<void> {
     const ticket = {};
     this.#loading.set(layer, ticket);
     const loaded = await this.#loaded(layer, source, progress, signal);
@@ -96,7 +107,8 @@ export class Scene {
     this.#points.add(loaded.group);
     loaded.paintMoved(this.#marks.moved);
     this.#fit();
-    await loaded.ready; // a tileset asks for what the first view shows
+    loaded.update(this.#rig.camera, this.#renderer); // a tileset asks for what the first view shows
+    await loaded.ready;
     if (this.#layers.get(layer) === loaded) this.#fit();
     progress(1);
   }
@@ -177,6 +189,7 @@ export class Scene {
 
   setTheme(theme: Theme): void {
     this.#eyeDome.setTheme(theme, this.#uniforms);
+    this.#marks.setTheme(theme);
     this.#container.dataset["theme"] = theme;
     this.#invalidate();
   }
@@ -266,14 +279,20 @@ export class Scene {
   }
 
   #resize(): void {
-    const [width, height] = [Math.max(this.#container.clientWidth, 1), Math.max(this.#container.clientHeight, 1)];
-    const ratio = this.#renderer.getPixelRatio();
-    this.#renderer.setSize(width, height, false);
-    this.#eyeDome.target.setSize(Math.floor(width * ratio), Math.floor(height * ratio));
-    this.#rig.resize(this.#half("after").width, height);
-    this.#uniforms.scale.value = (height * ratio) / (2 * Math.tan(MathUtils.degToRad(this.#rig.camera.fov / 2)));
+    this.#size(1);
+    this.#rig.resize(this.#half("after").width, Math.max(this.#container.clientHeight, 1));
     if (!this.#viewChosen && this.extent !== null) this.#fit();
     this.#invalidate();
+  }
+
+  /** Have the picture as many pixels as the screen, or `sharpness` of them a side. */
+  #size(sharpness: number): void {
+    const [width, height] = [Math.max(this.#container.clientWidth, 1), Math.max(this.#container.clientHeight, 1)];
+    const ratio = Math.min(devicePixelRatio, MOST_PIXEL_RATIO) * sharpness;
+    this.#renderer.setDrawingBufferSize(width, height, ratio);
+    this.#eyeDome.target.setSize(Math.floor(width * ratio), Math.floor(height * ratio));
+    this.#uniforms.scale.value = (height * ratio) / (2 * Math.tan(MathUtils.degToRad(this.#rig.camera.fov / 2)));
+    this.#sharpness = sharpness;
   }
 
   /** Return where a half of the split view is, CSS pixels; without one: all. */
@@ -292,7 +311,7 @@ export class Scene {
   #refresh(): void {
     this.#refreshing ??= setTimeout(() => {
       this.#refreshing = undefined;
-      for (const layer of this.#layers.values()) layer.update(this.#rig.camera, this.#renderer);
+      this.#update();
       clearTimeout(this.#late);
       const wait = this.#drawnAt + SPARED * this.#frameMs - performance.now();
       if (wait > 0) this.#late = setTimeout(() => this.#invalidate(), wait);
@@ -300,44 +319,52 @@ export class Scene {
     }, 10);
   }
 
-  /** Take note that the camera moves; a while later it has come to rest. */
+  /** Take note that the camera moves; a while later, which is longer than a frame takes, it has come to rest. */
   #moved(): void {
+    if (!this.#moving) this.#pace.begins();
     this.#moving = true;
     clearTimeout(this.#rest);
     this.#rest = setTimeout(() => {
-      [this.#moving, this.#lastFrame] = [false, 0];
+      this.#moving = false;
       this.#invalidate();
       this.#emit("view", null);
-    }, REST_MS);
+    }, REST_MS + 2 * this.#movingMs);
     this.#invalidate();
   }
 
   #step(now: number): void {
     this.#frame = 0;
     const flying = this.#rig.advance();
-    if (this.#moving) this.#adapt(now);
+    const drawable = [...this.#layers.values()].some((layer) => layer.drawable);
+    if (this.#blank && !drawable) return this.#update(); // a frame of nothing would hold up what is on its way
+    const moving = this.#moving;
     this.#draw();
-    if (!this.#announced && [...this.#layers.values()].some(({ drawable }) => drawable)) this.#announce();
+    if (!this.#announced && drawable) this.#announce();
+    for (const layer of this.#layers.values()) layer.drawn();
+    requestAnimationFrame((next) => this.#took(next - now, moving));
     if (flying) this.#invalidate();
   }
 
-  /** Draw fewer points where frames take long, and more where there is time. */
-  #adapt(now: number): void {
-    const took = now - this.#lastFrame;
-    if (this.#lastFrame > 0 && took < 1000) {
-      if (took > 1.4 * SMOOTH_MS) this.#share = Math.max(this.#share * 0.7, 0.02);
-      else if (took < 0.6 * SMOOTH_MS) this.#share = Math.min(this.#share * 1.15, 1);
+  /** Take note how long it was until a further frame could be drawn, milliseconds. */
+  #took(ms: number, moving: boolean): void {
+    if (!moving) this.#frameMs = ms;
+    else {
+      this.#movingMs = ms;
+      this.#pace.took(ms);
     }
-    this.#lastFrame = now;
+  }
+
+  #update(): void {
+    for (const layer of this.#layers.values()) layer.update(this.#rig.camera, this.#renderer);
   }
 
   #draw(): void {
-    const { camera } = this.#rig;
+    const [share, sharpness] = this.#moving ? [this.#pace.share, this.#pace.sharpness] : [1, 1];
+    if (sharpness !== this.#sharpness) this.#size(sharpness);
     this.#rig.clip();
-    for (const layer of this.#layers.values()) {
-      layer.thin(this.#moving ? this.#share : 1);
-      layer.update(camera, this.#renderer);
-    }
+    for (const layer of this.#layers.values()) layer.thin(share);
+    this.#update();
+    this.canvas.style.opacity = "";
     this.#eyeDome.grain = Math.max(0, ...[...this.#layers.values()].map(({ spacing }) => spacing));
     this.#drawnAt = performance.now();
     for (const half of this.#shown === "split" ? (["before", "after"] as const) : [null]) this.#drawHalf(half);
@@ -375,7 +402,6 @@ export class Scene {
     const gl = this.#renderer.getContext();
     gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4));
     this.#frameMs = performance.now() - began;
-    this.#share = MathUtils.clamp(SMOOTH_MS / Math.max(this.#frameMs, 1), 0.05, 1);
     this.#emit("drawn", null);
   }
 

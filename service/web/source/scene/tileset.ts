@@ -1,5 +1,6 @@
 /** A layer of 3D Tiles 1.1 (OGC 22-025r4): GLB points, of which as many are fetched as the eye can tell apart. */
 
+import { Scheduler } from "3d-tiles-renderer/core";
 import { TilesRenderer } from "3d-tiles-renderer/three";
 import { Box3, BufferAttribute, BufferGeometry, Group, Loader, Matrix4, Points, Vector3 } from "three";
 import type { Object3D, PerspectiveCamera, RawShaderMaterial, WebGLRenderer } from "three";
@@ -16,14 +17,25 @@ import type { Box, CloudSource, Layer } from "./types.ts";
 
 const NEIGHBOURS = 2.2; // pixels between points where all has come that is wanted
 const COARSE = 12; // pixels of a point while more is on its way
+const AT_ONCE = 4; // contents under way; a browser has six connections to a host, and the page asks for other things too
 /** Bytes of a picture of linear ones, which glTF has (Section 3.7.2.1). */
 const SRGB = Uint8Array.from({ length: 256 }, (_, byte) => 255 * encoded(byte / 255) + 0.5);
 
+/** Has the queues of the tiles' renderer go on between frames, which are far apart where the processor draws them. */
+const BETWEEN_FRAMES = { requestAnimationFrame: (done: () => void) => setTimeout(done), cancelAnimationFrame: (handle: number) => clearTimeout(handle) };
+
 interface Tile {
   geometricError: number;
+  content?: { uri?: string };
+  children?: Tile[];
 }
 
-/** Open a tileset. Resolves once its extent is known; rejects where it cannot be had. */
+/**
+ * Open a tileset. Resolves once its extent is known; rejects where it cannot be had.
+ *
+ * Until its coarsest points have been drawn nothing else is asked for: they are of all of the cloud, and whatever came
+ * beside them would have the first picture wait. Then what is finer comes, where it is missed most: by its error on the screen.
+ */
 export async function openTileset(
   source: CloudSource,
   layer: Layer,
@@ -32,9 +44,15 @@ export async function openTileset(
   changed: () => void,
   signal: AbortSignal | undefined,
 ): Promise<TilesetLayer> {
+  Scheduler.setXRSession(BETWEEN_FRAMES as unknown as XRSession);
   const tiles = new TilesRenderer(new URL(source.url, document.baseURI).href);
   tiles.manager.addHandler(/\.glb$/, new PointsLoader(layer, uniforms));
   tiles.registerPlugin({ name: "fetch", fetchData: (url: string, options: RequestInit) => fetched(url, options) });
+  tiles.downloadQueue.maxJobsPerOrigin = AT_ONCE;
+  tiles.maxDepth = 1;
+  tiles.addEventListener("load-tileset", () => {
+    if (tiles.maxDepth < Infinity) tiles.maxDepth = levelsToPoints(tiles.root as Tile | null);
+  });
   signal?.addEventListener("abort", () => tiles.dispose(), { once: true });
   await new Promise<void>((resolve, reject) => {
     tiles.addEventListener("load-root-tileset", () => resolve());
@@ -80,10 +98,11 @@ export class TilesetLayer implements LoadedLayer {
   readonly #tiles: TilesRenderer;
   readonly #parts = { value: 3 };
   readonly #cap = { value: COARSE };
+  readonly #changed: () => void;
   #share = 1;
 
   constructor(tiles: TilesRenderer, source: CloudSource, changed: () => void) {
-    this.#tiles = tiles;
+    [this.#tiles, this.#changed] = [tiles, changed];
     const matrix = matrixOf(source);
     this.bounds = transformed(rootBox(tiles), matrix);
     this.levels = { floor: this.bounds.min[2], ceiling: null };
@@ -107,11 +126,18 @@ export class TilesetLayer implements LoadedLayer {
     this.#tiles.setResolution(camera, canvas.width, canvas.height);
     this.#tiles.errorTarget = (NEIGHBOURS * renderer.getPixelRatio()) / Math.sqrt(this.#share);
     this.#tiles.update();
-    this.#cap.value = this.#tiles.loadProgress < 1 ? COARSE : Math.max(1.6 * this.#tiles.errorTarget, 2);
+    this.#cap.value = this.#coarse || this.#tiles.loadProgress < 1 ? COARSE : Math.max(1.6 * this.#tiles.errorTarget, 2);
   }
 
+  drawn(): void {
+    if (!this.drawable || !this.#coarse) return;
+    this.#tiles.maxDepth = Infinity;
+    this.#changed();
+  }
+
+  /** Tiles come and go by halves of the share, for those of a share that wavers would flicker. */
   thin(share: number): void {
-    this.#share = share;
+    this.#share = 2 ** Math.round(Math.log2(share));
   }
 
   show(present: boolean, lost: boolean): void {
@@ -123,6 +149,11 @@ export class TilesetLayer implements LoadedLayer {
 
   dispose(): void {
     this.#tiles.dispose();
+  }
+
+  /** Whether the coarsest points alone are asked for. */
+  get #coarse(): boolean {
+    return this.#tiles.maxDepth < Infinity;
   }
 
   /** Say of the points of a tile that has come how large they are. */
@@ -150,6 +181,13 @@ export class TilesetLayer implements LoadedLayer {
     this.spacing = this.spacing === 0 ? spacing : Math.min(this.spacing, spacing);
     return spacing;
   }
+}
+
+/** Return how many levels of a tree lead to its first points: above them are tiles of no content, or of a further tileset. */
+function levelsToPoints(root: Tile | null): number {
+  let levels = 1;
+  for (let tile = root; tile !== null && !/\.glb\b/.test(tile.content?.uri ?? ""); levels++) tile = tile.children?.[0] ?? null;
+  return levels;
 }
 
 /** Return the upright box around the root, in the tileset's frame. Throws an Error where there is none. */

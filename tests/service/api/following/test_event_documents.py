@@ -33,6 +33,9 @@ def test_every_type_has_a_schema() -> None:
 def test_what_is_told_keeps_to_its_schema(client: TestClient, catalog: Catalog) -> None:
     add_map(catalog)
     kept, _ = add_survey(catalog, [tile(0, 0)], captured_at=NOON, objects=[thing(1, now=place(1, 1))])
+    later = NOON + timedelta(hours=1)
+    again, _ = add_survey(catalog, [tile(0, 0)], captured_at=later, objects=[thing(1, now=place(1, 1))])
+    assert client.delete(f"/surveys/{again}").status_code == 204
     gone, _ = add_survey(catalog, [tile(1, 0)], captured_at=NOON + timedelta(days=1), objects=[])
     assert client.delete(f"/surveys/{gone}").status_code == 204
     assert client.delete(f"/surveys/{kept}").status_code == 204
@@ -53,8 +56,10 @@ def test_what_is_told_keeps_to_its_schema(client: TestClient, catalog: Catalog) 
         "survey.failed",
         "survey.deleted",
         "change.told",
+        "change.updated",
         "change.withdrawn",
         "object.told",
+        "object.updated",
         "object.withdrawn",
         "map.deleted",
     }

@@ -12,7 +12,9 @@ from sqlalchemy import select, update
 
 from service.catalog.catalog import Catalog, open_catalog
 from service.catalog.findings import history
-from service.catalog.records import ObjectRecord
+from service.catalog.findings.objects import ObjectFilter, SightingFilter
+from service.catalog.following.events import FeedCursor
+from service.catalog.records import MapObjectRecord, Motion, ObjectRecord, SightingRecord, TileRecord
 from service.catalog.sql import tables
 from service.settings import Settings
 from tests.support.samples import NOON, add_map, add_survey, add_version, place, thing, tile
@@ -208,6 +210,140 @@ def test_maps_do_not_share_objects(catalog: Catalog) -> None:
     assert ours != theirs
     catalog.maps.delete("hall")
     assert list(rows(catalog)) == [ours]
+
+
+# what moved, and is told in part
+
+
+OLD_PLACE, NEW_PLACE = (
+    tile(4, 2, "unchanged", 0.1, observed_share=0.9),
+    tile(4, 0, "unchanged", 0.1, observed_share=0.9),
+)
+MOVED = thing(1, now=DESK, before=DESK_BEFORE)
+HERE, GONE = thing(1, now=DESK, probability=0.7), thing(2, before=DESK_BEFORE, probability=0.6)
+
+
+def short_visit(catalog: Catalog, day: int, *objects: ObjectRecord, looked: Sequence[TileRecord]) -> str:
+    """A survey of a day that looked at some tiles alone; its id."""
+    at = NOON + timedelta(days=day)
+    return add_survey(catalog, list(looked), captured_at=at, objects=objects, moving=0)[0]
+
+
+def only(catalog: Catalog) -> tuple[MapObjectRecord, tuple[SightingRecord, ...]]:
+    """The one object of the map as the list has it, and its history; its own document tells the same."""
+    (listed,) = catalog.objects.page(ObjectFilter(map_id="lobby")).items
+    record, history = catalog.objects.get("lobby", listed.object_id)
+    assert record == listed
+    assert len(history) == record.sightings
+    return record, history
+
+
+@pytest.mark.parametrize("late", [False, True])
+@pytest.mark.parametrize(
+    ("objects", "looked", "kind", "told"),
+    [
+        ([HERE], [NEW_PLACE], "moved", "appeared"),
+        ([HERE], LOOKED, "appeared", "appeared"),
+        ([GONE], [OLD_PLACE], "moved", "disappeared"),
+        ([GONE], LOOKED, "disappeared", "disappeared"),
+        ([HERE, GONE], LOOKED, "moved", "moved"),
+        ([HERE, GONE], [], "moved", "moved"),
+        ([], [], "moved", None),
+        ([], LOOKED, "moved", None),
+    ],
+)
+def test_what_moved_stays_moved_where_a_visit_tells_a_part_of_it(
+    catalog: Catalog,
+    objects: Sequence[ObjectRecord],
+    looked: Sequence[TileRecord],
+    kind: str,
+    told: str | None,
+    late: bool,
+) -> None:
+    add_map(catalog)
+    at = NOON + timedelta(days=1)
+    first, job_id = add_survey(catalog, captured_at=at, ready=False)
+    catalog.surveys.save_result(first, tiles=LOOKED, threshold=0.5, objects=[MOVED], moving=0)
+    if not late:
+        catalog.jobs.succeed(job_id)
+    second = short_visit(catalog, 2, *objects, looked=looked)
+    if late:
+        catalog.jobs.succeed(job_id)
+    record, history = only(catalog)
+    now, before = (DESK if kind != "disappeared" else None), (DESK_BEFORE if kind != "appeared" else None)
+    thing_now = record.latest.thing
+    assert (thing_now.kind, thing_now.now, thing_now.before) == (kind, now, before)
+    assert [(seen.survey_id, seen.thing.kind) for seen in history] == [(first, "moved")] + [
+        (second, told)
+    ] * bool(told)
+    (row,) = rows(catalog).values()
+    shown = (now or before or DESK).bounds
+    assert (row.kind, (row.min_x, row.min_y), (row.max_x, row.max_y)) == (kind, shown.min[:2], shown.max[:2])
+
+
+def test_what_is_told_of_both_sides_is_told_in_one(catalog: Catalog) -> None:
+    add_map(catalog)
+    visit(catalog, 1, MOVED)
+    survey_id = visit(
+        catalog, 2, GONE.model_copy(update={"number": 1}), HERE.model_copy(update={"number": 2})
+    )
+    record, (_, seen) = only(catalog)
+    assert record.latest == seen
+    assert (seen.thing.number, seen.thing.probability) == (2, 0.7)  # of where it is
+    motion = seen.thing.motion
+    assert motion is not None
+    assert motion.translation == pytest.approx((0, -2.4, 0))
+    assert motion.yaw is None  # nobody has compared the two places
+    of_survey = catalog.objects.of_survey(SightingFilter(survey_id=survey_id)).items
+    assert [(one.thing.kind, one.object_id) for one in of_survey] == [
+        ("disappeared", record.object_id),
+        ("appeared", record.object_id),
+    ]  # as the survey told it
+
+
+def test_the_turn_of_what_moved_is_kept_where_a_later_visit_tells_one_side(catalog: Catalog) -> None:
+    add_map(catalog)
+    turned = MOVED.model_copy(update={"motion": Motion(translation=(0, -2.4, 0), yaw=1.5)})
+    visit(catalog, 1, turned)
+    further = place(7.2, 1, size=(1.6, 0.8, 0.75))
+    short_visit(catalog, 2, thing(1, now=further), looked=[NEW_PLACE])
+    record, _ = only(catalog)
+    motion = record.latest.thing.motion
+    assert motion is not None
+    assert motion.translation == pytest.approx((0.2, -2.4, 0))
+    assert motion.yaw == 1.5
+
+
+def test_a_survey_that_is_deleted_takes_what_it_alone_told_of_a_move(catalog: Catalog) -> None:
+    add_map(catalog)
+    first = visit(catalog, 1, MOVED)
+    second = short_visit(catalog, 2, HERE, looked=[NEW_PLACE])
+    third = short_visit(catalog, 3, GONE, looked=[OLD_PLACE])
+    record, history = only(catalog)
+    assert [seen.survey_id for seen in history] == [first, second, third]
+    object_id = record.object_id
+    catalog.surveys.delete(third)
+    record, _ = only(catalog)
+    assert (record.object_id, record.latest.thing.kind, record.latest.survey_id) == (
+        object_id,
+        "moved",
+        second,
+    )
+    catalog.surveys.delete(first)  # nobody is left who saw the old place
+    record, history = only(catalog)
+    assert (record.object_id, record.latest.thing.kind, len(history)) == (object_id, "appeared", 1)
+
+
+def test_what_changes_of_a_move_is_told_once(catalog: Catalog) -> None:
+    """A visit that tells the same two sides apart says nothing new of the kind."""
+    add_map(catalog)
+    visit(catalog, 1, MOVED)
+    wanted = ObjectFilter(map_id="lobby")
+    start = catalog.objects.published(wanted, after=FeedCursor(0, 0)).cursor
+    visit(catalog, 2, HERE, GONE)
+    told = catalog.objects.published(wanted, after=start)
+    assert [(one.latest.thing.kind, one.sightings) for one in told.items] == [("moved", 2)]
+    assert told.withdrawn == ()
 
 
 # versions

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 import random
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from datetime import timedelta
@@ -218,6 +219,82 @@ def test_two_chairs_whose_pairs_are_swapped_stay_two_objects() -> None:
     first = visit(1, moved(went(0, 0), came(5, 0)), moved(went(0, 3), came(5, 3)))
     second = visit(2, moved(went(0, 0), came(5, 3)), moved(went(0, 3), came(5, 0)))
     assert [track.status for track in track_objects([first, second])] == ["still_there"] * 2
+
+
+# which sides of what moved stand
+
+
+OLD, NEW = {"office": 1.0}, {"hall": 1.0}  # tiles that a visit looked at
+DESK_ACROSS = moved(went(1, 1, DESK, "office"), came(1, 4, DESK, "hall"))
+DESK_HERE, DESK_GONE = came(1, 4, DESK, "hall"), went(1, 1, DESK, "office")
+
+
+@pytest.mark.parametrize(
+    ("seen", "observed", "sides"),
+    [
+        ([DESK_HERE], NEW, "both"),  # the old place was not looked at
+        ([DESK_HERE], EVERYWHERE, "now"),  # there stands something as in the map again
+        ([DESK_GONE], OLD, "both"),
+        ([DESK_GONE], EVERYWHERE, "before"),  # it was taken away from its new place
+        ([DESK_HERE, DESK_GONE], EVERYWHERE, "both"),
+        ([DESK_GONE, DESK_HERE], {}, "both"),
+        ([DESK_ACROSS], EVERYWHERE, "both"),
+        ([], {}, "both"),
+        ([], OLD, "both"),
+        ([], NEW, "both"),
+        ([], EVERYWHERE, "both"),  # gone again: that is what it was
+    ],
+)
+def test_what_was_not_looked_at_still_stands(
+    seen: Sequence[Parts], observed: Mapping[str, float], sides: str
+) -> None:
+    visits = [visit(1, DESK_ACROSS), visit(2, *seen, observed=observed)]
+    for order in (visits, visits[::-1]):
+        (track,) = track_objects(order)
+        assert track.sides == ({"now", "before"} if sides == "both" else {sides})
+        assert track.visits == 1 + bool(seen)
+
+
+def test_a_side_that_was_found_as_in_the_map_stays_so_where_nobody_looks() -> None:
+    visits = [visit(1, DESK_ACROSS), visit(2, observed=OLD), visit(3, DESK_HERE, observed=NEW)]
+    (track,) = track_objects(visits)
+    assert track.sides == {"now"}
+    (track,) = track_objects([*visits, visit(4, DESK_ACROSS)])
+    assert track.sides == {"now", "before"}
+
+
+def test_what_moved_is_gone_again_where_two_visits_looked_at_a_place_each() -> None:
+    visits = [visit(1, DESK_ACROSS), visit(2, observed=OLD), visit(3, observed=NEW)]
+    assert [track_objects(visits[:n])[0].status for n in (2, 3)] == ["unknown", "gone_again"]
+    (track,) = track_objects([*visits, visit(4, observed=OLD)])  # the new place was not looked at
+    assert (track.status, track.last_known) == ("unknown", "gone_again")
+
+
+def test_what_came_is_gone_again_without_a_look_at_the_place_that_is_as_in_the_map() -> None:
+    visits = [visit(1, DESK_ACROSS), visit(2, DESK_HERE), visit(3, observed=NEW)]
+    (track,) = track_objects(visits)
+    assert track.status == "gone_again"
+    assert track.sides == {"now"}
+
+
+def test_a_side_that_a_version_took_over_does_not_stand_against_it() -> None:
+    """The version has the desk in its new place, and its points in the old one too: those were not replaced."""
+    taken = [Accepted(version=2, parts=(DESK_HERE,))]
+    visits = [visit(1, DESK_ACROSS), visit(2, DESK_GONE, version=2, observed=OLD)]
+    (track,) = track_objects(visits, taken)
+    assert days(track) == [1, 2]
+    assert track.sides == {"before"}
+
+
+@pytest.mark.parametrize("swapped", [False, True])
+def test_a_thing_does_not_stand_in_two_places_at_once(swapped: bool) -> None:
+    """The desk is where it was moved to, and another one is told to have come from its old place."""
+    other = moved(went(1, 1, DESK), came(6, 4, DESK))
+    seen = [other, came(1, 4, DESK)]
+    visits = [visit(1, DESK_MOVED), visit(2, *(seen[::-1] if swapped else seen)), visit(3, DESK_MOVED)]
+    first, second = track_objects(visits)
+    assert (days(first), days(second)) == ([1, 2, 3], [2])
+    assert [one.parts.keys() for _, one in first.sightings][1] == {"now"}
 
 
 # side by side, and alike or not
@@ -450,6 +527,9 @@ def test_every_sighting_is_of_one_object_and_every_object_has_one_id(seed: int) 
     assert told(again) == told(expected)
     assert gathered(again) == gathered(expected)
     assert all(track.object_id for track in again)
+    for track in expected:
+        told_sides = Counter((seen.survey_id, side) for seen, one in track.sightings for side in one.parts)
+        assert max(told_sides.values()) == 1
 
 
 def test_no_visits_have_no_objects() -> None:

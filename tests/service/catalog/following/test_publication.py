@@ -14,6 +14,7 @@ from sqlalchemy import select
 
 from service.catalog.catalog import Catalog, open_catalog
 from service.catalog.findings.changes import ChangeFilter
+from service.catalog.following.deliveries import Outcome
 from service.catalog.following.events import EventFilter, FeedCursor
 from service.catalog.following.publication import tell
 from service.catalog.records import ChangeRecord, EventRecord, EventType, ObjectRecord, Problem, TileState
@@ -222,6 +223,48 @@ def test_a_change_that_stays_over_six_surveys_is_published_once(catalog: Catalog
     assert len({change_id for change_id, _ in seen}) == 1
     assert [updated for _, updated in seen] == [False, *[True] * 5]
     assert (types(catalog).count("change.told"), types(catalog).count("change.updated")) == (1, 5)
+
+
+def delivered(catalog: Catalog, webhook_id: str) -> list[str]:
+    """Take what a webhook has to get; its events in short."""
+    got = []
+    while webhook_id in catalog.deliveries.due():
+        task = catalog.deliveries.claim(webhook_id)
+        assert task is not None
+        assert task.event is not None
+        got.append(task.event.type + " only_times" * bool(task.event.data.get("only_times")))
+        assert catalog.deliveries.record(task, Outcome(answered=204))
+    return got
+
+
+def test_a_webhook_that_names_no_types_is_not_told_that_all_is_as_it_was(shared: Settings) -> None:
+    catalog = open_catalog(shared)
+    add_map(catalog)
+    named: list[EventType] = ["change.updated", "object.updated"]
+    every, some = (
+        catalog.webhooks.add("https://a.org", types=types)[0].webhook_id for types in (None, named)
+    )
+    box = thing(1, now=place(1, 1))
+    again = ["change.updated only_times", "object.updated only_times"]
+
+    def after_visit(day: int, score: float, one: ObjectRecord) -> tuple[list[str], list[str]]:
+        seen = [tile(0, 0, score=score, observed_share=0.9)]
+        add_survey(catalog, seen, captured_at=NOON + timedelta(days=day), objects=[one], moving=0)
+        got = delivered(catalog, every)
+        return [one for one in got if one.split(".")[0] in ("change", "object")], delivered(catalog, some)
+
+    assert after_visit(1, 0.9, box) == (["change.told", "object.told"], [])
+    new_to_still = ["object.updated"]  # its status is `still_there` by now
+    assert after_visit(2, 0.901, box) == (new_to_still, [again[0], *new_to_still])
+    assert after_visit(3, 0.8, box) == ([], again)
+    assert after_visit(4, 0.95, box) == (["change.updated"], ["change.updated", again[1]])
+    further = thing(1, now=place(1.2, 1))
+    assert after_visit(5, 0.95, further) == (["object.updated"], [again[0], "object.updated"])
+    assert after_visit(0, 0.9, box) == (  # late: both were seen first a day earlier
+        ["change.updated", "object.updated"],
+        ["change.updated", "object.updated"],
+    )
+    catalog.close()
 
 
 def test_a_visit_that_is_uploaded_late_is_published_after_the_later_one(catalog: Catalog) -> None:

@@ -9,6 +9,7 @@ import {
   filterWords,
   NO_FILTERS,
   periodWords,
+  setFilters,
   tally,
   toggled,
   wholeDay,
@@ -102,7 +103,21 @@ test("what is filtered by is said", () => {
   const filters = { ...NO_FILTERS, kinds: ["moved", "appeared"], since: "monday", minScore: 0.5 };
   assert.equal(
     filterWords({ ...filters, device: "robot-7" }, THURSDAY),
-    "moved or appeared, first seen since Mon 2 Mar, by robot-7, at least 50 %",
+    "moved or appeared, first seen since Mon 2 Mar, device robot-7, at least 50 %",
+  );
+});
+
+test("each filter that is set says what it lets through, and is taken away alone", () => {
+  const filters = { ...NO_FILTERS, kinds: ["moved"], since: "2026-03-03", inSection: true };
+  const set = setFilters(filters, THURSDAY);
+  assert.deepEqual(
+    set.map(({ words }) => words),
+    ["moved", "first seen since Tue 3 Mar", "at the heights that are shown"],
+  );
+  assert.deepEqual({ ...filters, ...set[1]!.without }, { ...filters, since: "" });
+  assert.deepEqual(
+    set.reduce((rest, { without }) => ({ ...rest, ...without }), filters),
+    NO_FILTERS,
   );
 });
 

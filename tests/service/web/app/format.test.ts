@@ -7,6 +7,7 @@ import {
   count,
   extent,
   height,
+  heights,
   instant,
   metres,
   ordinal,
@@ -53,4 +54,9 @@ test("instants are told in local time, and how long ago", () => {
     ].map((text) => ago(text, NOW)),
     ["just now", "40 min ago", "5 h ago", "a day ago", "13 days ago", "in the future"],
   );
+});
+
+test("heights of a section are told to the centimetre, and without zeros that say nothing", () => {
+  assert.equal(heights([0, 1.0349]), "0 to 1.03 m");
+  assert.equal(heights([-0.05, 2.5]), "−0.05 to 2.5 m");
 });

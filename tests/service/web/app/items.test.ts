@@ -6,6 +6,7 @@ import {
   itemOfObject,
   itemOfSighting,
   itemOfTile,
+  joinSides,
   kindOfTile,
   markOf,
   tileMarkOf,
@@ -39,6 +40,20 @@ test("what moved is marked where it is and where it was; what is gone again is m
   assert.deepEqual(moved.from, boxOf(box(2, 3)));
   assert.equal(moved.muted, undefined);
   assert.equal(markOf(itemOfObject(object({ status: "gone_again" }))).muted, true);
+});
+
+test("two places that a survey told of one object are one item, which moved", () => {
+  const here = itemOfSighting(sighting({ now: box(5, 5), before: null }));
+  const gone = itemOfSighting(sighting({ kind: "disappeared", now: null, before: box(2, 3) }));
+  const another = itemOfSighting(sighting({ object_id: "object-2" }));
+  for (const told of [
+    [here, another, gone],
+    [gone, another, here],
+  ]) {
+    const [item, ...others] = joinSides(told);
+    assert.deepEqual(item, { ...here, kind: "moved", from: boxOf(box(2, 3)) });
+    assert.deepEqual(others, [another]);
+  }
 });
 
 test("what disappeared is where it was", () => {

@@ -3,7 +3,6 @@ import { test } from "node:test";
 
 import type { JobDocument } from "../../../../service/web/source/app/documents.ts";
 import {
-  adviceOn,
   coverage,
   isCompared,
   nothingChanged,
@@ -129,9 +128,4 @@ test("a status is told in the words of the kind: what disappeared is not still t
   for (const kind of ["appeared", "disappeared", "moved"])
     assert.equal(statusOf("unknown", kind), "Not looked at since");
   assert.match(whyStatus("unknown", "moved", looked), /latest survey that could be compared did not$/);
-});
-
-test("problems come with what to do", () => {
-  assert.match(adviceOn({ type: "urn:spicd:problem:disk_full", title: "", detail: "" }), /Delete surveys/);
-  assert.equal(adviceOn({ type: "urn:spicd:problem:conflict", title: "", detail: "", status: 409 }), "");
 });

@@ -13,7 +13,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from pye57 import libe57
 from scipy.spatial.transform import Rotation
 
-from tests.support.clouds import split_xml, with_xml, write_e57, write_e57_nodes
+from tests.support.clouds import damage_station, split_xml, with_xml, write_e57, write_e57_nodes
 from worker.cloud.formats.apart import stations_of
 from worker.cloud.formats.scan import Scan, read_scan
 from worker.cloud.poses import translation
@@ -71,6 +71,24 @@ def test_a_station_at_a_time_is_read_of_several_and_none_without_a_number(tmp_pa
     with pytest.raises(ScanTooLarge, match="2 scans declare 3000 points together, the limit is 2000"):
         read(path, max_points=2000)
     assert [file.station for file in files_of(path)] == [0, 1]
+
+
+def test_a_station_that_cannot_be_read_leaves_the_others(tmp_path):
+    path = write_e57(tmp_path / "hall.e57", [room(0), room(1)], poses=[pose_of(0, 0), pose_of(4, 30)])
+    damage_station(path, 0)
+    assert_array_equal(read(path, station=1).points, room(1).astype("f"))
+    with pytest.raises(ScanError, match="its points are damaged"):
+        read(path, station=0)
+
+
+def test_a_station_that_declares_what_cannot_be_leaves_the_others(tmp_path):
+    sound = [room(0)[:1400], room(1)]
+    path = write_e57(tmp_path / "hall.e57", sound, poses=[pose_of(0, 0), pose_of(4, 30)])
+    with_words(path, b'recordCount="1400"', b'recordCount="9999"')
+    assert [(one.name, one.n) for one in stations_of(path)] == [("station 1", 0), ("station 2", N)]
+    assert_array_equal(read(path, station=1).points, room(1).astype("f"))
+    with pytest.raises(ScanError, match="scan 1 declares 9999 points"):
+        read(path, station=0)
 
 
 def test_a_real_room_is_the_same_as_e57(shared_data, tmp_path):

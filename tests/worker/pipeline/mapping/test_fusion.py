@@ -1,6 +1,9 @@
 from __future__ import annotations
 
 import functools
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,9 +12,12 @@ from tests.support.tilings import grid_of
 from worker.cloud.types import Colors, Floats
 from worker.cloud.voxels import Voxels
 from worker.errors import MapFailed
+from worker.pipeline.flow import fused_scans
 from worker.pipeline.mapping.fusion import current_map, fuse, reference_map
 from worker.pipeline.registration.results import RegisteredScan
 from worker.pipeline.registration.settings import RegistrationSettings
+from worker.pipeline.settings import PipelineSettings
+from worker.progress import no_progress
 
 SETTINGS = RegistrationSettings()
 
@@ -63,7 +69,7 @@ def test_fusing_many_scans_gives_what_merging_them_one_by_one_gives(count: int) 
     assert fused.counts.tolist() == one_by_one.counts.tolist()
     assert fused.counts.sum() == sum(len(scan.points) for scan in scans)
     assert fused.points == pytest.approx(one_by_one.points, abs=1e-6)
-    assert fused.views == pytest.approx(one_by_one.views, abs=1e-9)
+    assert fused.views == pytest.approx(one_by_one.views.astype(np.float32), abs=1e-9)
 
 
 def test_no_scan_makes_no_map() -> None:
@@ -122,3 +128,24 @@ def test_colours_are_kept_only_where_every_scan_has_them() -> None:
     assert current_map(fuse([scan_of(floor(), colors=colors)], voxel_size=0.05)).colors is not None
     mixed = [scan_of(floor(), colors=colors), scan_of(floor())]
     assert current_map(fuse(mixed, voxel_size=0.05)).colors is None
+
+
+def test_what_fusing_may_hold_is_a_setting_and_the_map_does_not_depend_on_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    rng = np.random.default_rng(5)
+    scans = [scan_of(rng.uniform([number - 1, -1, -1], [number + 1, 1, 1], (4000, 3))) for number in range(5)]
+    written: list[int] = []
+
+    def watched() -> Iterator[RegisteredScan]:
+        for scan in scans:
+            yield scan
+            written.append(len(list(tmp_path.rglob("run-*"))))
+
+    tight = PipelineSettings(memory_bytes=200_000)
+    fused = fused_scans(watched(), len(scans), tight, no_progress)
+    assert written[-1] > 1
+    whole = fuse(scans, voxel_size=tight.registration.voxel_size)
+    assert fused.keys.tolist() == whole.keys.tolist()
+    assert fused.points == pytest.approx(whole.points, abs=1e-6)

@@ -3,13 +3,15 @@
 import { Fragment, h } from "preact";
 
 import { active, daysOf, filtered, filterWords, NO_FILTERS, PERIODS, periodWords, tally, toggled, wholeDay, withHigh, withLow, type Filters } from "../filters.ts";
-import type { SurveySummaryDocument } from "../documents.ts";
-import { ago, count, instant, percent } from "../format.ts";
+import type { ProblemDocument, SurveySummaryDocument } from "../documents.ts";
+import { ago, count, deviceWords, instant, percent } from "../format.ts";
 import { whereOf, type Item } from "../items.ts";
+import { plainOf } from "../problems.ts";
 import { allItems, focusOf, jobOf, listedSurvey, sectionOf, shownItems, type State } from "../state.ts";
 import { isCompared, KINDS, sayingOf, STATUSES, statusOf } from "../words.ts";
 import { newUpload, type Props } from "./page.tsx";
-import { Empty, Kind, Problem, Waiting } from "./parts.tsx";
+import { closedByEscape, openFilters } from "./panels.ts";
+import { Empty, Folded, Kind, Problem, Waiting } from "./parts.tsx";
 
 const MOST_DAYS = 12; // of visits that are offered to filter by
 
@@ -32,6 +34,8 @@ export function Changes(props: Props) {
         <button
           aria-expanded={state.filtersOpen}
           aria-controls="filters"
+          id="filters-button"
+          title="Filter by kind, time, place and more (/)"
           onClick={() => app.update({ filtersOpen: !state.filtersOpen })}
         >
           {set ? `Filters (${set})` : "Filters"}
@@ -122,8 +126,8 @@ function Row({ item, chosen, choose }: { item: Item; chosen: boolean; choose: ()
         )}
         {item.history?.transient && <span class="status">comes and goes</span>}
         <span title={`change first seen ${ago(item.firstSeen)}`}>since {instant(item.firstSeen)}</span>
+        {item.device && <span>{deviceWords(item.device)}</span>}
         <span>{whereOf(item)}</span>
-        {item.device && <span>{item.device}</span>}
       </span>
     </li>
   );
@@ -183,10 +187,24 @@ function NothingYet({ app, state }: Pick<Props, "app" | "state">) {
       title={place.survey ? long : `The latest survey with a result, ${instant(survey.captured_at)}: ${long}`}
     >
       {more && <p>{more}</p>}
+      {survey.problem && <Why problem={survey.problem} />}
       {survey.status === "failed" && (
         <button onClick={() => app.go({ survey: survey.survey_id, tab: "survey" })}>Why, scan by scan</button>
       )}
     </Empty>
+  );
+}
+
+/** Say why a survey failed: plainly where that is known, with the service's own words folded beneath. */
+function Why({ problem }: { problem: ProblemDocument }) {
+  const [, ...reasons] = plainOf(problem) ?? ["", problem.detail];
+  return (
+    <>
+      {reasons.map((line) => (
+        <p>{line}</p>
+      ))}
+      {plainOf(problem) && <Folded>{problem.detail}</Folded>}
+    </>
   );
 }
 
@@ -205,7 +223,12 @@ function FilterForm({ app, state }: Props) {
   const visits = daysOf((state.surveys.value ?? []).map(({ captured_at }) => captured_at)).slice(0, MOST_DAYS);
   const devices = tally((state.surveys.value ?? []).map(({ device_id }) => device_id)).map(([name]) => name);
   return (
-    <form id="filters" class="filters" onSubmit={(event) => event.preventDefault()}>
+    <form
+      id="filters"
+      class="filters"
+      onSubmit={(event) => event.preventDefault()}
+      onKeyDown={(event) => closedByEscape(event, () => openFilters(app, false))}
+    >
       <Choices
         legend="Kind"
         chosen={filters.kinds}

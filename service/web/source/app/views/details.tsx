@@ -3,14 +3,14 @@
 import { Fragment, h } from "preact";
 
 import type { SightingProperties, TileProperties } from "../documents.ts";
-import { ago, count, instant, metres, percent } from "../format.ts";
+import { ago, count, deviceWords, instant, metres, percent } from "../format.ts";
 import { whereOf, type Item } from "../items.ts";
 import type { Show } from "../link.ts";
 import { lookedAt } from "../stage.ts";
 import { focusOf, showOf, type Look } from "../state.ts";
 import { KINDS, statusOf, TILE_STATES, whyStatus } from "../words.ts";
 import { follow, type Props } from "./page.tsx";
-import { Empty, Fact, Kind, Problem, Share, Waiting } from "./parts.tsx";
+import { Empty, Fact, Kind, Meanings, Problem, Share, Waiting } from "./parts.tsx";
 
 /** Share of a place that a survey has to see to say that something is gone (service/catalog/tracking.py). */
 const ENOUGH = 0.5;
@@ -151,7 +151,7 @@ function AboutObject({ app, item }: Props & { item: Item }) {
         <SurveyLink app={app} id={item.surveyId}>
           {instant(seen.captured_at)}
         </SurveyLink>
-        {seen.device_id && `, ${seen.device_id}`}
+        {seen.device_id && `, ${deviceWords(seen.device_id)}`}
       </Fact>
       <Fact name="Compared">
         with version {seen.map_version}, by {seen.model}
@@ -212,6 +212,13 @@ function AboutTile({ app, tile }: { app: Props["app"]; tile: TileProperties }) {
   );
 }
 
+const TILE_COLUMNS: readonly (readonly [string, string])[] = [
+  ["Score", "probability that something in the tile changed"],
+  ["Seen", "share of the tile that the survey could judge"],
+  ["+", "voxels that appeared"],
+  ["−", "voxels that disappeared"],
+];
+
 /** The tiles that an object lies in, as the latest survey which saw it tells them. */
 function Tiles({ app, state, item }: Props & { item: Item }) {
   const { value } = state.looks;
@@ -223,10 +230,9 @@ function Tiles({ app, state, item }: Props & { item: Item }) {
         <thead>
           <tr>
             <th>Tile</th>
-            <th>Score</th>
-            <th>Seen</th>
-            <th title="voxels that appeared">+</th>
-            <th title="voxels that disappeared">−</th>
+            {TILE_COLUMNS.map(([word, meaning]) => (
+              <th title={meaning}>{word}</th>
+            ))}
           </tr>
         </thead>
         <tbody>
@@ -239,6 +245,7 @@ function Tiles({ app, state, item }: Props & { item: Item }) {
           ))}
         </tbody>
       </table>
+      <Meanings of={TILE_COLUMNS} />
     </section>
   );
 }
@@ -302,7 +309,8 @@ function History({ app, state, item }: Props & { item: Item }) {
 }
 
 function sawIt(seen: SightingProperties): string {
-  const words = [(KINDS[seen.kind] ?? seen.kind).toLowerCase(), percent(seen.probability), seen.device_id];
+  const device = seen.device_id && deviceWords(seen.device_id);
+  const words = [(KINDS[seen.kind] ?? seen.kind).toLowerCase(), percent(seen.probability), device];
   return words.filter(Boolean).join(", ");
 }
 

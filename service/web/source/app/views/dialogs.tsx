@@ -79,7 +79,7 @@ function Help({ app, state, close }: Pick<Props, "app" | "state"> & { close: () 
       </p>
       <div class="row end">
         <ThemeButton app={app} state={state} always />
-        <button class="primary" onClick={close}>
+        <button class="primary" autofocus onClick={close}>
           Close
         </button>
       </div>

@@ -1,13 +1,14 @@
 /** The page: its head, the list of maps or one map, and what lies over it. */
 
-import { h } from "preact";
+import { Fragment, h } from "preact";
 
 import type { Controller } from "../controller.ts";
 import { shownTheme, type Stage } from "../stage.ts";
-import type { State, Theme } from "../state.ts";
+import { placeOf, type Notice, type State, type Theme } from "../state.ts";
 import { Dialogs } from "./dialogs.tsx";
 import { MapPage } from "./map.tsx";
 import { MapsPage } from "./maps.tsx";
+import { Names } from "./parts.tsx";
 import { UploadDialog } from "./upload.tsx";
 
 export interface Props {
@@ -19,17 +20,48 @@ export interface Props {
 export function Page(props: Props) {
   const { state } = props;
   return (
-    <div class={`page ${state.place.embed ? "embedded" : ""}`}>
-      <a class="skip" href="#main" onClick={(event) => focusMain(event)}>
-        Skip to the content
-      </a>
-      <Head {...props} />
-      {state.place.map ? <MapPage {...props} /> : <MapsPage {...props} />}
-      <div class="notices" role="status" aria-live="polite">
-        {state.notice && <p class={`notice ${state.notice.tone}`}>{state.notice.text}</p>}
+    <Names.Provider value={namesOf(state)}>
+      <div class={`page ${state.place.embed ? "embedded" : ""}`}>
+        <a class="skip" href="#main" onClick={(event) => focusMain(event)}>
+          Skip to the content
+        </a>
+        <Head {...props} />
+        {state.place.map ? <MapPage {...props} /> : <MapsPage {...props} />}
+        <div class="notices" role="status" aria-live="polite">
+          {state.notice && <Said app={props.app} notice={state.notice} />}
+        </div>
+        <UploadDialog {...props} />
+        <Dialogs {...props} />
       </div>
-      <UploadDialog {...props} />
-      <Dialogs {...props} />
+    </Names.Provider>
+  );
+}
+
+/** Return the names of files by the ids of their scans: of those that were looked at, and of those just sent. */
+function namesOf({ names, upload }: State): Record<string, string> {
+  const sent = upload?.files.filter(({ scan }) => scan).map(({ scan, name }) => [scan, name]) ?? [];
+  return { ...names, ...Object.fromEntries(sent) };
+}
+
+/** What is said for a while; of a survey with the way to it. */
+function Said({ app, notice: { text, tone, to } }: { app: Controller; notice: Notice }) {
+  const show = () => {
+    app.unsay();
+    app.go({ ...(to!.map === app.state.place.map ? {} : placeOf(to!.map)), survey: to!.survey, item: null, tab: "survey" });
+  };
+  return (
+    <div class={`notice ${tone}`}>
+      <span>{text}</span>
+      {to && (
+        <>
+          <a href={`#map=${to.map}&survey=${to.survey}&tab=survey`} onClick={(event) => follow(event, show)}>
+            Show it
+          </a>
+          <button class="small" aria-label="Close this message" onClick={() => app.unsay()}>
+            ✕
+          </button>
+        </>
+      )}
     </div>
   );
 }

@@ -1,25 +1,36 @@
 /** Small parts that every view uses. */
 
-import { Fragment, h, type ComponentChildren } from "preact";
+import { createContext, Fragment, h, type ComponentChildren } from "preact";
 
 import type { Controller } from "../controller.ts";
 import type { ProblemDocument, ScanWarning } from "../documents.ts";
 import { percent } from "../format.ts";
-import { adviceOn, capital, REASONS } from "../words.ts";
+import { adviceOn, plainOf, withNames } from "../problems.ts";
+import { capital, REASONS } from "../words.ts";
 
-/** Show an error in the service's own words, and what to do about it. */
+/** Names of files by the ids of their scans, for the service's sentences, which have the ids. */
+export const Names = createContext<Readonly<Record<string, string>>>({});
+
+/** Show an error in plain words, or in the service's where those are plain, and what to do about it. */
 export function Problem({ problem, again }: { problem: ProblemDocument; again?: () => void }) {
   const advice = adviceOn(problem);
+  const plain = plainOf(problem);
+  const [title, ...more] = plain ?? [problem.title];
+  const detail = <Names.Consumer>{(names) => withNames(problem.detail, names)}</Names.Consumer>;
   return (
     <div class="problem" role="alert">
-      <strong>{problem.title}</strong>
-      <p>{problem.detail}</p>
+      <strong>{title}</strong>
+      {more.map((line) => (
+        <p>{line}</p>
+      ))}
+      {!plain && <p>{detail}</p>}
       {problem.errors?.map(({ place, detail }) => (
         <p>
           <code>{place}</code>: {detail}
         </p>
       ))}
       {advice && <p class="advice">{advice}</p>}
+      {plain && <Folded>{detail}</Folded>}
       {problem.instance && (
         <p>
           Named in the service's log: <code>{problem.instance}</code>
@@ -30,14 +41,42 @@ export function Problem({ problem, again }: { problem: ProblemDocument; again?: 
   );
 }
 
+/** What experts ask for, folded under its summary. */
+export function Folded({ summary, children }: { summary?: string; children: ComponentChildren }) {
+  return (
+    <details class="folded">
+      <summary>{summary ?? "Details"}</summary>
+      <div>{children}</div>
+    </details>
+  );
+}
+
+/** What the columns of a table mean, opened by a click, tap or key: each with its word. */
+export function Meanings({ of }: { of: readonly (readonly [string, string])[] }) {
+  return (
+    <Folded summary="What the columns mean">
+      <dl class="meanings">
+        {of.map(([word, meaning]) => (
+          <>
+            <dt>{word}</dt>
+            <dd>{meaning}</dd>
+          </>
+        ))}
+      </dl>
+    </Folded>
+  );
+}
+
 /** Show what is odd about a scan or a survey. */
 export function Warnings({ warnings }: { warnings: readonly ScanWarning[] }) {
   return (
     <>
       {warnings.map(({ reason, detail }) => (
-        <p class="warning">
-          <strong>{capital(REASONS[reason]?.[0] ?? reason)}.</strong> {detail}
-        </p>
+        <div class="warning">
+          <strong>{capital(REASONS[reason]?.[0] ?? reason)}.</strong>
+          {REASONS[reason]?.[1] && <p class="advice">{capital(REASONS[reason][1])}.</p>}
+          <Folded>{detail}</Folded>
+        </div>
       ))}
     </>
   );

@@ -5,7 +5,16 @@ import { Fragment, h } from "preact";
 import type { ScanOutcome } from "../documents.ts";
 import { count, metres, percent } from "../format.ts";
 import { capital, REASONS } from "../words.ts";
-import { Warnings } from "./parts.tsx";
+import { Folded, Meanings, Warnings } from "./parts.tsx";
+
+const ASKING = "…"; // in place of a file's name until it is known
+
+const COLUMNS: readonly (readonly [string, string])[] = [
+  ["Fitness", "share of its points that lie on the map"],
+  ["RMSE", "root mean square distance of those points"],
+  ["Sure", "how sure it is that it stands where it was taken"],
+  ["±", "where it stands, one sigma in the direction that is held worst"],
+];
 
 interface ScansProps {
   scans: readonly ScanOutcome[];
@@ -17,6 +26,7 @@ export function Scans({ scans, names, placing }: ScansProps) {
   const refused = scans.filter(({ accepted }) => accepted === false);
   const accepted = scans.filter((scan) => scan.accepted);
   const sure = accepted.some(({ confidence }) => confidence !== null); // it is not asked of the scans of a map
+  const columns = COLUMNS.filter(([word]) => sure || word !== "Sure");
   const waiting = scans.length - refused.length - accepted.length;
   return (
     <section>
@@ -27,17 +37,16 @@ export function Scans({ scans, names, placing }: ScansProps) {
         {waiting > 0 && `, ${waiting} ${placing ? "wait" : "not tried"}`}.
       </p>
       {refused.map((scan) => (
-        <Refused key={scan.scan_id} scan={scan} name={names[scan.scan_id] || scan.scan_id} />
+        <Refused key={scan.scan_id} scan={scan} name={names[scan.scan_id] ?? ASKING} />
       ))}
       {accepted.length > 0 && (
         <table class="scans">
           <thead>
             <tr>
               <th>Scan</th>
-              <th title="share of its points that lie on the map">Fitness</th>
-              <th title="root mean square distance of those points">RMSE</th>
-              {sure && <th title="that it stands where it was taken">Sure</th>}
-              <th title="where it stands, one sigma in the direction that is held worst">±</th>
+              {columns.map(([word, meaning]) => (
+                <th title={meaning}>{word}</th>
+              ))}
             </tr>
           </thead>
           <tbody>
@@ -46,12 +55,13 @@ export function Scans({ scans, names, placing }: ScansProps) {
                 key={scan.scan_id}
                 scan={scan}
                 sure={sure}
-                name={names[scan.scan_id] || scan.scan_id}
+                name={names[scan.scan_id] ?? ASKING}
               />
             ))}
           </tbody>
         </table>
       )}
+      {accepted.length > 0 && <Meanings of={columns} />}
     </section>
   );
 }
@@ -60,7 +70,9 @@ function Accepted({ scan, name, sure }: { scan: ScanOutcome; name: string; sure:
   return (
     <>
       <tr>
-        <td class="name">{name}</td>
+        <td class="name" title={scan.scan_id}>
+          {name}
+        </td>
         <td>{scan.fitness === null ? "" : percent(scan.fitness)}</td>
         <td>{scan.rmse === null ? "" : metres(scan.rmse)}</td>
         {sure && <td>{scan.confidence === null ? "not asked" : percent(scan.confidence)}</td>}
@@ -86,16 +98,15 @@ function Refused({ scan, name }: { scan: ScanOutcome; name: string }) {
   ].filter(Boolean);
   return (
     <div class="refused">
-      <strong>
+      <strong title={scan.scan_id}>
         {name}: {what}
       </strong>
       {advice && <p class="advice">{capital(advice)}.</p>}
       {(scan.detail || numbers.length > 0) && (
-        <details>
-          <summary>Figures</summary>
+        <Folded>
           {scan.detail && <p>{scan.detail}</p>}
           {numbers.length > 0 && <p class="faint">{capital(numbers.join(", "))}</p>}
-        </details>
+        </Folded>
       )}
       <Warnings warnings={scan.warnings} />
     </div>

@@ -3,7 +3,7 @@
 import { h } from "preact";
 
 import type { SurveySummaryDocument } from "../documents.ts";
-import { count, instant } from "../format.ts";
+import { count, deviceWords, instant } from "../format.ts";
 import { focusOf, jobOf, type State } from "../state.ts";
 import { sayingOf } from "../words.ts";
 import type { Props } from "./page.tsx";
@@ -62,6 +62,7 @@ function Visit({ state, survey, before, choose }: VisitProps) {
   const { tone, short, long } = sayingOf(survey, jobOf(state, survey.job_id));
   const gap = before ? Date.parse(survey.captured_at) - Date.parse(before.captured_at) : 0;
   const chosen = survey.survey_id === state.place.survey;
+  const title = survey.device_id ? `${long} By ${deviceWords(survey.device_id)}.` : long;
   const inFocus = survey.survey_id === focusOf(state)?.survey_id;
   return (
     <li>
@@ -70,7 +71,7 @@ function Visit({ state, survey, before, choose }: VisitProps) {
         class={`visit tone-${tone} ${inFocus ? "in-focus" : ""}`}
         id={`visit-${survey.survey_id}`}
         aria-pressed={chosen}
-        title={long}
+        title={title}
         ref={(element) => intoSight(element, chosen || inFocus)}
         onClick={choose}
       >

@@ -2,13 +2,14 @@
 
 import { Fragment, h } from "preact";
 
-import { toggled } from "../filters.ts";
-import { height, percent, whole } from "../format.ts";
-import type { Show } from "../link.ts";
+import { setFilters, toggled } from "../filters.ts";
+import { height, heights, percent, whole } from "../format.ts";
+import type { Place, Show } from "../link.ts";
 import { focusOf, sectionOf, showOf, type LayerState } from "../state.ts";
 import { TILE_STATES } from "../words.ts";
 import { referenceVersion } from "../stage.ts";
 import type { Props } from "./page.tsx";
+import { closedByEscape, openSection, seesFilters } from "./panels.ts";
 import { Kind } from "./parts.tsx";
 
 const SHOWS: readonly (readonly [Show, string, string])[] = [
@@ -21,36 +22,20 @@ const KINDS = ["appeared", "disappeared", "moved"];
 const STATES = ["changed", "inconsistent", "unobserved"];
 
 export function Over(props: Props) {
-  const { app, stage, state } = props;
+  const { state } = props;
   const version = referenceVersion(state);
-  const none = !focusOf(state) || focusOf(state)?.status !== "ready";
   return (
     <>
       <div class="over over-top">
-        <div class="segments" role="group" aria-label="Clouds that are shown">
-          {SHOWS.map(([show, word, key]) => (
-            <button
-              aria-pressed={showOf(state) === show}
-              disabled={none && show !== "reference"}
-              title={
-                none && show !== "reference" ? "There is no survey with a result to show" : `${word} (${key})`
-              }
-              onClick={() => app.go({ show })}
-            >
-              {word}
-            </button>
-          ))}
-        </div>
-        <button title="Look from above (t)" onClick={() => stage.topDown()}>
-          Top
-        </button>
-        <button
-          aria-expanded={state.sectionOpen}
-          title="Cut by height (c cuts the ceiling)"
-          onClick={() => app.update({ sectionOpen: !state.sectionOpen })}
-        >
-          Section
-        </button>
+        <Tools {...props} />
+        <Chips {...props} />
+        {showOf(state) === "split" && state.stage.survey.loaded && (
+          <div class="split-words" aria-hidden="true">
+            <span>Before</span>
+            <span>After</span>
+          </div>
+        )}
+        {state.sectionOpen && <Section {...props} />}
       </div>
       {version !== state.map.value?.version && (
         <p class="over reference-version">
@@ -58,16 +43,69 @@ export function Over(props: Props) {
           {state.map.value?.version}.
         </p>
       )}
-      {state.sectionOpen && <Section {...props} />}
-      {showOf(state) === "split" && state.stage.survey.loaded && (
-        <div class="over split-words" aria-hidden="true">
-          <span>Before</span>
-          <span>After</span>
-        </div>
-      )}
       <Loading {...props} />
       <Legend {...props} />
     </>
+  );
+}
+
+/** Buttons for what the scene shows. */
+function Tools({ app, stage, state }: Props) {
+  const none = !focusOf(state) || focusOf(state)?.status !== "ready";
+  return (
+    <div class="tools">
+      <div class="segments" role="group" aria-label="Clouds that are shown">
+        {SHOWS.map(([show, word, key]) => (
+          <button
+            aria-pressed={showOf(state) === show}
+            disabled={none && show !== "reference"}
+            title={
+              none && show !== "reference" ? "There is no survey with a result to show" : `${word} (${key})`
+            }
+            onClick={() => app.go({ show })}
+          >
+            {word}
+          </button>
+        ))}
+      </div>
+      <button title="Look from above (t)" onClick={() => stage.topDown()}>
+        Top
+      </button>
+      <button
+        id="section-button"
+        aria-expanded={state.sectionOpen}
+        title="Cut by height (x); c cuts the ceiling"
+        onClick={() => app.update({ sectionOpen: !state.sectionOpen })}
+      >
+        Section
+      </button>
+    </div>
+  );
+}
+
+/** What is cut and filtered while the panels that say so are closed; each goes by a press. */
+function Chips({ app, state }: Props) {
+  const { filters, section } = state.place;
+  const chips: [string, Partial<Place>][] = [];
+  if (section && !state.sectionOpen) chips.push([heights(section), { section: null }]);
+  if (!seesFilters(state)) {
+    for (const { words, without } of setFilters(filters))
+      chips.push([words, { filters: { ...filters, ...without } }]);
+  }
+  if (!chips.length) return null;
+  return (
+    <div class="chips" role="group" aria-label="What is cut and filtered">
+      {chips.map(([words, without]) => (
+        <button
+          key={words}
+          aria-label={`${words}: take it away`}
+          title={"section" in without ? "Show all heights but the ceiling" : "Do not filter by this"}
+          onClick={() => app.go(without)}
+        >
+          {words} <span aria-hidden="true">✕</span>
+        </button>
+      ))}
+    </div>
   );
 }
 
@@ -98,7 +136,7 @@ function Section({ app, state }: Props) {
   const { extent, ceiling } = state.stage;
   const section = sectionOf(state);
   if (!extent || !section)
-    return <div class="over section">The heights are known once the cloud is loaded.</div>;
+    return <div class="section">The heights are known once the cloud is loaded.</div>;
   const [low, high] = [extent.min[2], extent.max[2]];
   const set = (section: [number, number]) =>
     app.go({ section: section[1] - section[0] < 0.05 ? null : section });
@@ -109,6 +147,8 @@ function Section({ app, state }: Props) {
       </span>
       <input
         type="range"
+        aria-label={`${name}, metres`}
+        aria-valuetext={height(value)}
         min={low}
         max={high}
         step={0.05}
@@ -118,7 +158,12 @@ function Section({ app, state }: Props) {
     </label>
   );
   return (
-    <div class="over section" role="group" aria-label="Section: heights that are shown">
+    <div
+      class="section"
+      role="group"
+      aria-label="Section: heights that are shown"
+      onKeyDown={(event) => closedByEscape(event, () => openSection(app, false))}
+    >
       {slider("Up to", section[1], (value) => set([Math.min(section[0], value - 0.1), value]))}
       {slider("From", section[0], (value) => set([value, Math.max(section[1], value + 0.1)]))}
       <label class="check">
@@ -143,6 +188,7 @@ function Legend({ app, state }: Props) {
         KINDS.map((kind) => (
           <span>
             <Kind kind={kind} /> {kind}
+            {kind === "moved" && <Moved />}
           </span>
         ))}
       {STATES.map((name) => (
@@ -160,5 +206,15 @@ function Legend({ app, state }: Props) {
         </label>
       ))}
     </div>
+  );
+}
+
+/** The outlines of what moved, in words: dashed where it was, solid where it is. */
+function Moved() {
+  return (
+    <>
+      {" "}
+      <i class="outline outline-from" aria-hidden="true" /> from <i class="outline" aria-hidden="true" /> to
+    </>
   );
 }

@@ -7,6 +7,7 @@ import { bytes, count } from "../format.ts";
 import type { Sending, UploadState } from "../state.ts";
 import { addFiles, cancel, leaveOut, leaveOutRefused, submit } from "../submit.ts";
 import type { Props } from "./page.tsx";
+import { keepFocus } from "./panels.ts";
 import { Problem } from "./parts.tsx";
 
 export function UploadDialog({ app, state }: Props) {
@@ -25,8 +26,9 @@ export function UploadDialog({ app, state }: Props) {
 /** Open or close a dialog as the state has it; the browser keeps the focus inside, and gives it back. */
 export function shown(element: HTMLDialogElement | null, open: boolean): void {
   if (!element || element.open === open) return;
-  if (open) element.showModal();
-  else element.close();
+  if (!open) return element.close();
+  keepFocus(); // for the browser to give it back to something
+  element.showModal();
 }
 
 /** Close the dialog; a file chooser inside that is left without files tells `cancel` as well, and closes nothing. */
