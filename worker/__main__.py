@@ -38,7 +38,7 @@ from service.settings import Settings
 from service.up.embedded_redis import LaunchFailed
 from service.up.lifetime import end_with_parent
 from service.up.requirements import require_model, require_queue
-from worker.memory import limit_gpu_memory, limit_memory
+from worker.memory import limit_memory
 from worker.rq_workers import GeometryWorker, InferenceWorker
 from worker.scratch import shared_temporary, sweep
 from worker.threads import wait_passively
@@ -186,10 +186,9 @@ def limit_inference(settings: Settings) -> int:
     Not where it has a GPU, of whose memory it gets a share: CUDA maps far more than it uses. The limit is of the process,
     which outlives its steps.
     """
-    from worker.jobs.models import runs_on_gpu  # noqa: PLC0415  # torch takes seconds
+    from worker.jobs.models import take_gpu_share  # noqa: PLC0415  # torch takes seconds
 
-    if runs_on_gpu(settings):
-        limit_gpu_memory(settings.inference_gpu_share, settings.inference_workers)
+    if take_gpu_share(settings):
         return 0
     return limit_memory(settings.step_memory_bytes)
 
