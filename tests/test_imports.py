@@ -263,6 +263,7 @@ ONLY_IN = {
 KNOWS_THE_SERVICE = (
     "worker.__main__",
     "worker.jobs",
+    "worker.endings",
     "worker.rq_jobs",
     "worker.rq_workers",
     "worker.demo",

@@ -38,7 +38,7 @@ from service.settings import Settings
 from service.up.embedded_redis import LaunchFailed
 from service.up.lifetime import end_with_parent
 from service.up.requirements import require_model, require_queue
-from worker.memory import limit_gpu_memory, limit_memory
+from worker.memory import limit_memory
 from worker.rq_workers import GeometryWorker, InferenceWorker
 from worker.scratch import shared_temporary, sweep
 from worker.threads import wait_passively
@@ -166,13 +166,18 @@ def _require_all(settings: Settings, queue: str) -> None:
 
 
 def _require_device(settings: Settings, queue: str) -> None:
-    if queue == "inference" and settings.device == "cuda":
-        from worker.jobs.models import finds_gpu  # noqa: PLC0415  # torch takes seconds
+    if queue != "inference" or (settings.device != "cuda" and settings.inference_precision != "bfloat16"):
+        return
+    from worker.jobs.models import finds_gpu, lacks_precision  # noqa: PLC0415  # torch takes seconds
 
-        if not finds_gpu():
-            raise LaunchFailed(
-                "SPICD_DEVICE is cuda, but torch finds no CUDA GPU; set it to auto or cpu, or mend the driver"
-            )
+    if settings.device == "cuda" and not finds_gpu():
+        raise LaunchFailed(
+            "SPICD_DEVICE is cuda, but torch finds no CUDA GPU; set it to auto or cpu, or mend the driver"
+        )
+    if lacks_precision(settings):
+        raise LaunchFailed(
+            "SPICD_INFERENCE_PRECISION is bfloat16, and this machine's device does not have it; set it to auto"
+        )
 
 
 def limit_inference(settings: Settings) -> int:
@@ -181,10 +186,9 @@ def limit_inference(settings: Settings) -> int:
     Not where it has a GPU, of whose memory it gets a share: CUDA maps far more than it uses. The limit is of the process,
     which outlives its steps.
     """
-    from worker.jobs.models import runs_on_gpu  # noqa: PLC0415  # torch takes seconds
+    from worker.jobs.models import take_gpu_share  # noqa: PLC0415  # torch takes seconds
 
-    if runs_on_gpu(settings):
-        limit_gpu_memory(settings.inference_gpu_share, settings.inference_workers)
+    if take_gpu_share(settings):
         return 0
     return limit_memory(settings.step_memory_bytes)
 

@@ -17,8 +17,6 @@ from worker.errors import OutOfMemory
 
 SHARE = 0.8  #: of the machine's memory, or of the container's, that a step may take where nothing is set
 
-GPU_SHARED = 0.9  #: of the GPU's memory, that workers divide among themselves where nothing is set
-
 #: Where a container's limit stands: version 2 of the kernel's control groups, and version 1.
 _LIMITS = (Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"))
 _FAILED = re.compile("not enough memory|can't allocate memory|bad_alloc|out of memory", re.IGNORECASE)
@@ -42,20 +40,6 @@ def limit_memory(most: int | None) -> int:
         wanted = min(wanted, hard)
     resource.setrlimit(resource.RLIMIT_DATA, (wanted, hard))
     return wanted
-
-
-def limit_gpu_memory(share: float | None, workers: int) -> float:
-    """Limit what this process may take of the GPU's memory; return the share, 1 for all.
-
-    With None and several `workers` on the GPU each has an equal part, and a tenth stays for what CUDA keeps of each
-    beside (a few hundred MiB). Beyond its share a process gets torch.OutOfMemoryError, and the others never hear of it.
-    """
-    import torch  # noqa: PLC0415 - takes seconds, and only who has a GPU needs it
-
-    part = share or (1.0 if workers < 2 else GPU_SHARED / workers)
-    if part < 1:
-        torch.cuda.set_per_process_memory_fraction(part)
-    return part
 
 
 def available_memory() -> int:

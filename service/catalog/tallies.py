@@ -98,7 +98,7 @@ OBSERVED = Measure(
 )
 TILES = Measure(
     name="spicd_survey_tiles",
-    help="Tiles of a survey, which the inference step scores as one batch",
+    help="Tiles of a survey",
     labels=("model",),
     summary=True,
 )

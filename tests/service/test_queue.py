@@ -143,6 +143,16 @@ def test_workers_answer_while_their_key_lives(queue: JobQueue, redis: Redis) -> 
     assert queue.snapshot()["geometry"].silent == ()
 
 
+def test_the_models_that_workers_keep_open_are_added_up(queue: JobQueue, redis: Redis) -> None:
+    redis.sadd("rq:workers:inference", "rq:worker:w1", "rq:worker:w2", "rq:worker:w3")
+    redis.hset("rq:worker:w1", mapping={"state": "busy", "models": 2, "model_bytes": 300})
+    redis.hset("rq:worker:w2", mapping={"models": 1, "model_bytes": 50})
+    state = queue.snapshot()["inference"]
+    assert (state.models, state.model_bytes) == (3, 350)
+    assert (state.answering, state.silent) == (("w1", "w2"), ("w3",))
+    assert queue.snapshot()["geometry"].models == 0
+
+
 def test_where_no_worker_is_alive_all_claims_are_taken_away(queue: JobQueue, redis: Redis) -> None:
     queue.arrange("geometry", [("m1", REGISTER)])
     begin(redis, "m1-register")

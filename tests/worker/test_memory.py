@@ -22,6 +22,35 @@ def in_a_process(code: str) -> str:
     return done.stdout.strip()
 
 
+class OfGpu:
+    """A GPU's memory of which a process says how much it may take."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.shares: list[float] = []
+        monkeypatch.setattr("torch.cuda.is_available", lambda: True)
+        monkeypatch.setattr("torch.cuda.set_per_process_memory_fraction", self.shares.append)
+
+
+@pytest.mark.parametrize(
+    ("share", "workers", "asked"),
+    [(None, 1, []), (None, 2, [0.45]), (None, 3, [0.3]), (0.25, 1, [0.25]), (0.5, 3, [0.5]), (1.0, 2, [])],
+)
+def test_workers_on_one_gpu_have_a_share_of_its_memory_each(
+    monkeypatch: pytest.MonkeyPatch, share: float | None, workers: int, asked: list[float]
+) -> None:
+    gpu = OfGpu(monkeypatch)
+    settings = Settings(inference_gpu_share=share, inference_workers=workers, step_memory_bytes=GIB)
+    assert limit_inference(settings) == 0  # of the processor's memory: CUDA maps far more than it uses
+    assert gpu.shares == pytest.approx(asked)
+
+
+def test_a_worker_that_leaves_the_gpu_alone_takes_no_share_of_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    gpu = OfGpu(monkeypatch)
+    monkeypatch.setattr("worker.__main__.limit_memory", lambda most: most)
+    assert limit_inference(Settings(device="cpu", inference_gpu_share=0.5, step_memory_bytes=GIB)) == GIB
+    assert gpu.shares == []
+
+
 def test_an_allocation_past_the_limit_fails_and_one_within_it_does_not() -> None:
     code = """
 import numpy as np

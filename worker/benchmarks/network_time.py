@@ -114,7 +114,7 @@ def _recorded(run: Encode, points: Tensor) -> Encode:
     The last batch of a map is filled up with tiles of the one before.
     """
     inputs = points.clone(), points.mean(dim=1)
-    stream = torch.cuda.Stream()
+    stream = torch.cuda.Stream()  # type: ignore[no-untyped-call]
     stream.wait_stream(torch.cuda.current_stream())
     with torch.cuda.stream(stream):
         for _ in range(_WARM):

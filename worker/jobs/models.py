@@ -13,8 +13,8 @@ from service.catalog.records import ModelRecord, VersionRecord
 from service.settings import Settings
 from worker.detectors.card import Card
 from worker.detectors.detector import Detector
-from worker.detectors.precision import PrecisionChoice
-from worker.detectors.running.calls import DirectBatches, FittedRuns
+from worker.detectors.precision import PrecisionChoice, chosen_precision
+from worker.detectors.running.calls import DirectBatches, FittedRuns, limit_gpu_memory
 from worker.detectors.running.meter import Meter
 from worker.detectors.running.runtime import Runtime
 from worker.detectors.running.shared import SharedBatches
@@ -80,6 +80,23 @@ def finds_gpu() -> bool:
 def runs_on_gpu(settings: Settings) -> bool:
     """Tell whether networks of this process run on a GPU."""
     return settings.device != "cpu" and finds_gpu()
+
+
+def take_gpu_share(settings: Settings) -> bool:
+    """Take no more than this worker's share of the GPU's memory from now on; tell whether there is a GPU to share."""
+    if not runs_on_gpu(settings):
+        return False
+    limit_gpu_memory(settings.inference_gpu_share, settings.inference_workers)
+    return True
+
+
+def lacks_precision(settings: Settings) -> bool:
+    """Tell whether the device does not have the precision that is asked for."""
+    try:
+        chosen_precision(settings.inference_precision, resolve_device(settings.device), holds=True)
+    except DetectorUnavailable:
+        return True
+    return False
 
 
 @contextmanager

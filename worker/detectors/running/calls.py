@@ -24,6 +24,8 @@ Done = Callable[[int], None]  #: told how many items have their results; may rai
 
 MOST = 64  #: the size of a batch where nobody says otherwise: about 1 GiB beside the network for patches of 4,096 points
 
+GPU_SHARED = 0.9  #: of the GPU's memory, that workers divide among themselves where nothing is set
+
 
 def _one(_: object) -> int:
     return 1
@@ -130,6 +132,18 @@ def give_cache_back() -> None:
     """Give the GPU back what torch keeps for arrays to come."""
     if torch.cuda.is_available():
         torch.cuda.empty_cache()
+
+
+def limit_gpu_memory(share: float | None, workers: int) -> float:
+    """Limit what this process may take of the GPU's memory; return the share, 1 for all.
+
+    With None and several `workers` on the GPU each has an equal part, and a tenth stays for what CUDA keeps of each
+    beside (a few hundred MiB). Beyond its share a process gets torch.OutOfMemoryError, and the others never hear of it.
+    """
+    part = share or (1.0 if workers < 2 else GPU_SHARED / workers)
+    if part < 1:
+        torch.cuda.set_per_process_memory_fraction(part)
+    return part
 
 
 def _too_large(call: NetworkCall[I, R]) -> OutOfMemory:

@@ -40,14 +40,13 @@ class SpicdNet(SiameseDetector):
 
     @torch.inference_mode()
     def _descriptors(self, patches: Sequence[Patch]) -> Tensor:
-        clouds, centroids = zip(*map(self._on_device, patches), strict=True)
+        clouds = [torch.from_numpy(patch.distinct) for patch in patches]
+        centroids = [torch.from_numpy(patch.centroid) for patch in patches]
         if self._together is None:
-            return self._encoder.encode(clouds, centroids)
-        descriptors: Tensor = self._together(level(clouds), torch.stack(centroids))
+            return self._encoder.encode(
+                [cloud.to(self._device) for cloud in clouds],
+                [centroid.to(self._device) for centroid in centroids],
+            )
+        batch = level(clouds).to(self._device)  # one copy to the GPU, and not one a tile
+        descriptors: Tensor = self._together(batch, torch.stack(centroids).to(self._device))
         return descriptors
-
-    def _on_device(self, patch: Patch) -> tuple[Tensor, Tensor]:
-        distinct, centroid = (
-            torch.from_numpy(part).to(self._device) for part in (patch.distinct, patch.centroid)
-        )
-        return distinct, centroid

@@ -120,6 +120,35 @@ def test_the_disk_and_the_workers_are_told(client: TestClient, monkeypatch: pyte
     assert all(found["spicd_part_up", part] == 1 for part in ("database", "disk", "queue"))
 
 
+def test_what_inference_workers_keep_open_and_what_their_networks_did_is_told(
+    client: TestClient, catalog: Catalog, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    held = Snapshot(queues={"inference": QueueState(answering=("a", "b"), models=3, model_bytes=5_000_000)})
+    monkeypatch.setattr(RememberingQueue, "snapshot", lambda _: held)
+    with catalog.database.write() as session:
+        counted = {
+            ("network_seconds", "m/1"): (3, 0.5),
+            ("batch_size", "m/1"): (3, 130.0),
+            ("batch_requests", "m/1"): (3, 7.0),
+            ("wait_seconds", "m/1"): (3, 0.02),
+            ("out_of_memory", "m/1"): (2, 2.0),
+            ("models_opened", "m/1"): (1, 1.0),
+            ("models_evicted", "m/2"): (1, 1.0),
+        }
+        tallies.tally_inference(session, counted)
+    found = scraped(client)
+    assert found[("spicd_inference_models_warm",)] == 3
+    assert found[("spicd_inference_models_warm_bytes",)] == 5_000_000
+    assert found["spicd_inference_batch_size_sum", "m/1"] == 130
+    assert found["spicd_inference_batch_size_count", "m/1"] == 3
+    assert found["spicd_inference_batch_steps_sum", "m/1"] == 7
+    assert found["spicd_inference_network_seconds_sum", "m/1"] == 0.5
+    assert found["spicd_inference_wait_seconds_sum", "m/1"] == pytest.approx(0.02)
+    assert found["spicd_inference_out_of_memory_total", "m/1"] == 2
+    assert found["spicd_inference_models_opened_total", "m/1"] == 1
+    assert found["spicd_inference_models_evicted_total", "m/2"] == 1
+
+
 def test_without_the_queue_the_rest_is_still_told(client: TestClient, queue: RememberingQueue) -> None:
     queue.down = True
     found = scraped(client)

@@ -15,7 +15,7 @@ from worker.cloud.tiling import TilePairs
 from worker.detectors.card import MODEL_STORE, Card
 from worker.detectors.comparison import Comparison
 from worker.detectors.detector import Detection, Detector
-from worker.detectors.running.calls import FittedRuns
+from worker.detectors.running.calls import DirectBatches, FittedRuns
 from worker.detectors.running.meter import Meter
 from worker.detectors.running.runtime import Runtime
 from worker.detectors.running.shared import SharedBatches
@@ -89,6 +89,30 @@ def test_a_survey_of_tiles_has_the_scores_that_it_has_alone(
     for one, other in zip(alone, together, strict=True):
         assert differ(one, other) < 1e-5
     assert max(differ(alone[0], other) for other in alone[2:]) > 1e-4  # the surveys are told apart
+
+
+def test_a_batch_that_does_not_fit_is_halved_and_the_scores_are_the_same(
+    card: Card, network: SpicdNetwork, pairs: TilePairs, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    detector = SpicdNet(card, network, torch.device("cpu"))
+    comparison = surveys(pairs)[0]
+    expected = detector.detect(comparison)
+    detector.run_with(Runtime(batches=DirectBatches(FittedRuns(64, meter := Meter())), at_once=True))
+    together = detector._together
+    assert together is not None
+    real, sizes = together.forward, list[int]()
+
+    def small(points: torch.Tensor, centroids: torch.Tensor) -> torch.Tensor:
+        sizes.append(len(points))
+        if len(points) > 1:
+            raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB")
+        return real(points, centroids)
+
+    monkeypatch.setattr(together, "forward", small)
+    assert differ(detector.detect(comparison), expected) < 1e-5
+    assert sizes[:2] == [4, 2]
+    assert set(sizes[sizes.index(1) + 4 :]) <= {1}  # the size that fits is remembered
+    assert meter.take()["out_of_memory", card.model][0] > 0
 
 
 def test_a_survey_of_voxels_has_the_scores_that_it_has_alone() -> None:
