@@ -40,7 +40,7 @@ ORDER = (
 #: Methods without a card: their figures stand beside those of the models that they were measured with.
 BASELINES = ("C2C (mean)", "M3C2-approx", "M3C2")
 #: Of a network's tensors, what is no parameter.
-STATISTICS = ("running_mean", "running_var", "num_batches_tracked")
+STATISTICS = ("running_mean", "running_var", "num_batches_tracked", "encoder.kernel")
 
 ALL_VISITS = 48  #: of `evaluate revisit`; figures of fewer are marked
 
