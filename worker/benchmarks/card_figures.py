@@ -90,6 +90,10 @@ def paper_figures(document: Figures, card: Card) -> Figures:
         "false_positives_with_no_change": _quiet(experiments),
         "removals": _removals(experiments),
         "f1_by_experiment": {row["name"]: row["f1"] for row in experiments if row["operation"]},
+        "robustness": [
+            _picked(row, ("disturbance", "level", "precision", "recall", "f1", "false_positive_rate"))
+            for row in document["robustness"]
+        ],
         "f1_by_kind": {kind: rows[ours["method"]] for kind, rows in document["by_kind"].items()},
         "baselines": {
             row["method"]: {

@@ -1,7 +1,8 @@
 """`spicd-worker evaluate speed`: what all models of a store and the baselines take for 172 tiles, in one run.
 
 On a shared machine seconds are worth little by themselves, so all take turns, and are given as multiples of C2C and in
-processor seconds too. Each is given what it has in use: the reference embedding that a map keeps, or what scans saw.
+processor seconds too. Each is given what it has in use: the reference embedding that a map keeps, or what scans saw,
+and the precision that its card allows; where that is bfloat16, it is timed in float32 as well.
 """
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -38,7 +39,7 @@ from worker.cloud.tiling import TilePairs
 from worker.detectors.card import MODEL_STORE
 from worker.detectors.comparison import Comparison
 from worker.detectors.detector import Detector
-from worker.detectors.precision import chosen_precision
+from worker.detectors.precision import Precision, chosen_precision
 from worker.detectors.running.runtime import RunsNetwork, Runtime
 from worker.detectors.store import open_detector, resolve_device
 from worker.errors import DetectorUnavailable
@@ -67,6 +68,7 @@ class Timed:
     run: Callable[[], object]
     tiles: int  #: that one run scores
     detector: Detector | None = None  #: None: a baseline
+    precision: Precision | None = None  #: None: nothing that could be chosen
 
 
 def measure(settings: SpeedSettings, progress: Progress = no_progress) -> Document:
@@ -77,7 +79,12 @@ def measure(settings: SpeedSettings, progress: Progress = no_progress) -> Docume
         baseline.name: Timed(run=partial(baseline.score, pairs), tiles=len(pairs.observed))
         for baseline in installed_baselines()
     }
-    runs |= {detector.card.model: _timed(detector, pairs, comparison) for detector in detectors}
+    for detector in detectors:
+        name = detector.card.model
+        runs[name] = _timed(detector, pairs, comparison)
+        if runs[name].precision == "bfloat16":
+            exact = open_detector(settings.model_store, name)
+            runs[f"{name} in float32"] = replace(_timed(exact, pairs, comparison), precision="float32")
     seconds = times_of({name: timed.run for name, timed in runs.items()}, settings.repeats, progress)
     points = round(float(np.mean([len(tile) for tile in pairs.current])))
     return {
@@ -126,12 +133,14 @@ def _timed(detector: Detector, pairs: TilePairs, comparison: Comparison) -> Time
     """Return a detector's run: of the tile pairs, or by voxels of the whole clouds, of as many dense tiles as there are."""
     if detector.card.preprocessing.tiles == "touched":
         dense = int(comparison.tile_pairs.observed.sum())
-        return Timed(
-            run=lambda: told_by_voxels(side_by_side(comparison), detector), tiles=dense, detector=detector
-        )
+        run: Callable[[], object] = lambda: told_by_voxels(side_by_side(comparison), detector)  # noqa: E731
+        return Timed(run=run, tiles=dense, detector=detector, precision=_precision(detector))
     embedding = encode_reference(detector, pairs.reference)
     return Timed(
-        run=lambda: change_scores(detector, pairs, embedding), tiles=len(pairs.observed), detector=detector
+        run=lambda: change_scores(detector, pairs, embedding),
+        tiles=len(pairs.observed),
+        detector=detector,
+        precision=_precision(detector),
     )
 
 
@@ -159,7 +168,7 @@ def _row(
         "model": name,
         "sha256": None if card is None else card.sha256,
         "fingerprint": None if card is None else card.fingerprint,
-        "precision": _precision(timed.detector),
+        "precision": timed.precision,
         "tiles": timed.tiles,
         "seconds": spread(clock, "median", "least", "most", digits=3),
         "processor_seconds": spread(processor, "median", "least", "most", digits=3),
@@ -168,8 +177,8 @@ def _row(
     }
 
 
-def _precision(detector: Detector | None) -> str | None:
-    """Return what a network was computed with, as the workers choose it by the card; None without a network."""
+def _precision(detector: Detector) -> Precision | None:
+    """Return what a network is computed with, as the workers choose it by the card; None without a network."""
     if not isinstance(detector, RunsNetwork):
         return None
     device = resolve_device("auto")
@@ -186,7 +195,7 @@ def tables(figures: Document) -> Group:
     )
     rows = (
         (
-            row["model"] if row["precision"] in (None, "float32") else f"{row['model']} ({row['precision']})",
+            f"{row['model']} (bfloat16)" if row["precision"] == "bfloat16" else row["model"],
             f"{row['tiles']}",
             f"{row['seconds']['median']:.2f}",
             f"{row['seconds']['least']:.2f} to {row['seconds']['most']:.2f}",

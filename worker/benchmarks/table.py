@@ -17,7 +17,7 @@ from safetensors import safe_open
 
 from worker.benchmarks.card_figures import ON_GPU, SECTIONS, outdated_sections
 from worker.benchmarks.paper.experiments import published
-from worker.detectors.card import Card
+from worker.detectors.card import BaseRecord, Card
 from worker.detectors.store import open_card
 from worker.files import write_text
 
@@ -40,7 +40,7 @@ ORDER = (
 #: Methods without a card: their figures stand beside those of the models that they were measured with.
 BASELINES = ("C2C (mean)", "M3C2-approx", "M3C2")
 #: Of a network's tensors, what is no parameter.
-STATISTICS = ("running_mean", "running_var", "num_batches_tracked")
+STATISTICS = ("running_mean", "running_var", "num_batches_tracked", "encoder.kernel")
 
 ALL_VISITS = 48  #: of `evaluate revisit`; figures of fewer are marked
 
@@ -86,7 +86,7 @@ def measured(model_store: Path) -> list[Measured]:
     """
     names = sorted("/".join(card.parts[-3:-1]) for card in model_store.glob("*/*/card.json"))
     cards = {name: open_card(model_store, name) for name in names}
-    rows = [_of_card(card, model_store / name) for name, card in cards.items()]
+    rows = [_of_card(card, model_store) for card in cards.values()]
     rows += [_of_baseline(name, cards) for name in BASELINES]
     return sorted(rows, key=lambda row: (_place(row.name), row.name))
 
@@ -96,11 +96,8 @@ def _place(name: str) -> int:
     return ORDER.index(family) if family in ORDER else len(ORDER)
 
 
-def _of_card(card: Card, folder: Path) -> Measured:
+def _of_card(card: Card, model_store: Path) -> Measured:
     outdated = outdated_sections(card)
-    weights = None if card.weights is None else folder / card.weights
-    if weights is not None and hashlib.sha256(weights.read_bytes()).hexdigest() != card.sha256:
-        raise ValueError(f"{weights} are not the weights that the card of {card.model} names")
     if outdated:
         raise ValueError(f"{card.model}: {', '.join(outdated)} measured with other weights than the card's")
     return Measured(
@@ -108,8 +105,8 @@ def _of_card(card: Card, folder: Path) -> Measured:
         sections={name: card.evaluation[name] for name in (*SECTIONS, ON_GPU) if name in card.evaluation},
         beside={},
         sha256=card.sha256,
-        parameters=None if weights is None else parameters_of(weights),
-        training_seconds=training_seconds(card, folder),
+        parameters=sum(parameters_of(card, model_store).values()) or None,
+        training_seconds=training_seconds(card, model_store),
         trained=card.weights is not None,
     )
 
@@ -128,21 +125,42 @@ def _of_baseline(name: str, cards: Mapping[str, Card]) -> Measured:
     return Measured(name=name, sections=sections, beside=beside)
 
 
-def parameters_of(weights: Path) -> int:
-    """Count what was learned: the numbers of a file of weights, less the statistics that it normalises by."""
+def parameters_of(card: Card, model_store: Path) -> dict[str, int]:
+    """Count what was learned, by tensor: the numbers in a model's weights, less the statistics that it normalises by.
+
+    A model of which a part was trained has the other tensors of its base. Raises ValueError for weights that are not
+    those of the card, or of a base that the card does not name.
+    """
+    known = {} if card.base is None else parameters_of(_base(card, card.base, model_store), model_store)
+    if card.weights is None:
+        return known
+    weights = model_store / card.model / card.weights
+    if hashlib.sha256(weights.read_bytes()).hexdigest() != card.sha256:
+        raise ValueError(f"{weights} are not the weights that the card of {card.model} names")
     with safe_open(weights, framework="numpy") as tensors:
         names = [name for name in tensors.keys() if not name.endswith(STATISTICS)]  # noqa: SIM118 (no dict)
-        return sum(prod(tensors.get_slice(name).get_shape()) for name in names)
+        return known | {name: prod(tensors.get_slice(name).get_shape()) for name in names}
 
 
-def training_seconds(card: Card, folder: Path) -> float | None:
-    """Return how long the training took: as the card says in all, or the last rows of the logs beside it added up."""
+def _base(card: Card, record: BaseRecord, model_store: Path) -> Card:
+    base = open_card(model_store, record.model)
+    if base.sha256 != record.sha256:
+        raise ValueError(f"{card.model} is a part of {base.model} with other weights")
+    return base
+
+
+def training_seconds(card: Card, model_store: Path) -> float | None:
+    """Return how long the training took, that of a base included.
+
+    It is what the card says in all, or else the last rows of the logs beside it and what the head took, added up.
+    """
     if "seconds_in_all" in card.training:
         return float(card.training["seconds_in_all"])
-    ends = [_last_second(log) for log in sorted(folder.glob("epochs*.csv"))]
-    known = [end for end in ends if end is not None]
-    head = card.training.get("head_alone", {}).get("seconds", 0.0)
-    return sum(known) + float(head) if known else None
+    before = 0.0 if card.base is None else training_seconds(_base(card, card.base, model_store), model_store)
+    ends = [_last_second(log) for log in sorted((model_store / card.model).glob("epochs*.csv"))]
+    head = card.training.get("head_alone", {}).get("seconds")
+    known = [float(end) for end in (*ends, head) if end is not None]
+    return None if before is None or not known else before + sum(known)
 
 
 def _last_second(log: Path) -> float | None:
@@ -182,8 +200,13 @@ def _visits_f1(row: Measured) -> str | None:
 
 
 def _removals(row: Measured) -> str | None:
-    told = row.sections.get("paper", {}).get("removals")
-    return None if told is None else f"{_ratio(told['f1'])}, {_ratio(told['recall'])}"
+    """Write both; of a card that has the F1 alone, that."""
+    section = row.sections.get("paper", {})
+    told = section.get("removals")
+    if told is not None:
+        return f"{_ratio(told['f1'])}, {_ratio(told['recall'])}"
+    alone = section.get("f1_by_experiment", {}).get("type_remove")
+    return None if alone is None else f"{_ratio(alone)}, {MISSING}"
 
 
 def _quiet_alarms(row: Measured) -> str | None:

@@ -14,4 +14,4 @@ ModelStore = Annotated[
 Device = Annotated[Literal["auto", "cpu", "cuda"], typer.Option(envvar="SPICD_DEVICE")]
 AsJson = Annotated[bool, typer.Option("--json", help="Results as JSON on stdout, nothing else there.")]
 DEFAULT_MODEL = "voxel-net/1"
-PAPER_MODEL = "spicd-net/1"  #: the method of the paper, which its experiments are made for
+PAPER_MODEL = "spicd-net/2"  #: the method of the paper, which its experiments are made for

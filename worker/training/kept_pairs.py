@@ -2,7 +2,7 @@
 
 Encoding a tile is nearly all of the work of a training step. With a frozen encoder it is done once for every
 observation, and a head then sees a thousand times as many pairs in the same time. Nothing is augmented: the
-observations differ as visits do, or by noise of one level where a share of still pairs is to have some.
+observations differ as visits do, and a share of the still pairs by noise and lost points where that is asked for.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from worker.cloud.types import Points
 from worker.detectors.trainable import CHANGED, DIFFERENT, UNCHANGED, TrainableNetwork
 from worker.progress import Progress, no_progress
 from worker.training.dataset import TileSet
-from worker.training.pairs import PairSettings, changed, noisy
+from worker.training.pairs import PairSettings, changed, disturbed, some_disturbance
 
 #: Shares of the unchanged pairs by what they are of: of those of two visits, and of those that are still, which are
 #: as many of them as of the changed ones. Otherwise that a pair is still would say what it is.
@@ -153,7 +153,7 @@ def _gathered(tiles: TileSet, settings: PairSettings, rng: np.random.Generator) 
         """Keep a still pair, and the same with noise."""
         gathering.pair(kind, reference, current)
         if settings.noisy_share:
-            cloud = noisy(gathering.clouds[current], float(rng.uniform(0.0, settings.noise)), rng)
+            cloud = disturbed(gathering.clouds[current], some_disturbance(settings, rng), rng)
             gathering.pair(kind + NOISY, reference, gathering.cloud(cloud))
 
     synthetic = _synthetic_share(settings) > 0 or not any(one.changed for one in tiles.observations)

@@ -36,6 +36,8 @@ class PairSettings:
     #: to which level in metres. A head that only ever saw still pairs takes noise for another visit, and misses all.
     noisy_share: float = 0.0
     noise: float = 0.015
+    #: Ours: half of those also lose points, up to this share. By point counts alone, fewer points are a removal.
+    thinning: float = 0.35
     #: Ours: of changed pairs, those of whole things added, removed or moved, where there are any.
     edited_share: float = 0.65
     #: Ours: of changed pairs, those changed in some of the scans that the map is fused of.
@@ -72,6 +74,14 @@ PAPER_PAIRS = PairSettings(
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
+class Disturbance:
+    """What a whole tile suffers beside any change: of one level everywhere, unlike what another visit brings."""
+
+    noise: float  #: metres, sigma on every point
+    lost: float  #: share of the points
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
 class Observations:
     """Two dense observations of one tile, (n, 3) each, with nothing changed in between, and two with a change."""
 
@@ -80,9 +90,7 @@ class Observations:
     revisit: bool = False  #: of two visits, not one tile twice
     #: Of the very same scans, so that nothing differs but the change: no nuisance, no augmentation.
     still: bool = False
-    noise: float = (
-        0.0  #: metres, of every current point: the same for a changed pair and the one that matches it
-    )
+    disturbance: Disturbance | None = None  #: of the current side: one for a changed pair and what matches it
 
 
 class PairMaker:
@@ -132,7 +140,7 @@ class PairMaker:
         if label == DIFFERENT or not (observations.still and settings.stored_still):
             reference = augmented(reference, settings.augmentation, rng)
             current = augmented(current, settings.augmentation, rng)
-        return Pair(reference, noisy(current, observations.noise, rng), label)
+        return Pair(reference, disturbed(current, observations.disturbance, rng), label)
 
     def _unchanged(self, observations: Observations, rng: np.random.Generator) -> tuple[Points, Points]:
         if observations.still and self._settings.stored_still:
@@ -193,10 +201,9 @@ class PairMaker:
         a, b = tiles.points_a[i], tiles.points_b[i]
         if len(b) == 0 or rng.random() >= settings.revisit_share:
             still = rng.random() >= settings.rerun_share
-            noise = self._noise(rng) if still else 0.0
-            return Observations(
-                unchanged=(a, _stored_again(a, rng) if still else a), still=still, noise=noise
-            )
+            disturbance = drawn_disturbance(settings, rng) if still else None
+            current = _stored_again(a, rng) if still else a
+            return Observations(unchanged=(a, current), still=still, disturbance=disturbance)
         return Observations(unchanged=(a, b) if rng.random() < 0.5 else (b, a), revisit=True)
 
     def _revisited(self, observation: Observation, rng: np.random.Generator) -> Observations:
@@ -212,20 +219,13 @@ class PairMaker:
         """Pair a rebuilt map with the map: a tile that a synthetic change was made in, and one that none was."""
         changed = self._rebuilt[int(rng.integers(len(self._rebuilt)))]
         pair = (self._tiles.points_a[changed.tile], changed.points)
-        noise = self._noise(rng)
+        disturbance = drawn_disturbance(self._settings, rng)
         if not self._untouched:
-            return Observations(unchanged=(pair[0], pair[0]), changed=pair, still=True, noise=noise)
-        other = self._untouched[int(rng.integers(len(self._untouched)))]
-        return Observations(
-            unchanged=(self._tiles.points_a[other.tile], other.points), changed=pair, still=True, noise=noise
-        )
-
-    def _noise(self, rng: np.random.Generator) -> float:
-        """Draw a level of noise for a still pair, metres; most often none. No draw where none is asked for."""
-        settings = self._settings
-        if settings.noisy_share == 0 or rng.random() >= settings.noisy_share:
-            return 0.0
-        return float(rng.uniform(0.0, settings.noise))
+            unchanged = (pair[0], pair[0])
+        else:
+            other = self._untouched[int(rng.integers(len(self._untouched)))]
+            unchanged = (self._tiles.points_a[other.tile], other.points)
+        return Observations(unchanged=unchanged, changed=pair, still=True, disturbance=disturbance)
 
     def _sampled(
         self, first: Points, second: Points, intensity: float, rng: np.random.Generator
@@ -243,9 +243,28 @@ def _stored_again(points: Points, rng: np.random.Generator) -> Points:
     return (points + rng.normal(scale=STORED_JITTER, size=points.shape)).astype(np.float32)
 
 
-def noisy(points: Points, sigma: float, rng: np.random.Generator) -> Points:
-    """Move every point (n, 3) by noise of that many metres; nothing is drawn for none."""
-    return points if sigma == 0 else (points + rng.normal(scale=sigma, size=points.shape)).astype(np.float32)
+def drawn_disturbance(settings: PairSettings, rng: np.random.Generator) -> Disturbance | None:
+    """Draw what a still pair suffers; most often nothing. Nothing is drawn where no pair is to suffer anything."""
+    if settings.noisy_share == 0 or rng.random() >= settings.noisy_share:
+        return None
+    return some_disturbance(settings, rng)
+
+
+def some_disturbance(settings: PairSettings, rng: np.random.Generator) -> Disturbance:
+    """Draw noise, and in half of the cases lost points."""
+    return Disturbance(
+        noise=float(rng.uniform(0.0, settings.noise)),
+        lost=float(rng.uniform(0.0, settings.thinning)) if rng.random() < 0.5 else 0.0,
+    )
+
+
+def disturbed(points: Points, disturbance: Disturbance | None, rng: np.random.Generator) -> Points:
+    """Take points away from (n, 3), and move every other by noise; the very points for None. 64 points stay."""
+    if disturbance is None:
+        return points
+    kept = rng.permutation(len(points))[: max(round((1 - disturbance.lost) * len(points)), 64)]
+    noise = rng.normal(scale=disturbance.noise, size=(len(kept), 3))
+    return (points[np.sort(kept)] + noise).astype(np.float32)
 
 
 def changed(

@@ -68,6 +68,8 @@ OURS = {
         "rebuilt_share of the changed pairs were changed in some of the scans that the map is fused of"
     ),
     "chamfer_points": "the Chamfer statistics are of all points of both patches, not of 128 of each",
+    "counts": "the head is given point counts beside the Chamfer statistics",
+    "noisy_share": "noisy_share of the still pairs have noise of one level on every current point, and half of them lost points",
     "stored_still": "a stored patch that comes back is not augmented, nor a change of one",
     "matched_pairs": "a changed pair comes with an unchanged one of the same tile",
     "min_shown": "changes that hardly show are drawn again",

@@ -51,6 +51,7 @@ def paper_told() -> dict[str, Any]:
             {"name": "aggregated", "paper": {"f1": 0.84}},
         ],
         "table_6": [method("spicd-net/1", 0.85), method("C2C (mean)", 0.5), method("M3C2", 0.6)],
+        "robustness": [figures(0.7, disturbance="jitter (mm)", level=10)],
         "by_kind": {"remove": {"spicd-net/1": {"f1": 0.64, "f1_at_test_threshold": 0.65}, "M3C2": {"f1": 0}}},
     }
 
@@ -185,6 +186,9 @@ def test_the_paper_section_has_both_thresholds_the_kinds_and_the_baselines(store
     assert section["removals"] == {"precision": 0.8, "recall": 0.7, "f1": 0.64}
     assert section["baselines"]["M3C2"]["removals"]["f1"] == pytest.approx(0.5)
     assert section["f1_by_experiment"] == {"type_remove": 0.64}
+    assert [(row["disturbance"], row["level"], row["f1"]) for row in section["robustness"]] == [
+        ("jitter (mm)", 10, 0.7)
+    ]
     assert section["f1_by_kind"] == {"remove": {"f1": 0.64, "f1_at_test_threshold": 0.65}}
     assert section["false_positives_with_no_change"] == {"validation_threshold": 2, "test_threshold": 1}
     assert {name: row["f1"] for name, row in section["baselines"].items()} == {"C2C (mean)": 0.5, "M3C2": 0.6}

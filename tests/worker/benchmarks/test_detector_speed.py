@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
+import torch
 
 from worker.benchmarks.card_figures import speed_figures
 from worker.benchmarks.detector_speed import YARDSTICK, SpeedSettings, measure, tables, times_of
 from worker.detectors.card import MODEL_STORE
+from worker.detectors.precision import has_bfloat16
 from worker.detectors.store import open_card, write_card
 
 
@@ -19,6 +22,7 @@ def test_every_model_is_timed_on_as_many_tiles_and_goes_on_its_card(tmp_path: Pa
     for name, card in cards.items():
         (tmp_path / name).mkdir(parents=True)
         write_card(tmp_path / name, card)
+    shutil.copytree(MODEL_STORE / "spicd-net/1", tmp_path / "spicd-net/1")
     (tmp_path / "odd" / "1").mkdir(parents=True)
     odd = cards["c2c/1"].model_copy(update={"name": "odd", "detector": "nobody's"})
     write_card(tmp_path / "odd" / "1", odd)
@@ -28,6 +32,10 @@ def test_every_model_is_timed_on_as_many_tiles_and_goes_on_its_card(tmp_path: Pa
     assert rows["c2c/1"]["tiles"] == told["data"]["tiles"] == 6
     assert rows["voxel-rule/1"]["tiles"] > 0
     assert rows[YARDSTICK]["times_c2c"] == rows[YARDSTICK]["times_c2c_of_processor"] == 1.0
+    assert rows["c2c/1"]["precision"] is None
+    held = has_bfloat16(torch.device("cpu"))  # the card says that scores hold
+    assert rows["spicd-net/1"]["precision"] == ("bfloat16" if held else "float32")
+    assert ("spicd-net/1 in float32" in rows) == held
     assert [words for words in told["left_out"] if "nobody's" in words]
     json.dumps(told, allow_nan=False)
     section = speed_figures({"command": "speed", **told}, cards["c2c/1"])

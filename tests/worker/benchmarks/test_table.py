@@ -12,7 +12,7 @@ import torch
 from worker.benchmarks.paper.experiments import published
 from worker.benchmarks.table import BEGIN, END, MISSING, NOT_PRINTED, measured, write_table
 from worker.cli import main
-from worker.detectors.card import MODEL_STORE, Card, Preprocessing
+from worker.detectors.card import MODEL_STORE, BaseRecord, Card, Preprocessing
 from worker.detectors.store import write_card, write_model
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -100,6 +100,19 @@ def test_a_row_has_the_cards_figures_its_weights_and_what_it_is_made_of(store: P
     assert f"| `spicd-worker evaluate paper --model pointnet2/1` | corridor 1 | `{sha256}` |" in text
 
 
+def test_a_model_on_anothers_encoder_has_the_parameters_and_the_training_of_both(
+    store: Path, page: Path
+) -> None:
+    sha256 = json.loads((store / "pointnet2/1/card.json").read_text())["sha256"]
+    head = card("pointnet2", weights="weights.safetensors", training={"head_alone": {"seconds": 60.0}})
+    base = BaseRecord(model="pointnet2/1", sha256=sha256)
+    head = head.model_copy(update={"version": "2", "base": base})
+    write_model(store / "pointnet2" / "2", head, {"layer.bias": torch.zeros(3), "head": torch.zeros(5)})
+    write_table(page, store)
+    row = rows_of(page)["`pointnet2/2`"]
+    assert (row["parameters"], row["training"]) == ("20", "3 min")
+
+
 def test_what_nobody_measured_is_said_so_and_no_cell_is_blank(store: Path, page: Path) -> None:
     write_table(page, store)
     rows = rows_of(page)
@@ -126,6 +139,12 @@ def test_the_papers_own_rows_stand_below_as_quoted(store: Path, page: Path) -> N
     assert quoted["Siamese-KPConv, quoted from Table 6"]["fourteen experiments: F1"] == "0.678"
     assert quoted["Siamese-KPConv, quoted from Table 6"]["real scans: tile F1"] == NOT_PRINTED
     assert quoted["SPICD-Net, quoted from Tables 5 and 6"]["removals: F1, recall"] == "0.62, 0.60"
+
+
+def test_a_card_that_has_the_f1_of_removals_alone_has_no_recall(store: Path, page: Path) -> None:
+    measure(store, "pointnet2", removals=None, f1_by_experiment={"type_remove": 0.63})
+    write_table(page, store)
+    assert rows_of(page)["`pointnet2/1`"]["removals: F1, recall"] == f"0.63, {MISSING}"
 
 
 def test_figures_of_fewer_visits_are_marked(store: Path, page: Path) -> None:

@@ -80,7 +80,7 @@ def test_a_share_of_the_still_pairs_is_kept_with_noise_on_every_point(tiles, net
     assert not some.kinds["stored"].statistics.any()
     means = np.expm1(some.kinds["stored noisy"].statistics[:, 0])
     assert means.min() > 0
-    assert means.max() < 0.03
+    assert means.max() < 0.1  # noise of a centimetre, and the gaps that lost points leave
     drawn = some.draw(4000, np.random.default_rng(0))
     labels = np.bincount(drawn.labels.numpy())
     assert labels.tolist() == pytest.approx([2000, 1400, 600], abs=8)

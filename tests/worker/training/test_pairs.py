@@ -19,7 +19,15 @@ from worker.training.augmentation import (
     turned_alike,
 )
 from worker.training.dataset import TileSet
-from worker.training.pairs import PAPER_PAIRS, PairMaker, PairSettings, changed, composition
+from worker.training.pairs import (
+    PAPER_PAIRS,
+    Disturbance,
+    PairMaker,
+    PairSettings,
+    changed,
+    composition,
+    disturbed,
+)
 from worker.training.settings import TrainSettings
 
 STILL = Augmentation(jitter=0, dropout=0, shift=0, yaw=0)
@@ -252,26 +260,43 @@ def nearest(points: np.ndarray, others: np.ndarray) -> np.ndarray:
     return np.linalg.norm(points[:, None] - others, axis=2).min(axis=1)
 
 
-def test_a_still_pair_with_noise_has_one_level_of_it_on_its_current_points_alone(tiles):
+def test_a_still_pair_that_is_disturbed_has_one_level_on_its_current_points_alone(tiles):
     settings = replace(
-        PLAIN, rerun_share=0.0, revisit_share=0.0, rebuilt_share=1.0, noisy_share=1.0, noise=0.02
+        PLAIN,
+        rerun_share=0.0,
+        revisit_share=0.0,
+        rebuilt_share=1.0,
+        noisy_share=1.0,
+        noise=0.02,
+        thinning=0.4,
     )
     maker = PairMaker(tiles, settings)
-    levels, stored = [], {tuple(point) for points in tiles.points_a for point in points.round(4)}
+    suffered, stored = [], {tuple(point) for points in tiles.points_a for point in points.round(4)}
     for seed in range(20):
         observations = maker._observations((1, 0), np.random.default_rng(seed))
-        assert 0 < observations.noise < 0.02
         unchanged = maker.pair(0, np.random.default_rng(seed), observations)
         assert rows(unchanged.reference) <= stored
         assert not rows(unchanged.current) & stored
-        levels.append(observations.noise)
-    assert max(levels) > 2 * min(levels)
+        suffered.append(observations.disturbance)
+    assert 0 < min(one.noise for one in suffered) < max(one.noise for one in suffered) < 0.02
+    assert 4 < sum(one.lost > 0 for one in suffered) < 16
+    assert max(one.lost for one in suffered) < 0.4
 
 
-def test_no_still_pair_has_noise_where_no_share_is_asked_for(tiles):
+def test_a_disturbed_cloud_loses_the_share_and_moves_by_the_noise():
+    cloud = np.random.default_rng(0).random((1000, 3), dtype=np.float32)
+    moved = disturbed(cloud, Disturbance(noise=0.01, lost=0.0), np.random.default_rng(1))
+    assert (moved - cloud).std() == pytest.approx(0.01, rel=0.1)
+    thinner = disturbed(cloud, Disturbance(noise=0.0, lost=0.3), np.random.default_rng(1))
+    assert len(thinner) == 700
+    assert rows(thinner) <= rows(cloud)
+    assert disturbed(cloud, None, np.random.default_rng(1)) is cloud
+
+
+def test_no_still_pair_is_disturbed_where_no_share_is_asked_for(tiles):
     maker = PairMaker(tiles, replace(PLAIN, rerun_share=0.0, revisit_share=0.0, rebuilt_share=1.0))
     drawn = [maker._observations((1, 0), np.random.default_rng(seed)) for seed in range(20)]
-    assert {observations.noise for observations in drawn} == {0.0}
+    assert {observations.disturbance for observations in drawn} == {None}
 
 
 def test_the_same_stream_gives_the_same_pairs(tiles):

@@ -37,7 +37,7 @@ class PaperSettings:
 
     site: SiteSettings = field(default_factory=SiteSettings)
     validation_seed: int = 101  #: of the corridor that thresholds are chosen on
-    model: str = "spicd-net/1"
+    model: str = "spicd-net/2"
     model_store: Path = MODEL_STORE
     weights: Path | None = None  #: a checkpoint of training, measured in place of the model's weights
     everywhere: bool = False  #: changes are in all scans of a tile, not in the modified one alone
