@@ -51,11 +51,7 @@ def paper_told() -> dict[str, Any]:
             {"name": "aggregated", "paper": {"f1": 0.84}},
         ],
         "table_6": [method("spicd-net/1", 0.85), method("C2C (mean)", 0.5), method("M3C2", 0.6)],
-<<<<<<< HEAD
-        "robustness": [],
-=======
         "robustness": [figures(0.7, disturbance="jitter (mm)", level=10)],
->>>>>>> net
         "by_kind": {"remove": {"spicd-net/1": {"f1": 0.64, "f1_at_test_threshold": 0.65}, "M3C2": {"f1": 0}}},
     }
 
