@@ -37,7 +37,7 @@ def chamfer_statistics(
 
 def swapped(statistics: Tensor) -> Tensor:
     """Return the statistics (n, 8) or (n, 16) of the same pairs with reference and current exchanged."""
-    blocks = statistics.split(STATISTICS, dim=1)
+    blocks = torch.split(statistics, STATISTICS, dim=1)
     return torch.cat([block.roll(STATISTICS // 2, dims=1) for block in blocks], dim=1)
 
 
