@@ -45,11 +45,12 @@ OPTIONS = (
     Option(
         "noisy_share",
         float,
-        "Of still pairs, those with noise on every point or points lost.",
+        "Of still pairs, those with noise on every point.",
         0,
         1,
         of_pairs=True,
     ),
+    Option("thinning", float, "Half of those lose points, up to this share.", 0, 1, of_pairs=True),
     Option("counts", bool, "Give the head point counts beside the Chamfer statistics.", of_pairs=True),
     Option("density", float, "Least and largest share of points that changes take.", count=2, of_pairs=True),
     Option("start_from", str, "Checkpoint whose network is trained on."),

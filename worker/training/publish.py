@@ -69,7 +69,8 @@ OURS = {
     ),
     "chamfer_points": "the Chamfer statistics are of all points of both patches, not of 128 of each",
     "counts": "the head is given point counts beside the Chamfer statistics",
-    "noisy_share": "noisy_share of the still pairs have noise of one level on every current point, and half of them lost points",
+    "noisy_share": "noisy_share of the still pairs have noise of one level on every current point",
+    "thinning": "half of the pairs with noise also lose points, up to the share thinning",
     "stored_still": "a stored patch that comes back is not augmented, nor a change of one",
     "matched_pairs": "a changed pair comes with an unchanged one of the same tile",
     "min_shown": "changes that hardly show are drawn again",
@@ -230,6 +231,7 @@ def deviations(settings: dict[str, Any]) -> list[str]:
         **pairs,
         "chamfer_points": pairs["chamfer_points"] is None,
         "density": tuple(pairs["density"]) != PAPER_DENSITY,
+        "thinning": min(pairs["noisy_share"], pairs["thinning"]),
     }
     return [*DEVIATIONS, *(words for name, words in OURS.items() if ours[name])]
 

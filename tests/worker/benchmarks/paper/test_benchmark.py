@@ -26,7 +26,7 @@ def test_three_experiments_are_run_told_and_drawn(tmp_path: Path, capsys: pytest
     told = json.loads(capsys.readouterr().out)
     assert json.loads((tmp_path / "paper.json").read_text()) == told
     assert told["command"] == "spicd-worker evaluate paper --true-poses --quick"
-    assert told["sha256"] == open_card(MODEL_STORE, "spicd-net/1").sha256
+    assert told["sha256"] == open_card(MODEL_STORE, "spicd-net/2").sha256
     names = [row["name"] for row in told["table_5"]]
     assert names == ["magnitude_15cm", "type_remove", "baseline_no_change", "aggregated"]
     tiles = told["map"]["tiles"]
@@ -34,7 +34,7 @@ def test_three_experiments_are_run_told_and_drawn(tmp_path: Path, capsys: pytest
         assert sum(row[name] for name in COUNTS) == tiles
         assert row["true_positives"] + row["false_negatives"] <= row["scans"] * row["tiles_per_scan"]
     methods = {row["method"]: row for row in told["table_6"]}
-    expected = {"spicd-net/1", "C2C (mean)", "C2C (share over 10 cm)", "M3C2-approx"}
+    expected = {"spicd-net/2", "C2C (mean)", "C2C (share over 10 cm)", "M3C2-approx"}
     assert set(methods) == expected | ({"M3C2"} if m3c2_is_installed() else set())
     assert told["left_out"] == ([] if m3c2_is_installed() else ["M3C2"])
     for row in methods.values():
