@@ -11,7 +11,7 @@ import torch
 from worker.detectors.card import MODEL_STORE
 from worker.detectors.comparison import Comparison
 from worker.detectors.spicd_net.detector import SpicdNet
-from worker.detectors.store import open_card, open_detector, write_model
+from worker.detectors.store import open_card, open_detector, weights_of, write_model
 from worker.errors import DetectorUnavailable
 
 
@@ -131,8 +131,9 @@ def test_a_model_of_which_the_head_alone_was_trained_keeps_the_rest_in_its_base(
     )
     assert (folder / "weights.safetensors").stat().st_size < 1000
     opened = open_detector(model_store, "spicd-net/8", device="cpu")
-    assert opened.weights().keys() == weights.keys()
-    assert all(torch.equal(opened.weights()[name], value) for name, value in weights.items())
+    whole = weights_of(opened)
+    assert whole.keys() == weights.keys()
+    assert all(torch.equal(whole[name], value) for name, value in weights.items())
     with pytest.raises(ValueError, match="not whole by itself"):
         write_model(model_store / "spicd-net" / "9", card, weights, base=opened)
 

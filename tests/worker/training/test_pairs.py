@@ -277,6 +277,7 @@ def test_a_still_pair_that_is_disturbed_has_one_level_on_its_current_points_alon
         unchanged = maker.pair(0, np.random.default_rng(seed), observations)
         assert rows(unchanged.reference) <= stored
         assert not rows(unchanged.current) & stored
+        assert observations.disturbance is not None
         suffered.append(observations.disturbance)
     assert 0 < min(one.noise for one in suffered) < max(one.noise for one in suffered) < 0.02
     assert 4 < sum(one.lost > 0 for one in suffered) < 16
