@@ -22,7 +22,7 @@ SLOW = (
     "browser",
     "integration",
     "test_breaking.py",
-    "service/api/http/test_uploads.py",
+    "service/api/http/reading/test_uploads.py",
     "service/api/test_disk_full.py",
     "service/api/test_outages.py",
     "service/catalog/test_migrations.py",

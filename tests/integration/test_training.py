@@ -143,11 +143,11 @@ def test_the_weights_are_the_bases_or_near_them_and_those_that_the_card_vouches_
     job = asked(house)
     run(job)
     at = context(house, job)
-    ours, base = kept_detector(at, "lobby-net/1"), kept_detector(at, MODEL)
-    assert isinstance(ours, SpicdNet)
-    assert isinstance(base, SpicdNet)
     name = "head.classifier.0.weight"
-    apart = float((ours.weights()[name] - base.weights()[name]).abs().max())
+    with kept_detector(at, "lobby-net/1") as ours, kept_detector(at, MODEL) as base:
+        assert isinstance(ours, SpicdNet)
+        assert isinstance(base, SpicdNet)
+        apart = float((ours.weights()[name] - base.weights()[name]).abs().max())
     kept = "kept" in Card.model_validate(made(house, job).card).training
     assert apart == 0 if kept else 0 < apart < 0.1
     content = house.catalog.blobs.get_bytes(blob_keys.model_weights(job.job_id))

@@ -19,7 +19,7 @@ export function Dialogs({ app, state }: Props) {
         onClose={() => dialog === "help" && close()}
         aria-labelledby="help-title"
       >
-        <Help app={app} state={state} close={close} />
+        {dialog === "help" && <Help app={app} state={state} close={close} />}
       </dialog>
       <dialog
         ref={(element) => shown(element, dialog === "key")}
