@@ -40,13 +40,20 @@ class TilingSettings(StrictModel):
 class TileGrid:
     """A regular grid in the map frame; tile (i, j, k) starts at `origin + (i, j, k) * size`.
 
-    Indices below zero come with a map that grew: tiles keep their ids from version to version.
+    Indices below zero come with a map that grew: tiles keep their ids from version to version. Its arrays cannot be
+    written to, for all tiles of a map share them.
     """
 
     origin: Floats  #: (3,) metres, map frame, minimum corner of tile (0, 0, 0)
     size: Floats  #: (3,) metres
     shape: tuple[int, int, int]  #: number of tiles along x, y, z
     lowest: tuple[int, int, int] = (0, 0, 0)  #: indices of the first tile
+
+    def __post_init__(self) -> None:
+        for name in ("origin", "size"):
+            fixed = getattr(self, name).view()
+            fixed.flags.writeable = False
+            object.__setattr__(self, name, fixed)
 
     def lower(self, indices: Indices) -> Floats:
         """Return (T, 3) metres, map frame: minimum corners."""

@@ -230,3 +230,12 @@ def test_points_of_a_large_cloud_are_located_some_at_a_time(monkeypatch: pytest.
     whole = grid.locate(points)
     monkeypatch.setattr(module, "_AT_ONCE", 64)
     assert np.array_equal(grid.locate(points), whole)
+
+
+def test_nobody_who_shares_a_grid_can_change_it() -> None:
+    size = np.array(SIZE)
+    grid = TileGrid(origin=np.zeros(3), size=size, shape=(1, 1, 1))
+    for array in (grid.origin, grid.size):
+        with pytest.raises(ValueError, match="read-only"):
+            array *= 2
+    assert size.flags.writeable  # it is the grid's that cannot be written to, not the caller's

@@ -286,6 +286,6 @@ def _tile_before_and_after(result: PaperResult, place: int, tile: int, words: st
         limits = np.stack([corner, corner + size]).T
         axes.set(xlim=limits[0], ylim=limits[1], zlim=limits[2])
         axes.set_title(title, fontsize=9)
-        axes.set_box_aspect(size)
+        axes.set_box_aspect(tuple(size))  # an array it would scale in place
         axes.tick_params(labelsize=6)
     return figure

@@ -68,3 +68,13 @@ def test_the_report_says_which_pictures_it_lacks_and_why(result: PaperResult, tm
         assert words in page
     assert page.count("Left out") == 4
     assert page.count("data:image/png;base64,") == len(list(tmp_path.glob("*.png"))) == 8
+
+
+def test_drawing_a_report_changes_nothing_that_the_next_model_is_given(
+    result: PaperResult, tmp_path: Path
+) -> None:
+    grid = result.site.tiles.grid
+    before = grid.size.copy(), grid.origin.copy()
+    write_report(result, document(result), tmp_path)
+    assert np.array_equal(grid.size, before[0])
+    assert np.array_equal(grid.origin, before[1])
