@@ -207,9 +207,12 @@ def _pairs(tiles: TileSet, settings: dict[str, Any]) -> SurveyPairs:
 
 
 def _training(state: dict[str, Any], tiles: TileSet, command: str) -> dict[str, Any]:
+    settings = dict(state["settings"])
+    if settings["start_from"] is not None:  # folder and file, for where it lay is nobody else's matter
+        settings["start_from"] = "/".join(Path(settings["start_from"]).parts[-2:])
     return {
         "command": command,
-        "settings": state["settings"],
+        "settings": settings,
         "best_epoch": state["best_epoch"],
         "seconds_to_best": round(state["seconds"]),
         "paper": "up to 1,000 epochs, 276 run (Section 3.8)",

@@ -109,6 +109,15 @@ def test_the_trainings_log_comes_along_and_that_of_an_earlier_one_goes(store, tm
     assert not (folder / LOG).exists()
 
 
+def test_a_card_says_what_a_training_started_from_but_not_where_it_lay(store, tmp_path):
+    run, tiles = store.parent / "run", store.parent / "tiles.npz"
+    state = torch.load(run / "best.pt", weights_only=True)
+    state["settings"]["start_from"] = str(run / "last.pt")
+    torch.save(state, tmp_path / "best.pt")
+    card = read_card(publish(tmp_path / "best.pt", tiles, tmp_path / "store", summary=""))
+    assert card.training["settings"]["start_from"] == "run/last.pt"
+
+
 def test_a_card_names_the_deviations_of_its_own_training():
     assert deviations(asdict(PAPER)) == list(DEVIATIONS)
     ours = asdict(TrainSettings())
