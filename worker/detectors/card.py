@@ -90,7 +90,8 @@ class Card(StrictModel):
     quiet: QuietRecord | None = Field(default=None, description="of models that score voxels")
     precision: dict[str, PrecisionCheck] = Field(
         default_factory=dict,
-        description="what `spicd-worker evaluate precision` measured, by `cpu` and `cuda`, which compute differently",
+        description="what `spicd-worker evaluate precision`, or the training that published the model, measured, "
+        "by `cpu` and `cuda`, which compute differently",
     )
     weights: str | None = Field(default=None, description="file beside the card")
     sha256: str | None = Field(default=None, description="of the weights file")

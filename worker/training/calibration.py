@@ -42,6 +42,14 @@ class SurveyPairs:
         kinds = np.array(self.kinds)
         return (kinds == UNCHANGED) | (kinds == WHOLE) if WHOLE in self.kinds else np.ones(len(kinds), bool)
 
+    def subset(self, chosen: NDArray[np.intp]) -> SurveyPairs:
+        """Return the pairs at these indices."""
+        return SurveyPairs(
+            reference=tuple(self.reference[pair] for pair in chosen),
+            current=tuple(self.current[pair] for pair in chosen),
+            kinds=tuple(self.kinds[pair] for pair in chosen),
+        )
+
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class SurveyFigures:

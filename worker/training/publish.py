@@ -20,10 +20,20 @@ from numpy.typing import NDArray
 
 from worker.cloud.tiling import TileGrid, TilePairs, Tiles
 from worker.cloud.types import Arrays
-from worker.detectors.card import MODEL_STORE, Card, Preprocessing
+from worker.detectors.card import MODEL_STORE, Card, PrecisionCheck, Preprocessing
 from worker.detectors.comparison import Comparison
 from worker.detectors.detector import Detector
-from worker.detectors.store import WEIGHTS, detector_class, open_detector, weights_of, write_model
+from worker.detectors.precision import has_bfloat16
+from worker.detectors.running.runtime import RunsNetwork, Runtime
+from worker.detectors.store import (
+    WEIGHTS,
+    detector_class,
+    open_detector,
+    read_card,
+    weights_of,
+    write_card,
+    write_model,
+)
 from worker.training.calibration import (
     PREVALENCE,
     SurveyPairs,
@@ -38,6 +48,10 @@ from worker.training.pairs import PairSettings
 from worker.training.settings import detector_settings, whole
 
 VOXEL_SIZE, MIN_POINTS = 0.05, 512  #: paper, Table 3; the training tiles are made with the same
+
+PRECISION_PAIRS = (
+    256  #: of the validation pairs, that are scored in bfloat16 too, to see whether the scores hold
+)
 
 #: What a card says of the pairs that its figures are measured on.
 ABOUT_PAIRS = (
@@ -141,6 +155,8 @@ def publish(
     folder = write_model(
         model_store / card.name / version, card.model_copy(update=final), weights, base=stands_on
     )
+    written = read_card(folder)
+    write_card(folder, written.model_copy(update={"precision": _precision(best, written, command)}))
     _take_log(checkpoint.parent / LOG, folder / LOG)
     return folder
 
@@ -167,6 +183,30 @@ class _Scored:
         """Return the figures at a threshold, as the card has them."""
         figures = asdict(figures_at(threshold, self.scores, self.pairs))
         return {"pairs": len(self.pairs.kinds), "area_under_roc": self.area, **figures}
+
+
+def _precision(best: _Scored, card: Card, command: str) -> dict[str, PrecisionCheck]:
+    """Score some of the validation pairs in bfloat16, as a processor and as a GPU computes; {} where nothing can."""
+    detector = best.detector
+    if not (isinstance(detector, RunsNetwork) and "bfloat16" in detector.precisions and has_bfloat16(CPU)):
+        return {}
+    chosen = np.unique(np.linspace(0, len(best.scores) - 1, PRECISION_PAIRS).astype(np.intp))
+    pairs, exact = best.pairs.subset(chosen), best.scores[chosen]
+    checks = {}
+    for kind, device in (("cpu", platform.machine()), ("cuda", f"{platform.machine()}, as a GPU computes")):
+        detector.run_with(Runtime(precision="bfloat16", at_once=kind == "cuda"))
+        coarse = change_scores(detector, pairs)
+        checks[kind] = PrecisionCheck(
+            largest_score_difference=float(np.abs(coarse - exact).max()),
+            decided_otherwise=int(((coarse > card.threshold) != (exact > card.threshold)).sum()),
+            tiles=len(chosen),
+            sha256=str(card.sha256),
+            device=device,
+            data="validation pairs of the training",
+            command=command,
+        )
+    detector.run_with(Runtime())
+    return checks
 
 
 def _evaluation(

@@ -237,5 +237,5 @@ def test_nobody_who_shares_a_grid_can_change_it() -> None:
     grid = TileGrid(origin=np.zeros(3), size=size, shape=(1, 1, 1))
     for array in (grid.origin, grid.size):
         with pytest.raises(ValueError, match="read-only"):
-            array *= 2
+            np.multiply(array, 2, out=array)
     assert size.flags.writeable  # it is the grid's that cannot be written to, not the caller's

@@ -12,6 +12,7 @@ import torch
 from worker.detectors.spicd_net.detector import SpicdNet
 from worker.detectors.store import open_detector, read_card
 from worker.errors import DetectorUnavailable
+from worker.training import publish as module
 from worker.training.calibration import best_threshold, survey_pairs
 from worker.training.dataset import save_tiles, split_tiles
 from worker.training.log import LOG
@@ -116,6 +117,26 @@ def test_a_card_says_what_a_training_started_from_but_not_where_it_lay(store, tm
     torch.save(state, tmp_path / "best.pt")
     card = read_card(publish(tmp_path / "best.pt", tiles, tmp_path / "store", summary=""))
     assert card.training["settings"]["start_from"] == "run/last.pt"
+
+
+def test_how_far_the_scores_move_in_bfloat16_is_measured_for_these_weights(store, tmp_path, monkeypatch):
+    monkeypatch.setattr("worker.detectors.precision.has_bfloat16", lambda device: True)
+    monkeypatch.setattr(module, "has_bfloat16", lambda device: True)
+    checkpoint, tiles = store.parent / "run" / "best.pt", store.parent / "tiles.npz"
+    card = read_card(publish(checkpoint, tiles, tmp_path, summary="", command="pytest"))
+    assert set(card.precision) == {"cpu", "cuda"}
+    for kind, check in card.precision.items():
+        assert 0 < check.largest_score_difference < 0.05
+        assert check.tiles > 20
+        assert check.command == "pytest"
+        assert card.holds_in_bfloat16(kind) is check.holds
+    assert card.precision["cuda"].device.endswith("as a GPU computes")
+
+
+def test_where_no_processor_computes_so_nothing_is_said_of_it(store, tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "has_bfloat16", lambda device: False)
+    checkpoint, tiles = store.parent / "run" / "best.pt", store.parent / "tiles.npz"
+    assert read_card(publish(checkpoint, tiles, tmp_path, summary="")).precision == {}
 
 
 def test_a_card_names_the_deviations_of_its_own_training():

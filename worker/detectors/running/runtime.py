@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Protocol, runtime_checkable
+from typing import ClassVar, Protocol, runtime_checkable
 
-from worker.detectors.precision import PrecisionChoice
+from worker.detectors.precision import Precision, PrecisionChoice
 from worker.detectors.running.calls import Batches, DirectBatches
 
 
@@ -21,6 +21,8 @@ class Runtime:
 @runtime_checkable
 class RunsNetwork(Protocol):
     """A detector with a network."""
+
+    precisions: ClassVar[tuple[Precision, ...]]  #: that the network can be computed in
 
     def run_with(self, runtime: Runtime) -> None:
         """Run it so from now on. Raises DetectorUnavailable for a precision that the device does not have."""

@@ -24,6 +24,7 @@ from worker.detectors.running.calls import NetworkCall
 from worker.detectors.running.runtime import Runtime
 from worker.detectors.siamese.chamfer import chamfer_statistics
 from worker.detectors.siamese.head import PairHead
+from worker.errors import DetectorUnavailable
 from worker.progress import Progress, no_progress
 
 #: Tiles of a batch on a processor, so between two calls of `progress`, and how soon a dismissed job stops: some 40 ms on
@@ -70,6 +71,7 @@ class SiameseDetector(ABC):
     """
 
     settings_class: ClassVar[type[SiameseSettings]] = SiameseSettings
+    precisions: ClassVar[tuple[Precision, ...]] = ("float32",)
 
     def __init__(self, card: Card, network: nn.Module, head: PairHead, device: torch.device) -> None:
         """Take a network in whose weights those of `head` are."""
@@ -87,8 +89,14 @@ class SiameseDetector(ABC):
         """Run the network so from now on (worker.detectors.running.runtime)."""
         self._batches = runtime.batches
         at_once = self._device.type == "cuda" if runtime.at_once is None else runtime.at_once
-        holds = self.card.holds_in_bfloat16("cuda" if at_once else "cpu")
-        self._encode_with(chosen_precision(runtime.precision, self._device, holds=holds), at_once=at_once)
+        holds = "bfloat16" in self.precisions and self.card.holds_in_bfloat16("cuda" if at_once else "cpu")
+        precision = chosen_precision(runtime.precision, self._device, holds=holds)
+        if precision not in self.precisions:
+            raise DetectorUnavailable(
+                f"model {self.card.model} computes in {' or '.join(self.precisions)}, not in {precision}; "
+                "set SPICD_INFERENCE_PRECISION to auto"
+            )
+        self._encode_with(precision, at_once=at_once)
 
     def _encode_with(self, precision: Precision, *, at_once: bool) -> None:
         """Encode in this precision from now on; `at_once`: a batch as one, as a GPU does best."""

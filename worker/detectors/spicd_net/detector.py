@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -18,6 +19,8 @@ from worker.detectors.spicd_net.together import TogetherEncoder, level
 
 class SpicdNet(SiameseDetector):
     """Detector (worker.detectors.detector) around the network of the paper's Section 3.6."""
+
+    precisions: ClassVar[tuple[Precision, ...]] = ("float32", "bfloat16")
 
     def __init__(self, card: Card, network: SpicdNetwork, device: torch.device) -> None:
         super().__init__(card, network, network.head, device)

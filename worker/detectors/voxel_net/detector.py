@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Self
+from typing import ClassVar, Self
 
 import numpy as np
 import torch
@@ -46,6 +46,7 @@ class VoxelNet(Scorer):
     """Detector (worker.detectors.detector) that weighs the evidence by a network; it has one for blind clouds."""
 
     settings_class = VoxelNetSettings
+    precisions: ClassVar[tuple[Precision, ...]] = ("float32", "bfloat16")
 
     def __init__(self, card: Card, networks: dict[str, VoxelNetwork], device: torch.device) -> None:
         settings = card.settings_as(VoxelNetSettings)

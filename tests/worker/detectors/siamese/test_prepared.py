@@ -10,11 +10,12 @@ from worker.cloud.tiling import TilePairs
 from worker.detectors.card import Card, Preprocessing
 from worker.detectors.comparison import Comparison
 from worker.detectors.registry import trainable_detectors
+from worker.detectors.running.runtime import Runtime
 from worker.detectors.siamese.prepared import SiameseNetwork
 from worker.detectors.siamese.prepared_detector import PreparedDetector
 from worker.detectors.store import detector_class, open_detector, write_model
 from worker.detectors.trainable import CHANGED, UNCHANGED, Pair, TrainableNetwork, network_class
-from worker.errors import Cancelled
+from worker.errors import Cancelled, DetectorUnavailable
 
 KEYS = ("kpconv", "pointnet2")
 CPU = torch.device("cpu")
@@ -198,3 +199,12 @@ def test_an_encoder_is_taken_over_without_its_head(key, network):
     for name, value in fresh.state_dict().items():
         expected = head[name] if name in head else network.state_dict()[name]
         assert torch.equal(value, expected), name
+
+
+def test_bfloat16_which_these_networks_do_not_have_is_refused_and_never_chosen(detector, key, monkeypatch):
+    monkeypatch.setattr("worker.detectors.precision.has_bfloat16", lambda device: True)
+    with pytest.raises(DetectorUnavailable, match=f"model {key}/3 computes in float32, not in bfloat16"):
+        detector.run_with(Runtime(precision="bfloat16"))
+    monkeypatch.setattr(Card, "holds_in_bfloat16", lambda card, kind: True)
+    detector.run_with(Runtime(precision="auto"))
+    assert detector._precision == "float32"
