@@ -199,13 +199,18 @@ def training_curves(log: Log) -> Figure:
     """Draw loss and accuracy of training and validation over the epochs (paper, Figure 8)."""
     figure = Figure(figsize=(10, 4), dpi=120, layout="constrained")
     left, right = figure.subplots(1, 2)
-    _draw_epochs(left, log, "train_loss", "validation_loss")
+    draw_losses(left, log)
     label(left, "epoch", "focal loss")
     left.set_ylim(bottom=0)
     _draw_epochs(right, log, "train_accuracy", "accuracy", scale=100)
     label(right, "epoch", "accuracy (%)")
     right.set_ylim(0, 100)
     return figure
+
+
+def draw_losses(axes: Axes, log: Log) -> None:
+    """Draw the loss of training and validation over the epochs."""
+    _draw_epochs(axes, log, "train_loss", "validation_loss")
 
 
 def read_log(path: Path) -> Log:

@@ -63,8 +63,11 @@ def table(
         typer.Option("--check", help="Write nothing; fail where the document is not what the cards say."),
     ] = False,
 ) -> None:
-    """Set all detectors side by side, from what their cards say: the table of docs/comparison.md."""
-    from worker.benchmarks.table import write_table  # noqa: PLC0415
+    """Set all detectors side by side, from what their cards say: the table of docs/comparison.md and its pictures."""
+    from worker.benchmarks.table import measured, write_table  # noqa: PLC0415
+    from worker.benchmarks.table_pictures import write_pictures  # noqa: PLC0415
 
     changed = write_table(page, model_store, check=check)
+    if not check:
+        write_pictures(page.parent / "pictures", measured(model_store), model_store)
     terminal.output().print(f"{page}: {'written' if changed else 'up to date'}", highlight=False)
