@@ -11,7 +11,7 @@ from worker.benchmarks.paper.experiments import published
 from worker.benchmarks.plots import coloured, draw_losses, entitle, label, read_log, save
 from worker.benchmarks.table import Measured
 
-PAPER = {"color": "#555", "marker": "D", "linestyle": "none"}  #: of points that the paper prints
+PRINTED = "#555"  #: of points that the paper prints
 
 
 def write_pictures(folder: Path, rows: Sequence[Measured], model_store: Path) -> list[Path]:
@@ -41,7 +41,8 @@ def experiments(rows: Sequence[Measured]) -> Figure | None:
     for color, (model, by_experiment) in coloured(known):
         values = [_drawn(by_experiment.get(name)) for name in names]
         axes.plot(names, values, "o-", color=color, label=model)
-    axes.plot(names, [printed[name]["f1"] for name in names], label="SPICD-Net in the paper", **PAPER)
+    theirs = [printed[name]["f1"] for name in names]
+    axes.plot(names, theirs, "D", color=PRINTED, label="SPICD-Net in the paper")
     entitle(axes, "The paper's experiments: F1 at a threshold chosen on another corridor")
     label(axes, "", "F1", legend=False)
     axes.legend(fontsize=8, frameon=False, loc="center left", bbox_to_anchor=(1, 0.5))
@@ -68,7 +69,8 @@ def disturbances(rows: Sequence[Measured]) -> Figure | None:
             )
         if kind.startswith("dropout"):
             paper = published()["robustness"]["dropout"]
-            axes.plot([100 * float(lost) for lost in paper], list(paper.values()), label="paper", **PAPER)
+            lost = [100 * float(share) for share in paper]
+            axes.plot(lost, list(paper.values()), "D", color=PRINTED, label="paper")
         axes.set_ylim(-0.03, 1.03)
         label(axes, kind, "F1")
     return figure
