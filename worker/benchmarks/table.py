@@ -23,7 +23,7 @@ from worker.files import write_text
 
 BEGIN, END = "<!-- evaluate table: begin -->", "<!-- evaluate table: end -->"
 MISSING = "not measured"
-NOT_PRINTED = "not in the paper"
+NOT_PRINTED = "–"  #: of the paper's rows; the page says what it means
 NONE = "none"
 #: The detectors in the table's order; others come after them by name.
 ORDER = (

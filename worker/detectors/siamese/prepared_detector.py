@@ -11,6 +11,7 @@ from torch import Tensor
 from worker.cloud.patches import Patch
 from worker.detectors.card import Card
 from worker.detectors.siamese.detector import SiameseDetector
+from worker.detectors.siamese.parallel import in_groups
 from worker.detectors.siamese.prepared import PreparedEncoder, SiameseNetwork
 
 
@@ -32,10 +33,16 @@ class PreparedDetector(SiameseDetector):
         network.load_state_dict(weights)
         return cls(card, network, device)
 
-    @torch.inference_mode()
     def _descriptors(self, patches: Sequence[Patch]) -> Tensor:
-        """Encode tile by tile on a CPU, where one fills its caches, and all at once on a GPU."""
-        few = 1 if self._device.type == "cpu" else len(patches)
-        clouds = [patch.distinct for patch in patches]
-        starts = range(0, len(clouds), few)
-        return torch.cat([self._encoder(self._encoder.prepare(clouds[at : at + few])) for at in starts])
+        """Encode tile by tile on a CPU, where one fills its caches, shared among threads; all at once on a GPU."""
+        if self._device.type == "cpu":
+            return torch.cat(in_groups(self._one_by_one, patches))
+        return self._together(patches)
+
+    def _one_by_one(self, patches: Sequence[Patch]) -> Tensor:
+        return torch.cat([self._together([patch]) for patch in patches])
+
+    @torch.inference_mode()
+    def _together(self, patches: Sequence[Patch]) -> Tensor:
+        descriptors: Tensor = self._encoder(self._encoder.prepare([patch.distinct for patch in patches]))
+        return descriptors
