@@ -9,6 +9,7 @@ import typer
 from worker.cli import cards, evaluate, terminal
 from worker.cli.demo import demo
 from worker.cli.detect import detect
+from worker.cli.publish import publish
 from worker.cli.register import register
 from worker.cli.train import train, with_training_options
 from worker.cli.train_voxels import train_voxels
@@ -42,6 +43,7 @@ def _commands() -> typer.Typer:
         detect,
         register,
         with_training_options(train),
+        publish,
         train_voxels,
         demo,
         evaluate.bench,

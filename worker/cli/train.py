@@ -57,8 +57,13 @@ def train(
         _make_tiles(tiles, buildings, progress)
         best = run(settings, tiles, folder, progress, on_epoch=draw_curves)
     terminal.output().print(
-        f"{best}\n`python -m worker.training.publish {best} {tiles}` makes a model of it", highlight=False
+        f"{best}\nmake a model of it: spicd-worker publish {folder}{_of(tiles, folder)} --model NAME/VERSION",
+        highlight=False,
     )
+
+
+def _of(tiles: Path, folder: Path) -> str:
+    return "" if tiles == folder / "tiles.npz" else f" --tiles {tiles}"
 
 
 def with_training_options(command: Callable[..., None]) -> Callable[..., None]:

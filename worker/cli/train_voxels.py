@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from worker.cli import terminal
+from worker.cli.publish import new_model, next_version
 from worker.detectors.card import MODEL_STORE
 
 SUMMARY = (
@@ -23,7 +24,10 @@ def train_voxels(
     store: Annotated[
         Path, typer.Option(help="Where the model is written, as voxel-net/VERSION.")
     ] = MODEL_STORE,
-    version: Annotated[str, typer.Option(help="Of the model.")] = "1",
+    version: Annotated[
+        str | None,
+        typer.Option(help="Version of the model; left out: the next number that the store has not."),
+    ] = None,
     offices: Annotated[int, typer.Option(min=0, help="Simulated offices of a new set of samples.")] = 12,
     corridors: Annotated[int, typer.Option(min=0, help="Simulated corridors.")] = 8,
     rooms: Annotated[int, typer.Option(min=0, help="Simulated single rooms.")] = 24,
@@ -42,6 +46,9 @@ def train_voxels(
     from worker.training.voxels.samples import load_samples  # noqa: PLC0415
     from worker.training.voxels.trainer import VoxelTrainSettings, train_networks  # noqa: PLC0415
 
+    if version is None:
+        version = next_version(store, "voxel-net")
+    new_model(store, f"voxel-net/{version}")
     if threads is not None:
         torch.set_num_threads(threads)
     buildings = {"office": offices, "corridor": corridors, "room": rooms}

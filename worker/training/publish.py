@@ -5,10 +5,8 @@ It stands apart from training, which needs torch and NumPy alone: a GPU machine 
 
 from __future__ import annotations
 
-import argparse
 import platform
 import shutil
-import sys
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -20,7 +18,7 @@ from numpy.typing import NDArray
 
 from worker.cloud.tiling import TileGrid, TilePairs, Tiles
 from worker.cloud.types import Arrays
-from worker.detectors.card import MODEL_STORE, Card, PrecisionCheck, Preprocessing
+from worker.detectors.card import Card, PrecisionCheck, Preprocessing
 from worker.detectors.comparison import Comparison
 from worker.detectors.detector import Detector
 from worker.detectors.precision import has_bfloat16
@@ -28,7 +26,6 @@ from worker.detectors.running.runtime import RunsNetwork, Runtime
 from worker.detectors.store import (
     WEIGHTS,
     detector_class,
-    open_detector,
     read_card,
     weights_of,
     write_card,
@@ -45,7 +42,13 @@ from worker.training.calibration import (
 from worker.training.dataset import TileSet, load_tiles, split_tiles
 from worker.training.log import LOG
 from worker.training.pairs import PairSettings
-from worker.training.settings import detector_settings, whole
+from worker.training.settings import (
+    TrainSettings,
+    detector_settings,
+    training_command,
+    whole,
+    without_place,
+)
 
 VOXEL_SIZE, MIN_POINTS = 0.05, 512  #: paper, Table 3; the training tiles are made with the same
 
@@ -104,8 +107,8 @@ def publish(
     *,
     unseen: Path | None = None,
     version: str = "1",
-    summary: str,
-    command: str = "",
+    summary: str | None = None,
+    command: str | None = None,
     name: str | None = None,
     about: Mapping[str, Any] | None = None,
     beside: Mapping[str, Detector] | None = None,
@@ -115,7 +118,8 @@ def publish(
 ) -> Path:
     """Write `model_store/<name>/<version>/`, its threshold chosen on the validation tiles; returns the folder.
 
-    `name` is the detector's where it is left out. `unseen` is a training set of other buildings, on which the card's
+    `name` is the detector's where it is left out, `command` what `spicd-worker train` takes for the checkpoint's settings,
+    `summary` a sentence with both. `unseen` is a training set of other buildings, on which the card's
     evaluation is measured; without one the validation tiles serve for that too, and the card says so. `about` adds to
     what the card says of the training; `beside` are other detectors by name, measured on the validation pairs at their
     own thresholds. `base` names the one of them that was trained further: where that ranks the validation pairs no
@@ -125,6 +129,10 @@ def publish(
     """
     state = torch.load(checkpoint, map_location="cpu", weights_only=True)
     settings = state["settings"] = whole(state["settings"])
+    command = training_command(settings) if command is None else command
+    if summary is None:
+        title = TrainSettings(detector=settings["detector"]).network.title
+        summary = f"{title}, trained by `{command}`"
     training_set = load_tiles(tiles)
     usual = Preprocessing(voxel_size=VOXEL_SIZE, tile_size=training_set.tile_size, min_points=MIN_POINTS)
     card = Card(
@@ -247,12 +255,9 @@ def _pairs(tiles: TileSet, settings: dict[str, Any]) -> SurveyPairs:
 
 
 def _training(state: dict[str, Any], tiles: TileSet, command: str) -> dict[str, Any]:
-    settings = dict(state["settings"])
-    if settings["start_from"] is not None:  # folder and file, for where it lay is nobody else's matter
-        settings["start_from"] = "/".join(Path(settings["start_from"]).parts[-2:])
     return {
         "command": command,
-        "settings": settings,
+        "settings": {**state["settings"], "start_from": without_place(state["settings"]["start_from"])},
         "best_epoch": state["best_epoch"],
         "seconds_to_best": round(state["seconds"]),
         "paper": "up to 1,000 epochs, 276 run (Section 3.8)",
@@ -285,26 +290,3 @@ def _take_log(log: Path, place: Path) -> None:
         shutil.copyfile(log, place)
     else:
         place.unlink(missing_ok=True)
-
-
-def main() -> None:
-    """Publish from the command line: `python -m worker.training.publish CHECKPOINT TILES`."""
-    parser = argparse.ArgumentParser(prog="python -m worker.training.publish")
-    parser.add_argument("checkpoint", type=Path)
-    parser.add_argument("tiles", type=Path, help="the training set that it was made with")
-    parser.add_argument("--unseen", type=Path, help="tiles of other buildings, to measure on")
-    parser.add_argument("--store", type=Path, default=MODEL_STORE, dest="model_store")
-    parser.add_argument("--version", default="1")
-    parser.add_argument("--summary", default="SPICD-Net as the paper describes it")
-    parser.add_argument("--command", default="", help="how the training was started, for the card")
-    parser.add_argument(
-        "--stands-on", help="model of the store (name/version) that has the weights which are equal"
-    )
-    given = vars(parser.parse_args())
-    if given["stands_on"] is not None:
-        given["stands_on"] = open_detector(given["model_store"], given["stands_on"], "cpu")
-    sys.stdout.write(f"{publish(**given)}\n")
-
-
-if __name__ == "__main__":
-    main()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import fields
+from dataclasses import asdict, fields
 from pathlib import Path
 
 import pytest
@@ -11,7 +11,7 @@ import pytest
 from worker.training import __main__ as command
 from worker.training.options import OPTIONS, with_options
 from worker.training.pairs import PairSettings
-from worker.training.settings import PAPER, TrainSettings
+from worker.training.settings import PAPER, TrainSettings, training_command
 
 
 @pytest.mark.parametrize("option", OPTIONS, ids=lambda option: option.name)
@@ -49,3 +49,31 @@ def test_the_bare_command_line_takes_them_all(monkeypatch, tmp_path, capsys):
         value = getattr(settings.pairs if option.of_pairs else settings, option.name)
         assert value == ((1.0, 1.0) if option.count == 2 else option.kind(1))
     assert capsys.readouterr().out == f"{tmp_path / 'best.pt'}\n"
+
+
+@pytest.mark.parametrize("preset", [TrainSettings(), PAPER], ids=["ours", "paper"])
+def test_the_command_of_a_checkpoint_gives_its_settings_again(preset):
+    given = {"detector": "kpconv", "minutes": 2.5, "counts": True, "density": [0.1, 0.4], "head_epochs": 7}
+    settings = with_options(preset, given, device="cpu")
+    words = training_command(asdict(settings)).split()
+    assert words[:3] == ["spicd-worker", "train", "FOLDER"]
+    assert ("--paper" in words) is (preset is PAPER)
+    told = {option.name: words[words.index(option.flag) + 1 :] for option in OPTIONS if option.flag in words}
+    read = {
+        option.name: True
+        if option.kind is bool
+        else [option.kind(word) for word in told[option.name][: option.count]]
+        for option in OPTIONS
+        if option.name in told
+    }
+    read = {
+        name: value[0] if isinstance(value, list) and len(value) == 1 else value
+        for name, value in read.items()
+    }
+    assert read == given
+    assert with_options(preset, read, device="cpu") == settings
+
+
+def test_the_command_names_what_it_started_from_but_not_where_that_lay():
+    settings = {**asdict(TrainSettings()), "start_from": "/home/somebody/run/last.pt"}
+    assert training_command(settings) == "spicd-worker train FOLDER --start-from run/last.pt"
