@@ -23,6 +23,8 @@ def command_line(context: typer.Context) -> str:
 
 
 def _spelled(option: Any, value: Any) -> list[str]:
+    if option.param_type_name == "argument":  # a folder of somebody's machine is told as its help calls it
+        return [str(option.name).upper() if isinstance(value, Path) else shlex.quote(str(value))]
     if isinstance(value, bool):
         return [option.opts[0] if value else option.secondary_opts[0]]
     values = value if isinstance(value, list | tuple) else [value]

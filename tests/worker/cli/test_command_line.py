@@ -41,6 +41,19 @@ def test_options_are_told_as_one_would_type_them() -> None:
     assert words == "cook taste --weights 'a b.pt' --weights c.pt --no-salt --quick"
 
 
+def test_an_argument_is_told_without_a_flag_and_a_folder_without_its_place() -> None:
+    found = []
+
+    def taste(context: typer.Context, folder: Path, times: int) -> None:  # noqa: ARG001
+        found.append(command_line(context))
+
+    app = typer.Typer()
+    app.command("taste")(taste)
+    app.command("other")(lambda: None)
+    app(args=["taste", "/home/somebody", "3"], prog_name="cook", standalone_mode=False)
+    assert found == ["cook taste FOLDER 3"]
+
+
 def test_what_the_environment_chose_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TASTE_MODEL", "rich/2")
     assert told() == "cook taste --model rich/2"
