@@ -40,12 +40,17 @@ class PrecisionSettings:
     model_store: Path = MODEL_STORE
     device: Device = "auto"
     way: Kind | None = (
-        None  #: of computing, the processor's or a GPU's, which any device can; None: the device's own
+        None  #: of computing: a GPU's, which any device can, or the processor's, which it alone can; None: the device's own
     )
     offices: int = 3
     scans: int = 6  #: of each visit
     edits: int = 6  #: between both
     seed: int = 1
+
+    @property
+    def computes_on(self) -> Device:
+        """The device that is used: for the processor's way always the processor, which alone searches in 8 bits."""
+        return "cpu" if self.way == "cpu" else self.device
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
@@ -56,13 +61,13 @@ class _Placed:
 
 def measure(settings: PrecisionSettings, progress: Progress = no_progress) -> PrecisionCheck:
     """Score everything both ways. Raises DetectorUnavailable for a device without bfloat16, and as `open_detector`."""
-    device = resolve_device(settings.device)
+    device = resolve_device(settings.computes_on)
     at_once = (settings.way or device.type) == "cuda"
     exact, coarse = (
         open_detector(
             settings.model_store,
             settings.model,
-            settings.device,
+            settings.computes_on,
             Runtime(precision=precision, at_once=at_once),
         )
         for precision in ("float32", "bfloat16")

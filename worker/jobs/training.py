@@ -189,7 +189,7 @@ def _settings(context: Context, asked: _Asked, tiles: Path) -> TrainSettings:
     share = held_out_share(load_tiles(tiles), min_separation=SITE.pairs.min_separation)
     # else the network would be used on another input than it was trained on
     own = settings_of(card) if asked.detector == card.detector else {}
-    pairs = {name: own[name] for name in ("patch_points", "chamfer_points") if name in own}
+    pairs = {name: own[name] for name in ("patch_points", "chamfer_points", "counts") if name in own}
     return replace(
         SITE,
         detector=asked.detector,

@@ -26,6 +26,7 @@ from worker.detectors.running.runtime import RunsNetwork, Runtime
 from worker.detectors.store import (
     WEIGHTS,
     detector_class,
+    open_detector,
     read_card,
     weights_of,
     write_card,
@@ -164,7 +165,8 @@ def publish(
         model_store / card.name / version, card.model_copy(update=final), weights, base=stands_on
     )
     written = read_card(folder)
-    write_card(folder, written.model_copy(update={"precision": _precision(best, written, command)}))
+    checks = _precision(model_store, written, pairs, command)
+    write_card(folder, written.model_copy(update={"precision": checks}))
     _take_log(checkpoint.parent / LOG, folder / LOG)
     return folder
 
@@ -193,27 +195,33 @@ class _Scored:
         return {"pairs": len(self.pairs.kinds), "area_under_roc": self.area, **figures}
 
 
-def _precision(best: _Scored, card: Card, command: str) -> dict[str, PrecisionCheck]:
-    """Score some of the validation pairs in bfloat16, as a processor and as a GPU computes; {} where nothing can."""
-    detector = best.detector
-    if not (isinstance(detector, RunsNetwork) and "bfloat16" in detector.precisions and has_bfloat16(CPU)):
+def _precision(model_store: Path, card: Card, pairs: SurveyPairs, command: str) -> dict[str, PrecisionCheck]:
+    """Score some of the pairs in float32, and in bfloat16 as a processor and as a GPU computes; {} where nothing can.
+
+    The model is opened for it anew: a detector that somebody else has in hand stays as it is.
+    """
+
+    def opened(**how: Any) -> Detector:
+        return open_detector(model_store, card.model, "cpu", Runtime(**how))
+
+    exact_detector = opened()
+    network = isinstance(exact_detector, RunsNetwork) and "bfloat16" in exact_detector.precisions
+    if not (network and has_bfloat16(CPU)):
         return {}
-    chosen = np.unique(np.linspace(0, len(best.scores) - 1, PRECISION_PAIRS).astype(np.intp))
-    pairs, exact = best.pairs.subset(chosen), best.scores[chosen]
+    some = pairs.subset(np.unique(np.linspace(0, len(pairs.kinds) - 1, PRECISION_PAIRS).astype(np.intp)))
+    exact = change_scores(exact_detector, some)
     checks = {}
     for kind, device in (("cpu", platform.machine()), ("cuda", f"{platform.machine()}, as a GPU computes")):
-        detector.run_with(Runtime(precision="bfloat16", at_once=kind == "cuda"))
-        coarse = change_scores(detector, pairs)
+        coarse = change_scores(opened(precision="bfloat16", at_once=kind == "cuda"), some)
         checks[kind] = PrecisionCheck(
             largest_score_difference=float(np.abs(coarse - exact).max()),
             decided_otherwise=int(((coarse > card.threshold) != (exact > card.threshold)).sum()),
-            tiles=len(chosen),
+            tiles=len(some.kinds),
             sha256=str(card.sha256),
             device=device,
             data="validation pairs of the training",
             command=command,
         )
-    detector.run_with(Runtime())
     return checks
 
 

@@ -90,3 +90,11 @@ def test_a_detector_is_told_by_its_card(store: Path) -> None:
 def test_a_model_without_a_network_has_no_precision(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="voxel-rule/1 has no network"):
         measure(PrecisionSettings(model="voxel-rule/1", device="cpu", offices=1, scans=2, edits=1))
+
+
+@pytest.mark.parametrize(
+    ("device", "way", "used"), [("cuda", "cpu", "cpu"), ("cuda", "cuda", "cuda"), ("auto", None, "auto")]
+)
+def test_the_processors_way_is_measured_on_a_processor(device: str, way: str | None, used: str) -> None:
+    """A GPU that is told to compute so does not search in 8 bits: it would be compared with itself."""
+    assert PrecisionSettings(model=MODEL, device=device, way=way).computes_on == used  # type: ignore[arg-type]

@@ -44,7 +44,7 @@ def test_options_are_told_as_one_would_type_them() -> None:
 def test_an_argument_is_told_without_a_flag_and_a_folder_without_its_place() -> None:
     found = []
 
-    def taste(context: typer.Context, folder: Path, times: int) -> None:  # noqa: ARG001
+    def taste(context: typer.Context, folder: Path, times: int) -> None:
         found.append(command_line(context))
 
     app = typer.Typer()

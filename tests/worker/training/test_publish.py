@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from worker.detectors.running.runtime import Runtime
 from worker.detectors.spicd_net.detector import SpicdNet
 from worker.detectors.store import open_detector, read_card
 from worker.errors import DetectorUnavailable
@@ -131,6 +132,22 @@ def test_how_far_the_scores_move_in_bfloat16_is_measured_for_these_weights(store
         assert check.command == "pytest"
         assert card.holds_in_bfloat16(kind) is check.holds
     assert card.precision["cuda"].device.endswith("as a GPU computes")
+
+
+def test_a_model_that_others_have_in_hand_stays_as_it_is(store, tmp_path, monkeypatch):
+    """A base that is published again is the detector that a worker keeps warm for its surveys."""
+    monkeypatch.setattr("worker.detectors.precision.has_bfloat16", lambda device: True)
+    monkeypatch.setattr(module, "has_bfloat16", lambda device: True)
+    base = opened(store)
+    base.run_with(kept := Runtime(precision="bfloat16"))
+    run, tiles = store.parent / "run", store.parent / "tiles.npz"
+    card = read_card(
+        publish(run / "best.pt", tiles, tmp_path, summary="", beside={"base": base}, base="base")
+    )
+    assert "kept" in card.training
+    assert base._batches is kept.batches
+    assert base._precision == "bfloat16"
+    assert card.precision["cpu"].largest_score_difference > 0  # of float32, whatever the base computes in
 
 
 def test_where_no_processor_computes_so_nothing_is_said_of_it(store, tmp_path, monkeypatch):

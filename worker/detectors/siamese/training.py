@@ -68,14 +68,13 @@ class SiameseTraining(ABC, Generic[B]):
         return focal_loss(logits, labels)
 
     def start_from(self, module: nn.Module, weights: Mapping[str, Tensor], *, fresh_head: bool) -> None:
-        """Take over all weights, or with `fresh_head` those of the encoder."""
-        if not fresh_head:
-            module.load_state_dict(weights)
-            return
-        inner = "encoder."
-        module.get_submodule("encoder").load_state_dict(
-            {name.removeprefix(inner): value for name, value in weights.items() if name.startswith(inner)}
-        )
+        """Take over all weights, or with `fresh_head` those of the encoder. Raises ValueError for another network's."""
+        part, inner = (module.get_submodule("encoder"), "encoder.") if fresh_head else (module, "")
+        taken = {name.removeprefix(inner): value for name, value in weights.items() if name.startswith(inner)}
+        try:
+            part.load_state_dict(taken)
+        except RuntimeError as unsound:
+            raise ValueError(f"what it starts from is another network: {unsound}") from unsound
 
     @torch.no_grad()
     def initialize_from_data(self, module: nn.Module, batches: Iterable[B]) -> None:
