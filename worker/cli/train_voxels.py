@@ -35,7 +35,7 @@ def train_voxels(
         int, typer.Option(min=1, help="Of 100 steps, for clouds with their sensors' places.")
     ] = 20,
     blind_epochs: Annotated[int, typer.Option(min=1, help="Of 100 steps, for clouds without.")] = 6,
-    threads: Annotated[int | None, typer.Option(min=1, help="Of the CPU.")] = None,
+    threads: Annotated[int | None, typer.Option(min=1, help="Threads of the CPU.")] = None,
 ) -> None:
     """Train the voxel network on simulated visits and publish it (about 40 minutes on two cores, all in all)."""
     # Not at the head of the file: torch takes seconds, which `--help` need not wait for.

@@ -30,33 +30,80 @@ class Option:
         return "--" + self.name.replace("_", "-")
 
 
+#: A test holds the default that a text names to that of the settings.
 OPTIONS = (
-    Option("detector", str, "Whose network is trained: spicd-net, pointnet2 or kpconv."),
-    Option("epochs", int, "At most so many.", 0),
-    Option("minutes", float, "Wall clock of the training; the learning rate follows it.", 0),
-    Option("train_pairs", int, "An epoch.", 1),
-    Option("validation_pairs", int, "After each epoch.", 1),
-    Option("batch", int, "Pairs.", 2),
-    Option("revisit_share", float, "Of pairs of two visits, not one sampled twice.", 0, 1, of_pairs=True),
-    Option("edited_share", float, "Of changed pairs, those of whole things.", 0, 1, of_pairs=True),
+    Option("detector", str, "Whose network is trained: spicd-net, pointnet2 or kpconv (default: spicd-net)."),
+    Option("epochs", int, "Stop after so many epochs; 0: train the head alone (default: 1000).", 0),
     Option(
-        "rebuilt_share", float, "Of changed pairs, those of a map with changed scans.", 0, 1, of_pairs=True
-    ),
-    Option(
-        "noisy_share",
+        "minutes",
         float,
-        "Of still pairs, those with noise on every point.",
+        "Stop after this time by the clock; the learning rate follows it (default: no limit).",
+        0,
+    ),
+    Option("train_pairs", int, "Pairs in each epoch (default: 2000).", 1),
+    Option("validation_pairs", int, "Pairs to validate on after each epoch (default: 500).", 1),
+    Option("batch", int, "Pairs in one step (default: 16).", 2),
+    Option(
+        "revisit_share",
+        float,
+        "Share of pairs that are two visits, not one tile sampled twice (default: 0.7).",
         0,
         1,
         of_pairs=True,
     ),
-    Option("thinning", float, "Half of those lose points, up to this share.", 0, 1, of_pairs=True),
-    Option("counts", bool, "Give the head point counts beside the Chamfer statistics.", of_pairs=True),
-    Option("density", float, "Least and largest share of points that changes take.", count=2, of_pairs=True),
-    Option("start_from", str, "Checkpoint whose network is trained on."),
-    Option("fresh_head", bool, "Take its encoder alone, and start the head anew."),
-    Option("head_epochs", int, "Of the head alone, after the rest: seconds each.", 0),
-    Option("learning_rate", float, "To begin with.", 0),
+    Option(
+        "edited_share",
+        float,
+        "Share of changed pairs in which whole things came, went or moved (default: 0.65).",
+        0,
+        1,
+        of_pairs=True,
+    ),
+    Option(
+        "rebuilt_share",
+        float,
+        "Share of changed pairs that are a map fused anew with some scans changed (default: 0.35).",
+        0,
+        1,
+        of_pairs=True,
+    ),
+    Option(
+        "noisy_share",
+        float,
+        "Share of still pairs that have noise on every point (default: 0.0).",
+        0,
+        1,
+        of_pairs=True,
+    ),
+    Option(
+        "thinning",
+        float,
+        "Half of the noisy pairs also lose up to this share of their points (default: 0.35).",
+        0,
+        1,
+        of_pairs=True,
+    ),
+    Option(
+        "counts",
+        bool,
+        "Give the head point counts beside the Chamfer statistics (default: no).",
+        of_pairs=True,
+    ),
+    Option(
+        "density",
+        float,
+        "Least and largest share of a tile's points that a synthetic change takes (default: 0.075 0.075).",
+        count=2,
+        of_pairs=True,
+    ),
+    Option("start_from", str, "Checkpoint whose network is trained further (default: none)."),
+    Option(
+        "fresh_head", bool, "Take only the encoder of that checkpoint, and start the head anew (default: no)."
+    ),
+    Option(
+        "head_epochs", int, "Then train the head alone for so many epochs, of seconds each (default: 0).", 0
+    ),
+    Option("learning_rate", float, "Learning rate at the start (default: 0.001).", 0),
 )
 
 

@@ -20,6 +20,15 @@ def test_every_option_is_a_field(option):
     assert option.name in {field.name for field in fields(settings)}
 
 
+@pytest.mark.parametrize("option", OPTIONS, ids=lambda option: option.name)
+def test_every_text_names_the_default(option):
+    settings = TrainSettings()
+    value = getattr(settings.pairs if option.of_pairs else settings, option.name)
+    told = " ".join(map(str, value)) if isinstance(value, tuple) else str(value)
+    told = {"False": "no", "None": "no limit" if option.kind is float else "none"}.get(told, told)
+    assert option.help.endswith(f"(default: {told}).")
+
+
 def test_what_is_given_takes_the_place_of_the_default_and_nothing_else_does():
     given = {"epochs": 3, "edited_share": 0.0, "density": [0.1, 0.2], "minutes": None, "folder": Path()}
     made = with_options(PAPER, given, device="cuda")
