@@ -41,7 +41,7 @@ from worker.training.calibration import (
     survey_pairs,
 )
 from worker.training.dataset import TileSet, load_tiles, split_tiles
-from worker.training.log import LOG
+from worker.training.log import HEAD_LOG, LOG
 from worker.training.pairs import PairSettings
 from worker.training.settings import (
     TrainSettings,
@@ -126,7 +126,7 @@ def publish(
     own thresholds. `base` names the one of them that was trained further: where that ranks the validation pairs no
     worse, its weights are published, with the threshold that is best here. `preprocessing` is the paper's where it is
     left out. Weights that are those of `stands_on`, as an encoder's of which the head alone was trained, stay there.
-    The training's log, where it lies beside the checkpoint, comes along.
+    The training's logs, where they lie beside the checkpoint, come along.
     """
     state = torch.load(checkpoint, map_location="cpu", weights_only=True)
     settings = state["settings"] = whole(state["settings"])
@@ -167,7 +167,8 @@ def publish(
     written = read_card(folder)
     checks = _precision(model_store, written, pairs, command)
     write_card(folder, written.model_copy(update={"precision": checks}))
-    _take_log(checkpoint.parent / LOG, folder / LOG)
+    for log in (LOG, HEAD_LOG):
+        _take_log(checkpoint.parent / log, folder / log)
     return folder
 
 

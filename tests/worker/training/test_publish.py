@@ -16,7 +16,7 @@ from worker.errors import DetectorUnavailable
 from worker.training import publish as module
 from worker.training.calibration import best_threshold, survey_pairs
 from worker.training.dataset import save_tiles, split_tiles
-from worker.training.log import LOG
+from worker.training.log import HEAD_LOG, LOG
 from worker.training.pairs import PairSettings
 from worker.training.publish import DEVIATIONS, change_scores, deviations, publish
 from worker.training.settings import PAPER, TrainSettings
@@ -107,8 +107,11 @@ def test_the_trainings_log_comes_along_and_that_of_an_earlier_one_goes(store, tm
     tiles, models = store.parent / "tiles.npz", tmp_path / "store"
     folder = publish(run / "best.pt", tiles, models, summary="")
     assert (folder / LOG).exists()
+    assert not (folder / HEAD_LOG).exists()
+    (alone.parent / HEAD_LOG).write_text("epoch,seconds\n1,2.0\n")
     assert publish(alone, tiles, models, summary="") == folder
     assert not (folder / LOG).exists()
+    assert (folder / HEAD_LOG).read_bytes() == (alone.parent / HEAD_LOG).read_bytes()
 
 
 def test_a_card_says_what_a_training_started_from_but_not_where_it_lay(store, tmp_path):
