@@ -252,7 +252,7 @@ def test_the_idle_thread_holds_on_to_nothing_of_the_last_batch(uncollected):
         return [Thing() for _ in items]
 
     batches, item = SharedBatches(), Thing()
-    seen = [weakref.ref(item), weakref.ref(run)]
+    seen: list[weakref.ref[Any]] = [weakref.ref(item), weakref.ref(run)]
     gone = threading.Event()
     last = weakref.finalize(run, gone.set)
     call = NetworkCall(model="m/1", function="f", fingerprint="", run=run)
@@ -307,7 +307,7 @@ def test_a_device_that_fails_is_told_to_all_of_the_batch_and_nothing_is_run_agai
         held.let(9)
         for future in (first, *others):
             with pytest.raises(
-                DeviceLost, match="model held/1 fails: CUDA error: device-side assert triggered$"
+                DeviceLost, match=r"model held/1 fails: CUDA error: device-side assert triggered$"
             ):
                 future.result(60)
     assert len(held.batches) == 2
