@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from service.errors import Unavailable, is_disk_full
-from worker.errors import NoSpaceLeft, PipelineError
+from worker.errors import DeviceLost, NoSpaceLeft, PipelineError
 from worker.rq_jobs import FunctionRefused, StepJob, StepTimedOut
 
 _OUTSIDE = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGQUIT)
@@ -35,6 +35,9 @@ def ending_of(error: BaseException, job: StepJob) -> Ending:
         return Ending(how="stopped")
     if isinstance(error, Unavailable):  # the step could not even say that it was interrupted
         return Ending(how="interrupted", sentence=str(error))
+    if DeviceLost.is_told_by(error):
+        what = str(error).partition("\n")[0]
+        return Ending(how="interrupted", sentence=f"the device of the networks failed ({what})")
     code, sentence = _problem(error, job)
     return Ending(how="failed", code=code, sentence=sentence)
 

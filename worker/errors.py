@@ -14,9 +14,15 @@ PipelineError
 ├── DetectorUnavailable      detector_unavailable   no such model, or its files do not match its card
 └── Cancelled                cancelled              somebody dismissed the job, or another worker has the step
     └── GaveWay              cancelled              the step goes on later: others go first
+
+DeviceLost is none of them: nobody's fault, and no end of the job. The process ends, and another runs the step.
 """
 
 from __future__ import annotations
+
+import re
+
+_DEVICE_LOST = re.compile(r"CUDA (driver )?error(?!: (out of memory|CUBLAS_STATUS_ALLOC_FAILED))")
 
 
 class PipelineError(Exception):
@@ -75,3 +81,19 @@ class GaveWay(Cancelled):
 
 class NoSpaceLeft(PipelineError):
     code = "disk_full"
+
+
+class DeviceLost(Exception):
+    """The device that runs the networks cannot be used by this process any more, and can by another.
+
+    After an illegal access, a failed assertion in a kernel or a fault of the hardware (Xid) each later CUDA call of the
+    process fails (CUDA Runtime API, `cudaErrorIllegalAddress`: "the process must be terminated and relaunched").
+    """
+
+    @classmethod
+    def is_told_by(cls, error: BaseException) -> bool:
+        """Tell whether an error says so, as torch has it. A lack of the device's memory is none of these."""
+        if not isinstance(error, RuntimeError):
+            return isinstance(error, cls)
+        by_torch = any(kind.__name__ == "AcceleratorError" for kind in type(error).__mro__)
+        return bool(_DEVICE_LOST.search(str(error))) or (by_torch and "out of memory" not in str(error))

@@ -36,7 +36,7 @@ from service.logs import about
 from service.settings import Settings
 from service.up.lifetime import end_with_parent, out_of_memory_kills
 from worker.endings import Ending, WorkerStopped, ending_of, ending_of_status
-from worker.errors import PipelineError
+from worker.errors import DeviceLost, PipelineError
 from worker.memory import limit_memory
 from worker.rq_jobs import FunctionRefused, StepJob, StepTimedOut, step_job
 from worker.rq_threads import Door, StepThreads
@@ -104,6 +104,7 @@ class _StepWorker(BaseWorker):  # type: ignore[misc]  # rq is untyped here
         self._records = records
         self._grace_s = grace_s
         self._telling = threading.RLock()  #: one at a time tells the catalog
+        self._exit = threading.Lock()  #: held by who ends this process
 
     @property
     def stopping(self) -> bool:
@@ -216,7 +217,15 @@ class _StepWorker(BaseWorker):  # type: ignore[misc]  # rq is untyped here
         except BaseException as error:
             expected = isinstance(error, _EXPECTED)
             log.error("%s failed: %s", job.id, error, exc_info=None if expected else error)
-            self._record(job, ending_of(error, job))
+            ending, lost = ending_of(error, job), DeviceLost.is_told_by(error)
+        else:
+            return
+        if lost:
+            self._leave_device(job, ending)
+        self._record(job, ending)
+
+    def _leave_device(self, job: StepJob, ending: Ending) -> None:
+        """End this process where it would run further steps on a device that it has lost."""
 
     def _limited(self, job: StepJob) -> AbstractContextManager[object]:
         """Return a block that raises StepTimedOut when the step's time is up."""
@@ -235,7 +244,9 @@ class _StepWorker(BaseWorker):  # type: ignore[misc]  # rq is untyped here
         def beat() -> None:
             while not over.wait(HEARTBEAT_S):
                 if limit_s and time.monotonic() - begun > limit_s:
-                    self._end_with(job)
+                    log.error("%s: does not hear that its time is up; this worker ends", job.id)
+                    why = f"step {job.id} did not hear that its time was up"
+                    self._end_with(job, ending_of(StepTimedOut(), job), why)
                 with suppress(RedisError):
                     self.maintain_heartbeats(job)
 
@@ -247,18 +258,18 @@ class _StepWorker(BaseWorker):  # type: ignore[misc]  # rq is untyped here
             over.set()
             thread.join(ANSWERS_S)  # no sign of life may come after the claim was given back
 
-    def _end_with(self, job: StepJob) -> None:
-        """Record that a step took too long, and end this process, which it holds."""
+    def _end_with(self, job: StepJob, ending: Ending, why: str) -> None:
+        """Record how a step ended, and end this process, which is of no use to others either."""
         last = threading.Timer(_LAST_WORDS_S, os._exit, (1,))
         last.daemon = True
         last.start()
-        log.error("%s: does not hear that its time is up; this worker ends", job.id)
-        self._record(job, ending_of(StepTimedOut(), job))
-        self._before_exit(job)
-        os._exit(1)
+        with self._exit:  # who comes second is recorded by the first, and waits for the end
+            self._record(job, ending)
+            self._before_exit(job, why)
+            os._exit(1)
 
-    def _before_exit(self, job: StepJob) -> None:
-        """Take leave of whatever else runs in this process, which a step holds that does not hear."""
+    def _before_exit(self, job: StepJob, why: str) -> None:
+        """Take leave of whatever else runs in this process."""
 
     def _record(self, job: StepJob, ending: Ending) -> None:
         """Tell the catalog how a step ended."""
@@ -467,11 +478,15 @@ class InferenceWorker(_StepWorker, SimpleWorker):  # type: ignore[misc]
             if timer is not None:
                 timer.cancel()
 
-    def _before_exit(self, job: StepJob) -> None:
+    def _leave_device(self, job: StepJob, ending: Ending) -> None:
+        """End: each later step would fail as this one did, and a new process has the device anew."""
+        log.error("%s: the device of its networks is lost; this worker ends", job.id)
+        self._end_with(job, ending, f"step {job.id} lost the device of the networks")
+
+    def _before_exit(self, job: StepJob, why: str) -> None:
         """Have the other steps run elsewhere: it is not their fault."""
         for other in [other for other in self._jobs if other is not job]:
-            why = f"its worker ended, for step {job.id} did not hear that its time was up"
-            self._record(other, Ending(how="interrupted", sentence=why))
+            self._record(other, Ending(how="interrupted", sentence=f"its worker ended, for {why}"))
 
     def _end_grace(self) -> None:
         """Signal the main thread, which runs the step; the handler is `request_force_stop` by now."""

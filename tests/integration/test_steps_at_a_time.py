@@ -152,3 +152,21 @@ def test_a_step_that_does_not_hear_takes_its_worker_along_and_costs_the_others_n
     (bench.folder / "go").touch()
     started(bench)
     ended(bench, "m2")
+
+
+def test_a_gpu_that_fails_ends_the_worker_and_its_steps_are_run_again_by_the_next(bench: Bench) -> None:
+    bench.submit("m1", ("faulty_once", "inference"), ("finish", "inference"))
+    worker = started(bench)
+    bench.wait_for("faulty_once m1")
+    bench.submit("m2", ("hold", "inference"), ("finish", "inference"))
+    bench.wait_for("hold m2")
+    (bench.folder / "fail").touch()
+    assert worker.wait(60) == 1
+    told = [line for line in bench.record() if line.startswith("interrupted")]
+    assert sorted(line.split()[1] for line in told) == ["m1", "m2"]
+    assert any("illegal memory access was encountered)" in line for line in told)
+    assert bench.lines("lost") == bench.lines("died") == []
+    (bench.folder / "go").touch()
+    started(bench)
+    ended(bench, "m1")
+    ended(bench, "m2")

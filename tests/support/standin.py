@@ -34,7 +34,7 @@ from worker.scratch import shared_temporary
 
 FUNCTIONS = (
     "first", "second", "third", "refuse", "crash", "crash_once", "sleep", "busy", "hold", "finish", "stray", "full",
-    "early", "deaf",
+    "early", "deaf", "faulty_once",
 )  # fmt: skip
 
 
@@ -147,6 +147,18 @@ def deaf(context: Context) -> None:
             time.sleep(60)
         except Exception:  # noqa: S112 - that is the fault
             continue
+
+
+@stage
+def faulty_once(context: Context) -> None:
+    """Meet one that fails when the test says so, and works in the next process."""
+    record("faulty_once", context.job.job_id, str(os.getpid()))
+    folder = Path(os.environ["STANDIN_RECORD"]).parent
+    if not (folder / "failed").exists():
+        while not (folder / "fail").exists():
+            time.sleep(0.02)
+        (folder / "failed").touch()
+        raise RuntimeError("CUDA error: an illegal memory access was encountered\nand what else torch says")
 
 
 @stage

@@ -17,8 +17,9 @@ from safetensors.torch import load, save
 from worker.detectors.card import BaseRecord, Card
 from worker.detectors.detector import Detector
 from worker.detectors.registry import DETECTORS
+from worker.detectors.running.calls import is_full_memory
 from worker.detectors.running.runtime import RunsNetwork, Runtime
-from worker.errors import DetectorUnavailable, TrainingFailed
+from worker.errors import DetectorUnavailable, DeviceLost, OutOfMemory, TrainingFailed
 from worker.files import write_text
 
 Device = Literal["auto", "cpu", "cuda"]
@@ -59,7 +60,7 @@ def open_detector(
     """Return the detector `<name>/<version>`, ready to score.
 
     Raises DetectorUnavailable when there is no such model, its card is unsound, its weights are not those of
-    the card, or the device is not there.
+    the card, or the device is not there; OutOfMemory when the device has no room for it, DeviceLost when it fails.
     """
     card = open_card(model_store, name)
     content = _weights_file(_folder(model_store, name), card)
@@ -74,10 +75,11 @@ def make_detector(
     *,
     base: Weights | None = None,
 ) -> Detector:
-    """Return the detector of a card and the bytes of its weights file (None: none). Raises DetectorUnavailable.
+    """Return the detector of a card and the bytes of its weights file (None: none).
 
     `runtime` is what its network is run by; by default in the thread that asks, in float32. `base` are the weights of
-    the model that the card names as its base, if any.
+    the model that the card names as its base, if any. Raises DetectorUnavailable, OutOfMemory when the device has no
+    room for it, and DeviceLost when the device fails.
     """
     name = card.model
     if card.detector not in DETECTORS:
@@ -85,11 +87,26 @@ def make_detector(
             f"model {name}: no detector {card.detector!r}; there are {sorted(DETECTORS)}"
         )
     weights = {} if content is None else _checked_weights(name, card, content)
+    merged, lost = {**(base or {}), **weights}, ""
     try:
-        merged = {**(base or {}), **weights}
-        detector = detector_class(card.detector).load(card, merged, resolve_device(device))
-    except (RuntimeError, ValueError) as unsound:
-        raise DetectorUnavailable(f"model {name}: {unsound}") from unsound
+        return _placed(card, merged, resolve_device(device), runtime)
+    except (RuntimeError, ValueError) as error:
+        if DeviceLost.is_told_by(error):
+            lost = str(error).partition("\n")[0]
+        elif not is_full_memory(error):
+            raise DetectorUnavailable(f"model {name}: {error}") from error
+    # only here, for the error holds on to what was placed of the model
+    if lost:
+        raise DeviceLost(f"the device of model {name} fails: {lost}")
+    raise OutOfMemory(
+        f"model {name} needs more of the GPU's memory than is free; "
+        "raise SPICD_INFERENCE_GPU_SHARE, or end what else runs there"
+    )
+
+
+def _placed(card: Card, weights: Weights, device: torch.device, runtime: Runtime | None) -> Detector:
+    """Return the detector on its device. Raises RuntimeError or ValueError, by what is unsound or does not suffice."""
+    detector = detector_class(card.detector).load(card, weights, device)
     if runtime is not None and isinstance(detector, RunsNetwork):
         detector.run_with(runtime)
     return detector

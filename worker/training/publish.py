@@ -40,16 +40,11 @@ from worker.training.calibration import (
     figures_at,
     survey_pairs,
 )
+from worker.training.command import training_command, without_place
 from worker.training.dataset import TileSet, load_tiles, split_tiles
 from worker.training.log import HEAD_LOG, LOG
 from worker.training.pairs import PairSettings
-from worker.training.settings import (
-    TrainSettings,
-    detector_settings,
-    training_command,
-    whole,
-    without_place,
-)
+from worker.training.settings import TrainSettings, detector_settings, whole
 
 VOXEL_SIZE, MIN_POINTS = 0.05, 512  #: paper, Table 3; the training tiles are made with the same
 

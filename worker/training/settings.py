@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
-from pathlib import Path
 from typing import Any
 
 from worker.detectors.trainable import TrainableNetwork, network_class
-from worker.training.options import OPTIONS
 from worker.training.pairs import PAPER_PAIRS, SAMPLE_POINTS, PairSettings
 
 
@@ -106,28 +103,3 @@ def detector_settings(settings: dict[str, Any]) -> dict[str, Any]:
 
 def _renamed(settings: dict[str, Any]) -> dict[str, Any]:
     return {_NAMES_OF_0_1.get(name, name): value for name, value in settings.items()}
-
-
-def training_command(settings: Mapping[str, Any]) -> str:
-    """Return the call of `spicd-worker train` that has the settings of a checkpoint, as `whole` returns them."""
-    paper = not settings["initialize_head"]
-    default = asdict(PAPER if paper else TrainSettings())
-    words = ["spicd-worker", "train", "FOLDER", *(["--paper"] if paper else [])]
-    for option in OPTIONS:
-        value, usual = (
-            _values((there["pairs"] if option.of_pairs else there)[option.name])
-            for there in (settings, default)
-        )
-        if value != usual:
-            told = [without_place(one) for one in value] if option.name == "start_from" else value
-            words += [option.flag, *([] if option.kind is bool else map(str, told))]
-    return " ".join(words)
-
-
-def without_place(path: str | None) -> str | None:
-    """Return folder and file of a path, for where on a machine these lay is nobody else's matter."""
-    return None if path is None else "/".join(Path(path).parts[-2:])
-
-
-def _values(value: Any) -> list[Any]:
-    return list(value) if isinstance(value, list | tuple) else [value]

@@ -10,9 +10,10 @@ import torch
 
 from worker.detectors.card import MODEL_STORE
 from worker.detectors.comparison import Comparison
+from worker.detectors.running.runtime import Runtime
 from worker.detectors.spicd_net.detector import SpicdNet
 from worker.detectors.store import open_card, open_detector, weights_of, write_model
-from worker.errors import DetectorUnavailable
+from worker.errors import DetectorUnavailable, DeviceLost, OutOfMemory
 
 
 def edit(card_path, **fields) -> None:
@@ -146,3 +147,31 @@ def test_a_model_whose_base_is_another_one_now_is_refused(model_store, network, 
     write_model(model_store / "spicd-net" / "7", base.card, changed)
     with pytest.raises(DetectorUnavailable, match="a part of spicd-net/7 with sha256"):
         open_detector(model_store, "spicd-net/8")
+
+
+@pytest.mark.parametrize(
+    ("error", "told", "sentence"),
+    [
+        (
+            torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB"),
+            OutOfMemory,
+            "more of the GPU's",
+        ),
+        (torch.AcceleratorError("CUDA error: out of memory\nmore"), OutOfMemory, "more of the GPU's"),
+        (
+            RuntimeError("CUDA error: unspecified launch failure\nmore"),
+            DeviceLost,
+            "unspecified launch failure$",
+        ),
+        (RuntimeError("size mismatch"), DetectorUnavailable, "size mismatch"),
+    ],
+)
+def test_what_the_device_says_of_itself_is_not_said_of_the_model(
+    model_store, monkeypatch, error, told, sentence
+):
+    def fails(*_: object) -> None:
+        raise error
+
+    monkeypatch.setattr(SpicdNet, "run_with", fails)
+    with pytest.raises(told, match=f"model spicd-net/7.*{sentence}"):
+        open_detector(model_store, "spicd-net/7", "cpu", Runtime())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -13,7 +14,7 @@ from typing import Generic, Protocol, TypeVar
 import torch
 
 from worker.detectors.running.meter import Meter
-from worker.errors import OutOfMemory
+from worker.errors import DeviceLost, OutOfMemory
 
 log = logging.getLogger("worker.detectors")
 
@@ -25,6 +26,8 @@ Done = Callable[[int], None]  #: told how many items have their results; may rai
 MOST = 64  #: the size of a batch where nobody says otherwise: about 1 GiB beside the network for patches of 4,096 points
 
 GPU_SHARED = 0.9  #: of the GPU's memory, that workers divide among themselves where nothing is set
+
+_FULL = re.compile("CUDA (driver )?error: (out of memory|CUBLAS_STATUS_ALLOC_FAILED)")
 
 
 def _one(_: object) -> int:
@@ -57,7 +60,10 @@ class Batches(Protocol):
     """Runs calls; `worker.detectors.running.shared.SharedBatches` does it for several threads together."""
 
     def run(self, call: NetworkCall[I, R], items: Sequence[I], done: Done) -> list[R]:
-        """Return the result of each item. Raises what `done` raises, OutOfMemory, and what the network raises."""
+        """Return the result of each item.
+
+        Raises what `done` raises, OutOfMemory, DeviceLost, and what else the network raises.
+        """
 
     def expect(self, model: str) -> AbstractContextManager[None]:
         """Say for the length of a block that its thread may ask for calls of a model."""
@@ -93,7 +99,10 @@ class FittedRuns:
             begin = end
 
     def run(self, call: NetworkCall[I, R], items: Sequence[I]) -> list[R | OutOfMemory]:
-        """Return of each item its result, or the error where it did not fit alone. Raises what the network raises."""
+        """Return of each item its result, or the error where it did not fit alone.
+
+        Raises what the network raises, and DeviceLost in place of an error that says so.
+        """
         begun = time.perf_counter()
         results: list[R | OutOfMemory] = []
         parts = [items]
@@ -114,18 +123,31 @@ class FittedRuns:
 
     def _fitting(self, call: NetworkCall[I, R], items: Sequence[I]) -> list[R] | None:
         """Return the results; None where the memory of the device did not suffice."""
+        lost = ""
         try:
             return list(call.run(items))
-        except torch.OutOfMemoryError:
-            self.meter.add("out_of_memory", call.model)
-            log.warning("model %s: %d items at once do not fit into the GPU's memory", call.model, len(items))
+        except RuntimeError as error:
+            if DeviceLost.is_told_by(error):
+                log.exception("model %s: the device fails", call.model)
+                lost = str(error).partition("\n")[0]
+            elif not is_full_memory(error):
+                raise
         # only here, for the error holds on to what the network had made
+        if lost:
+            raise DeviceLost(f"the device of model {call.model} fails: {lost}")
+        self.meter.add("out_of_memory", call.model)
+        log.warning("model %s: %d items at once do not fit into the GPU's memory", call.model, len(items))
         give_cache_back()
         return None
 
     def _remember(self, call: NetworkCall[I, R], size: int) -> None:
         with self._lock:
             self._fits[call.key] = max(1, min(size, self._fits.get(call.key, size)))
+
+
+def is_full_memory(error: BaseException) -> bool:
+    """Tell whether an error says that the memory of a GPU does not suffice, that of torch's arrays or of CUDA itself."""
+    return isinstance(error, torch.OutOfMemoryError) or bool(_FULL.search(str(error)))
 
 
 def give_cache_back() -> None:

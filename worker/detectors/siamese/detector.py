@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -81,9 +81,6 @@ class SiameseDetector(ABC):
         self._network = network.to(device).eval()
         self._head = head
         self._batches = Runtime().batches
-        few = CPU_TILES if device.type == "cpu" else None
-        self._encoding = self._call("encode", self._descriptors_each, most=few)
-        self._comparing = self._call("compare", self._compare)
 
     def run_with(self, runtime: Runtime) -> None:
         """Run the network so from now on (worker.detectors.running.runtime)."""
@@ -107,6 +104,7 @@ class SiameseDetector(ABC):
         """Encode a few patches, one at least, on the device: (n, D)."""
 
     def _call(self, function: str, run: Any, most: int | None = None) -> NetworkCall[Any, Any]:
+        """Make a call when it is asked for: kept, it and the detector would hold each other, and the weights with them."""
         card = self.card
         return NetworkCall(
             model=card.model, function=function, fingerprint=card.fingerprint, run=run, most=most
@@ -119,6 +117,10 @@ class SiameseDetector(ABC):
     def weights(self) -> dict[str, Tensor]:
         """Return what `load` takes, to train further from."""
         return dict(self._network.state_dict())
+
+    def held_tensors(self) -> Iterator[Tensor]:
+        """Yield all that is kept on the device, some perhaps twice."""
+        yield from self._network.state_dict().values()
 
     def encode_reference(
         self,
@@ -179,7 +181,9 @@ class SiameseDetector(ABC):
         def done(count: int) -> None:
             progress(stage, count / len(patches))
 
-        return np.stack(self._batches.run(self._encoding, patches, done))
+        few = CPU_TILES if self._device.type == "cpu" else None
+        encoding = self._call("encode", self._descriptors_each, most=few)
+        return np.stack(self._batches.run(encoding, patches, done))
 
     def _pairs(self, before: Sequence[Patch], after: Sequence[Patch]) -> list[tuple[Points, Points]]:
         """Return what of each pair of patches the Chamfer branch sees, (n, 3) and (m, 3)."""
@@ -208,7 +212,8 @@ class SiameseDetector(ABC):
         items = list(zip(reference, current, clouds, strict=True))
         if self._device.type == "cpu":
             return np.stack(self._compare(items))
-        return np.stack(self._batches.run(self._comparing, items, lambda _: progress("scoring", 1.0)))
+        comparing = self._call("compare", self._compare)
+        return np.stack(self._batches.run(comparing, items, lambda _: progress("scoring", 1.0)))
 
     @torch.inference_mode()
     def _compare(self, items: Sequence[_Compared]) -> list[NDArray[np.float32]]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import ClassVar
 
 import torch
@@ -38,18 +38,29 @@ class SpicdNet(SiameseDetector):
         """Take the encoder of a processor, which in place of bfloat16 searches in 8 bits, or that of a GPU."""
         super()._encode_with(precision, at_once=at_once)
         searched = precision == "bfloat16" and self._device.type == "cpu"
-        self._encoder = FrozenEncoder(self._spicd.encoder, searched=searched)
-        self._together = TogetherEncoder(self._spicd.encoder, precision).to(self._device) if at_once else None
+        self._encoder: FrozenEncoder | TogetherEncoder = (
+            TogetherEncoder(self._spicd.encoder, precision).to(self._device)
+            if at_once
+            else FrozenEncoder(self._spicd.encoder, searched=searched)
+        )
+
+    def held_tensors(self) -> Iterator[Tensor]:
+        """Yield all that is kept on the device, some perhaps twice."""
+        yield from super().held_tensors()
+        if isinstance(self._encoder, FrozenEncoder):
+            yield from self._encoder.tensors()
+        else:
+            yield from self._encoder.state_dict().values()
 
     @torch.inference_mode()
     def _descriptors(self, patches: Sequence[Patch]) -> Tensor:
         clouds = [torch.from_numpy(patch.distinct) for patch in patches]
         centroids = [torch.from_numpy(patch.centroid) for patch in patches]
-        if self._together is None:
+        if isinstance(self._encoder, FrozenEncoder):
             return self._encoder.encode(
                 [cloud.to(self._device) for cloud in clouds],
                 [centroid.to(self._device) for centroid in centroids],
             )
         batch = level(clouds).to(self._device)  # one copy to the GPU, and not one a tile
-        descriptors: Tensor = self._together(batch, torch.stack(centroids).to(self._device))
+        descriptors: Tensor = self._encoder(batch, torch.stack(centroids).to(self._device))
         return descriptors

@@ -7,7 +7,7 @@ max-pools searched in 8 bits (`worker.detectors.siamese.search`) it is off by as
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import torch
 from torch import Tensor
@@ -34,8 +34,8 @@ class _Pooled:
     """A layer that is max-pooled at once."""
 
     def __init__(self, layer: NormedLinear, maximum: Callable[[Tensor], Maximum]) -> None:
-        weight, self._bias = _frozen(layer)
-        self._maximum = maximum(weight)
+        self.weight, self._bias = _frozen(layer)
+        self._maximum = maximum(self.weight)
 
     def __call__(self, x: Tensor) -> Tensor:
         """(m, inputs), rectified -> (outputs,); raises ValueError for a cloud without points."""
@@ -53,6 +53,13 @@ class _FrozenTransform:
         )
         self.pooled = _Pooled(net.pooled, maximum)
         self.matrix, self.k = net.matrix, net.k
+
+    def tensors(self) -> Iterator[Tensor]:
+        """Yield what it holds but for the biases of pooled layers, a few KiB."""
+        for layer in (self.points1, self.points2, self.global1, self.global2):
+            yield from layer
+        yield self.pooled.weight
+        yield from self.matrix.state_dict().values()
 
     def matrices(self, clouds: Sequence[Tensor]) -> Tensor:
         """Return the transforms of n clouds (m, k): (n, k, k)."""
@@ -78,6 +85,14 @@ class FrozenEncoder:
     def __call__(self, points: Tensor, centroid: Tensor) -> Tensor:
         """Encode distinct points (m, 3), with the padded patch's centroid (3,), as a descriptor (1024,)."""
         return self.encode([points], [centroid])[0]
+
+    def tensors(self) -> Iterator[Tensor]:
+        """Yield the weights that it holds."""
+        yield from self.input_transform.tensors()
+        yield from self.feature_transform.tensors()
+        for layer in (self.mlp1, self.mlp2, self.mlp3):
+            yield from layer
+        yield self.mlp4.weight
 
     def encode(self, clouds: Sequence[Tensor], centroids: Sequence[Tensor]) -> Tensor:
         """Encode n clouds (m, 3), metres, with the centroids (3,) of their padded patches: (n, 1024).

@@ -55,7 +55,6 @@ class VoxelNet(Scorer):
         self._device = device
         self._precision: Precision = "float32"
         self._batches = Runtime().batches
-        self._calls = {name: self._call(name) for name in networks}
 
     def run_with(self, runtime: Runtime) -> None:
         """Run the networks so from now on (worker.detectors.running.runtime)."""
@@ -64,6 +63,8 @@ class VoxelNet(Scorer):
         self._precision = chosen_precision(runtime.precision, self._device, holds=holds)
 
     def _call(self, name: str) -> NetworkCall[Looked, NDArray[np.float32]]:
+        """Make a call when it is asked for: kept, it and the detector would hold each other, and the weights with them."""
+
         def run(clouds: Sequence[Looked]) -> list[NDArray[np.float32]]:
             return probabilities_each(self._networks[name], clouds, self._device, self._precision)
 
@@ -92,7 +93,7 @@ class VoxelNet(Scorer):
         """Return (N,) the network's probabilities."""
         name = SEEING if free_space else BLIND
         cloud = Looked.at(self._networks[name], evidence.keys, evidence.channels)
-        (told,) = self._batches.run(self._calls[name], [cloud], lambda _: None)
+        (told,) = self._batches.run(self._call(name), [cloud], lambda _: None)
         return told
 
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
@@ -21,6 +22,7 @@ from worker.detectors.running.runtime import Runtime
 from worker.detectors.running.shared import SharedBatches
 from worker.detectors.spicd_net.detector import SpicdNet
 from worker.detectors.spicd_net.network import SpicdNetwork
+from worker.detectors.spicd_net.together import TogetherEncoder
 from worker.detectors.store import open_detector
 from worker.simulation.scenes import random_room
 from worker.simulation.visits import visit
@@ -37,17 +39,15 @@ def shared(
 
     def detect(detector: Detector, comparisons: list[Comparison]) -> list[Detection]:
         detector.run_with(Runtime(batches=batches, at_once=at_once))  # type: ignore[attr-defined]
-        with ThreadPoolExecutor(len(comparisons)) as pool, ExitStack() as users:
-            for _ in comparisons:
-                users.enter_context(batches.expect(detector.card.model))
-            futures = [pool.submit(_one, detector, one, users) for one in comparisons]
-            return [future.result(120) for future in futures]
+        all_here = threading.Barrier(len(comparisons))
 
-    def _one(detector: Detector, comparison: Comparison, users: ExitStack) -> Detection:
-        found = detector.detect(comparison)
-        batches._count_user(detector.card.model, -1)  # it will ask for nothing more
-        users.callback(batches._count_user, detector.card.model, 1)
-        return found
+        def one(comparison: Comparison) -> Detection:
+            with batches.expect(detector.card.model):
+                all_here.wait(60)
+                return detector.detect(comparison)
+
+        with ThreadPoolExecutor(len(comparisons)) as pool:
+            return [future.result(120) for future in [pool.submit(one, each) for each in comparisons]]
 
     yield detect
 
@@ -98,8 +98,8 @@ def test_a_batch_that_does_not_fit_is_halved_and_the_scores_are_the_same(
     comparison = surveys(pairs)[0]
     expected = detector.detect(comparison)
     detector.run_with(Runtime(batches=DirectBatches(FittedRuns(64, meter := Meter())), at_once=True))
-    together = detector._together
-    assert together is not None
+    together = detector._encoder
+    assert isinstance(together, TogetherEncoder)
     real, sizes = together.forward, list[int]()
 
     def small(points: torch.Tensor, centroids: torch.Tensor) -> torch.Tensor:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import gc
 import threading
+import weakref
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
@@ -14,7 +16,7 @@ import torch
 from worker.detectors.running.calls import FittedRuns, NetworkCall
 from worker.detectors.running.meter import Meter
 from worker.detectors.running.shared import SharedBatches
-from worker.errors import Cancelled, OutOfMemory
+from worker.errors import Cancelled, DeviceLost, OutOfMemory
 
 Item = tuple[str, int]  #: survey, number
 FOR_EVER = 3600.0
@@ -48,47 +50,30 @@ class Held:
 
 @contextmanager
 def asking(batches: SharedBatches) -> Iterator[Callable[..., Future[Any]]]:
-    """Asks from a thread each; returns once the items are in the queue."""
+    """Asks from a thread each; returns once the items are handed over, so that the network hears of them in this order."""
     with ThreadPoolExecutor(8) as pool:
 
         def ask(held: Held, survey: str, count: int, done: Callable[[int], None] = lambda done: None) -> Any:
-            handed = threading.Event()
+            began, handed = threading.Event(), threading.Event()
 
             def told(number: int) -> None:
-                handed.set()
+                if began.is_set():  # the second time: it waits
+                    handed.set()
+                began.set()
                 done(number)
 
             items = [(survey, number) for number in range(count)]
             future = pool.submit(batches.run, held.call, items, told)
+            future.add_done_callback(lambda _: handed.set())
             assert handed.wait(60)
-            _until_waiting(batches, survey)
             return future
 
         yield ask
 
 
-def _until_waiting(batches: SharedBatches, survey: str) -> None:
-    """Wait until the items of a survey are known: in a request that waits, or in a batch already."""
-    known = threading.Event()
-    while not known.wait(0.005):
-        with batches._changed:
-            seen = [request.items[0][0] for request in batches._requests]
-        if survey in seen or survey in _served(batches):
-            return
-
-
-def _served(batches: SharedBatches) -> set[str]:
-    return {item[0] for held in HELD for batch in held.batches for item in batch}
-
-
-HELD: list[Held] = []
-
-
 @pytest.fixture
 def held() -> Held:
-    HELD.clear()
-    HELD.append(Held())
-    return HELD[0]
+    return Held()
 
 
 def test_each_survey_gets_its_own_results_in_its_order_of_batches_they_share(held):
@@ -122,7 +107,6 @@ def test_a_batch_has_an_item_of_each_survey_in_turn_so_that_a_large_one_holds_up
 
 def test_models_take_turns(held):
     other = Held("other/1")
-    HELD.append(other)
     batches = SharedBatches(FittedRuns(1))
     with asking(batches) as ask:
         one = ask(held, "a", 3)
@@ -248,3 +232,82 @@ def test_what_was_counted_says_how_many_steps_shared_the_batches(held):
 def test_no_items_need_no_network(held):
     assert SharedBatches().run(held.call, [], lambda done: None) == []
     assert held.batches == []
+
+
+class Thing:
+    """What can be seen to go."""
+
+
+@pytest.fixture
+def uncollected() -> Iterator[None]:
+    """What goes here goes by itself."""
+    gc.collect()
+    gc.disable()
+    yield
+    gc.enable()
+
+
+def test_the_idle_thread_holds_on_to_nothing_of_the_last_batch(uncollected):
+    def run(items: Sequence[Thing]) -> list[Thing]:
+        return [Thing() for _ in items]
+
+    batches, item = SharedBatches(), Thing()
+    seen: list[weakref.ref[Any]] = [weakref.ref(item), weakref.ref(run)]
+    gone = threading.Event()
+    last = weakref.finalize(run, gone.set)
+    call = NetworkCall(model="m/1", function="f", fingerprint="", run=run)
+    found = batches.run(call, [item], lambda done: None)
+    seen.append(weakref.ref(found[0]))
+    del call, run, item, found
+    assert gone.wait(60), "the model of the last batch is kept"
+    assert not last.alive
+    assert [one() for one in seen] == [None, None, None]
+
+
+def test_what_a_batch_that_failed_had_made_is_gone_when_its_parts_are_run_and_from_the_errors(
+    uncollected, held
+):
+    made: list[weakref.ref[Thing]] = []
+    kept: list[int] = []
+
+    def fails(items: Sequence[Item]) -> BaseException | None:
+        kept.append(sum(one() is not None for one in made))
+        if items[0][0] == "a":
+            return None
+        activations = Thing()
+        made.append(weakref.ref(activations))
+        try:
+            raise ValueError("no number")
+        except ValueError as error:
+            raise RuntimeError(f"cannot be run: {len(items)}") from error
+
+    held.fails = fails
+    batches = SharedBatches(FittedRuns(8))
+    with asking(batches) as ask:
+        first = ask(held, "a", 1)
+        held.wait_for_batch()
+        others = [ask(held, "b", 2), ask(held, "c", 1)]
+        held.let(4)
+        errors = [other.exception(60) for other in others]
+        first.result(60)
+    assert [str(error) for error in errors] == ["cannot be run: 2", "cannot be run: 1"]
+    assert kept == [0, 0, 0, 0]
+    assert [one() for one in made] == [None, None, None]
+
+
+def test_a_device_that_fails_is_told_to_all_of_the_batch_and_nothing_is_run_again(held):
+    held.fails = lambda items: torch.AcceleratorError(
+        "CUDA error: device-side assert triggered\nCUDA kernel errors might be reported later"
+    )
+    batches = SharedBatches(FittedRuns(8))
+    with asking(batches) as ask:
+        first = ask(held, "a", 1)
+        held.wait_for_batch()
+        others = [ask(held, "b", 2), ask(held, "c", 2)]
+        held.let(9)
+        for future in (first, *others):
+            with pytest.raises(
+                DeviceLost, match=r"model held/1 fails: CUDA error: device-side assert triggered$"
+            ):
+                future.result(60)
+    assert len(held.batches) == 2

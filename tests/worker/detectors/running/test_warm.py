@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import gc
 import threading
+import weakref
 from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 from typing import Any
@@ -10,9 +12,15 @@ from typing import Any
 import pytest
 import torch
 
+from tests.support.detectors import CountingDetector
+from worker.detectors.card import MODEL_STORE, Card
 from worker.detectors.running.meter import Meter
-from worker.detectors.running.warm import LEAST_BYTES, Held, WarmModels, weight_of
-from worker.errors import DetectorUnavailable
+from worker.detectors.running.runtime import Runtime
+from worker.detectors.running.warm import LEAST_BYTES, Held, Lease, WarmModels, weight_of
+from worker.detectors.spicd_net.detector import SpicdNet
+from worker.detectors.spicd_net.network import SpicdNetwork
+from worker.detectors.store import open_detector
+from worker.errors import DetectorUnavailable, OutOfMemory
 
 MIB = 1 << 20
 
@@ -132,3 +140,69 @@ def test_two_steps_that_need_the_same_model_open_it_once(opened):
 def test_a_detector_without_weights_counts_a_little():
     without: Any = SimpleNamespace(card=None)
     assert weight_of(without) == LEAST_BYTES
+
+
+def test_a_model_that_does_not_fit_is_opened_once_more_with_the_idle_ones_closed(opened):
+    warm, tries = WarmModels(99 * MIB), list[int]()
+
+    def large() -> Any:
+        tries.append(warm.held.models)
+        if warm.held.models > 1:
+            raise OutOfMemory("model large needs more of the GPU's memory than is free")
+        return opened.model("large")[1]()
+
+    with warm.borrow(*opened.model("used")):
+        use(warm, opened.model("idle"))
+        use(warm, ("large", large))
+        assert tries == [2, 1]
+        assert warm.held.models == 2
+    with warm.borrow(*opened.model("used")), warm.borrow(*opened.model("too")):
+        with pytest.raises(OutOfMemory, match="model large needs"):
+            use(warm, ("large once more", large))
+        assert warm.held.models == 2  # those in use
+
+
+@pytest.mark.parametrize("model", ["spicd-net/1", "voxel-net/1", "pointnet2/1"])
+def test_a_model_that_is_closed_is_gone_at_once(model):
+    warm = WarmModels(1 << 30)
+    with warm.borrow(model, lambda: open_detector(MODEL_STORE, model, "cpu", Runtime())) as detector:
+        seen = weakref.ref(detector)
+        del detector
+    gc.collect()
+    gc.disable()
+    try:
+        warm._close_idle(0)
+        assert seen() is None
+    finally:
+        gc.enable()
+
+
+def test_who_is_left_without_giving_back_has_the_model_no_more():
+    """As a step that an error from outside is raised in, just where it should have counted itself out."""
+    warm = WarmModels(1 << 30)
+    block = warm.borrow("m/1", CountingDetector)
+    block.__enter__()
+    warm._close_idle(0)
+    assert warm.held.models == 1
+    warm._models["m/1"].lend(lease := Lease())
+    del block
+    warm._close_idle(0)
+    assert warm.held.models == 1
+    del lease
+    warm._close_idle(0)
+    assert warm.held.models == 0
+
+
+@pytest.mark.parametrize("at_once", [False, True])
+def test_weights_that_are_kept_a_second_time_count_twice(card: Card, network: SpicdNetwork, at_once: bool):
+    detector = SpicdNet(card, network, torch.device("cpu"))
+    detector.run_with(Runtime(at_once=at_once))
+    once = sum(tensor.nbytes for tensor in network.state_dict().values())
+    encoder = sum(tensor.nbytes for tensor in network.encoder.state_dict().values())
+    # all but the matrices of the T-Nets, which both share, and the figures of the normalisation
+    shared = sum(
+        tensor.nbytes
+        for net in (network.encoder.input_transform, network.encoder.feature_transform)
+        for tensor in net.matrix.state_dict().values()
+    )
+    assert weight_of(detector) == pytest.approx(once + encoder - shared, rel=0.01)
