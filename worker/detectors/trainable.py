@@ -69,6 +69,9 @@ class TrainableNetwork(Protocol[B]):
     def head(self, module: nn.Module) -> nn.Module:
         """Return the part that makes logits (n, 3) of descriptors (n, D), (n, D) and statistics (n, S)."""
 
+    def begin_head(self, module: nn.Module, reference: Tensor, current: Tensor, statistics: Tensor) -> None:
+        """Initialise the head from descriptors (n, D), (n, D) and statistics (n, S) of n pairs."""
+
     def encode(
         self, module: nn.Module, clouds: Sequence[Points], progress: Progress
     ) -> tuple[Tensor, list[Tensor]]:

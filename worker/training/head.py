@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from worker.detectors.trainable import TrainableNetwork
+from worker.detectors.trainable import DIFFERENT, TrainableNetwork
 from worker.metrics import ClassFigures, class_figures
 from worker.progress import Progress, no_progress
 from worker.training.dataset import TileSet
@@ -20,6 +20,8 @@ from worker.training.kept_pairs import Drawn, PairPool, keep_pairs
 from worker.training.log import HEAD_LOG, EpochRow, append_row
 from worker.training.settings import Schedule, TrainSettings
 from worker.training.steps import Steps
+
+INITIALIZATION_PAIRS = 1024  #: that a head is initialised by; they cost next to nothing
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -51,6 +53,8 @@ def train_head(
         keep_pairs(kind, network, tiles, settings.pairs, seed=settings.seed, progress=progress)
         for tiles in (training, validation)
     ]
+    if settings.initialize_head and settings.fresh_head and not settings.epochs:
+        _begin(kind, network, pools[0], settings)
     held_out = pools[1].draw(settings.head_validation_pairs, np.random.default_rng((settings.seed, 6)))
     head = kind.head(network)
     run = _HeadRun(kind, head, pools[0], held_out, settings)
@@ -65,6 +69,13 @@ def train_head(
         epochs=settings.head_epochs,
         seconds=round(time.monotonic() - begun, 1),
     )
+
+
+def _begin(kind: TrainableNetwork[Any], network: nn.Module, pool: PairPool, settings: TrainSettings) -> None:
+    """Initialise a head that nothing has trained yet from pairs of one place, whose distances are the fine ones."""
+    drawn = pool.draw(INITIALIZATION_PAIRS, np.random.default_rng((settings.seed, 0)))
+    same = drawn.labels != DIFFERENT
+    kind.begin_head(network, drawn.reference[same], drawn.current[same], drawn.statistics[same])
 
 
 class _HeadRun:

@@ -83,7 +83,8 @@ class Run:
             start = torch.load(settings.start_from, map_location=self._device, weights_only=True)["network"]
         if start is not None:
             self._kind.start_from(self._network, start, fresh_head=settings.fresh_head)
-        if settings.initialize_head and (start is None or settings.fresh_head):
+        fresh = settings.initialize_head and (start is None or settings.fresh_head)
+        if fresh and settings.epochs:  # without an epoch it is the training of the head alone that begins it
             rng = np.random.default_rng((settings.seed, 0))
             batches = self._batches(self._makers[0], INITIALIZATION_PAIRS, rng)
             self._kind.initialize_from_data(self._network, batches)

@@ -193,3 +193,20 @@ def test_the_head_alone_may_be_trained_on_another_trainings_encoder(tiles, tmp_p
     before, after = (torch.load(path, weights_only=True)["network"] for path in (start, best))
     same = {name: torch.equal(before[name], after[name]) for name in before}
     assert all(kept for name, kept in same.items() if name.startswith("encoder."))
+
+
+def test_a_head_that_no_epoch_trains_begins_from_the_pool(tiles, tmp_path, network):
+    """Its first layers hear of all their inputs: without that the products of descriptors drown the statistics."""
+    save_tiles(tiles, tmp_path / "tiles.npz")
+    torch.save({"network": network.state_dict()}, tmp_path / "encoder.pt")
+    settings = replace(
+        SETTINGS, epochs=0, head_epochs=1, start_from=str(tmp_path / "encoder.pt"), fresh_head=True
+    )
+    begun = []
+    for initialized in (True, False):
+        run = replace(settings, initialize_head=initialized, head_learning_rate=0.0, final_learning_rate=0.0)
+        best = train(run, tmp_path / "tiles.npz", tmp_path / str(initialized))
+        begun.append(torch.load(best, weights_only=True)["network"])
+    assert not torch.equal(begun[0]["head.chamfer.0.weight"], begun[1]["head.chamfer.0.weight"])
+    encoders = [{name: one[name] for name in one if name.startswith("encoder.")} for one in begun]
+    assert all(torch.equal(encoders[0][name], encoders[1][name]) for name in encoders[0])

@@ -85,7 +85,14 @@ class SiameseTraining(ABC, Generic[B]):
             sides.append([side[same_place] for side in self.descriptors(module, batch).chunk(2)])
             statistics.append(self._statistics(*compared(batch, device_of(module)))[same_place])
         reference, current = (torch.cat(side) for side in zip(*sides, strict=True))
-        self.head(module).initialize_from_data(reference, current, torch.cat(statistics))
+        self.begin_head(module, reference, current, torch.cat(statistics))
+
+    def begin_head(self, module: nn.Module, reference: Tensor, current: Tensor, statistics: Tensor) -> None:
+        """Initialise the head from descriptors (n, D) of both sides and statistics (n, 8 or 16) of n pairs."""
+        device = device_of(module)
+        self.head(module).initialize_from_data(
+            reference.to(device), current.to(device), statistics.to(device)
+        )
 
     def encode(
         self, module: nn.Module, clouds: Sequence[Points], progress: Progress
