@@ -23,7 +23,7 @@ def tables(result: Document) -> Group:
         _table("Real pairs as they are: objects (voxels); changed of observed tiles", _pairs(result)),
         *([] if result["registered"] is None else [_table("With our own registration", _registered(result))]),
         _table(_edited_title(result), _edited(result)),
-        _table("Things found, by group", _groups(result)),
+        *(_table("Things found, by group", groups) for groups in _told_groups(result)),
     )
 
 
@@ -43,7 +43,7 @@ def page(result: Document, folder: Path) -> str:
         "## With things put in",
         _edited_title(result),
         _markdown(_edited(result)),
-        _markdown(_groups(result)),
+        *map(_markdown, _told_groups(result)),
     ]
     parts.append("## Pictures")
     for name in (
@@ -128,6 +128,12 @@ def _edited(result: Document) -> Rows:
                 ]
             )
     return rows
+
+
+def _told_groups(result: Document) -> list[Rows]:
+    """Return the table of things by group; none where no model tells things."""
+    rows = _groups(result)
+    return [rows] if len(rows) > 1 else []
 
 
 def _groups(result: Document) -> Rows:

@@ -37,6 +37,13 @@ def test_the_smallest_pair_runs_from_files_to_a_page(shared_data: Path, tmp_path
     assert json.loads((tmp_path / "real.json").read_text()) == result
     assert "![corridor_pair, first to second](corridor-pair-first-to-second.png)" in page
     terminal.output().print(tables(result))
+    of_tiles = [model for model in result["edited"]["models"] if model["found"] is None]
+    edited = {
+        **result["edited"],
+        "models": of_tiles,
+    }  # who scores tiles tells no things, and so no table of them
+    assert "| things |" in write_report(result, tmp_path).read_text().replace(" voxel-rule/1 |", "")
+    assert "| things |" not in write_report({**result, "edited": edited}, tmp_path).read_text()
 
 
 @pytest.mark.slow
