@@ -73,7 +73,7 @@ class Settings(BaseSettings):
     inference_batch_tiles: int = Field(
         64,
         ge=1,
-        description="most tiles of a batch; halved for a model that does not fit into the GPU's memory so",
+        description="most tiles of a batch; halved while a batch does not fit into the GPU's memory",
     )
     inference_batch_wait_ms: float = Field(
         5.0,
@@ -89,7 +89,7 @@ class Settings(BaseSettings):
     inference_model_bytes: int = Field(
         1024**3,
         ge=0,
-        description="weights of models that an inference worker keeps open; beyond, who was used longest ago is closed",
+        description="bytes of models that an inference worker keeps open; above this the least recently used model is closed",
     )
     inference_gpu_share: float | None = Field(
         None,

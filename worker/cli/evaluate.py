@@ -376,7 +376,7 @@ def bench_network(
     out: Annotated[Path, typer.Option(help="Where the figures are saved.")] = Path("bench/network.json"),
     model_store: ModelStore = MODEL_STORE,
 ) -> None:
-    """Measure milliseconds of SPICD-Net's network for a map's tiles beside their floor, best on a GPU."""
+    """Time SPICD-Net's network on a map's tiles, and say the least time that their products need on this device."""
     from worker.benchmarks.documents import write_json  # noqa: PLC0415
     from worker.benchmarks.network_time import NetworkTimeSettings, measure, table  # noqa: PLC0415
 
