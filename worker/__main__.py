@@ -79,7 +79,9 @@ def main(arguments: list[str] | None = None) -> int:
         )
         return 2
     try:
-        if not options.parent:  # who starts a worker of its own has looked
+        if options.parent:  # who starts a worker of its own has looked, but a GPU can be lost since
+            _require_device(settings, options.queue)
+        else:
             _require_all(settings, options.queue)
     except LaunchFailed as error:
         print(error, file=sys.stderr)

@@ -17,7 +17,7 @@ from safetensors.torch import load, save
 from worker.detectors.card import BaseRecord, Card
 from worker.detectors.detector import Detector
 from worker.detectors.registry import DETECTORS
-from worker.detectors.running.calls import is_full_memory
+from worker.detectors.running.calls import device_answers, is_full_memory
 from worker.detectors.running.runtime import RunsNetwork, Runtime
 from worker.errors import DetectorUnavailable, DeviceLost, OutOfMemory, TrainingFailed
 from worker.files import write_text
@@ -91,12 +91,14 @@ def make_detector(
     try:
         return _placed(card, merged, resolve_device(device), runtime)
     except (RuntimeError, ValueError) as error:
-        if DeviceLost.is_told_by(error):
+        if not is_full_memory(error):
+            if not DeviceLost.is_told_by(error):
+                raise DetectorUnavailable(f"model {name}: {error}") from error
             lost = str(error).partition("\n")[0]
-        elif not is_full_memory(error):
-            raise DetectorUnavailable(f"model {name}: {error}") from error
     # only here, for the error holds on to what was placed of the model
     if lost:
+        if device_answers():
+            raise DetectorUnavailable(f"model {name}: {lost}")
         raise DeviceLost(f"the device of model {name} fails: {lost}")
     raise OutOfMemory(
         f"model {name} needs more of the GPU's memory than is free; "
@@ -193,9 +195,12 @@ WEIGHTS = "weights.safetensors"
 def write_model(folder: Path, card: Card, weights: Weights, *, base: Detector | None = None) -> Path:
     """Write the weights before the card, whose `sha256` is put in here; returns the folder.
 
-    With `base`, a whole model of the same store, weights that are equal to its own are left out of the file.
+    With `base`, a whole model of the same store, weights that are equal to its own are left out of the file. Raises
+    ValueError for a base of another detector, and as `_record`.
     """
     if base is not None:
+        if base.card.detector != card.detector:
+            raise ValueError(f"a {card.detector} cannot stand on {base.card.model}, a {base.card.detector}")
         card = card.model_copy(update={"base": _record(base)})
         known = weights_of(base)
         weights = {name: value for name, value in weights.items() if not _equal(value, known.get(name))}

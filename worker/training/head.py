@@ -53,7 +53,7 @@ def train_head(
         keep_pairs(kind, network, tiles, settings.pairs, seed=settings.seed, progress=progress)
         for tiles in (training, validation)
     ]
-    if settings.initialize_head and settings.fresh_head and not settings.epochs:
+    if settings.initialize_head and not settings.epochs and (settings.fresh_head or not settings.start_from):
         _begin(kind, network, pools[0], settings)
     held_out = pools[1].draw(settings.head_validation_pairs, np.random.default_rng((settings.seed, 6)))
     head = kind.head(network)

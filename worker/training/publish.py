@@ -25,8 +25,9 @@ from worker.detectors.precision import has_bfloat16
 from worker.detectors.running.runtime import RunsNetwork, Runtime
 from worker.detectors.store import (
     WEIGHTS,
+    Weights,
     detector_class,
-    open_detector,
+    make_detector,
     read_card,
     weights_of,
     write_card,
@@ -156,15 +157,23 @@ def publish(
     unknown = None if unseen is None else _pairs(load_tiles(unseen), settings)
     evaluation = _evaluation(best, threshold, others, unknown)
     final = {"threshold": threshold, "training": training, "evaluation": evaluation}
-    folder = write_model(
-        model_store / card.name / version, card.model_copy(update=final), weights, base=stands_on
-    )
-    written = read_card(folder)
-    checks = _precision(model_store, written, pairs, command)
-    write_card(folder, written.model_copy(update={"precision": checks}))
+    aside = model_store / f".partial-{card.name}-{version}"
+    shutil.rmtree(aside, ignore_errors=True)
+    write_model(aside, card.model_copy(update=final), weights, base=stands_on)
+    checks = _precision(aside, {} if stands_on is None else weights_of(stands_on), pairs, command)
+    write_card(aside, read_card(aside).model_copy(update={"precision": checks}))
     for log in (LOG, HEAD_LOG):
-        _take_log(checkpoint.parent / log, folder / log)
-    return folder
+        if (checkpoint.parent / log).exists():
+            shutil.copyfile(checkpoint.parent / log, aside / log)
+    return _put(aside, model_store / card.name / version)
+
+
+def _put(aside: Path, folder: Path) -> Path:
+    """Put a whole model in its place, that of an earlier one too."""
+    if folder.exists():
+        shutil.rmtree(folder)
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    return aside.rename(folder)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -191,14 +200,16 @@ class _Scored:
         return {"pairs": len(self.pairs.kinds), "area_under_roc": self.area, **figures}
 
 
-def _precision(model_store: Path, card: Card, pairs: SurveyPairs, command: str) -> dict[str, PrecisionCheck]:
+def _precision(folder: Path, base: Weights, pairs: SurveyPairs, command: str) -> dict[str, PrecisionCheck]:
     """Score some of the pairs in float32, and in bfloat16 as a processor and as a GPU computes; {} where nothing can.
 
-    The model is opened for it anew: a detector that somebody else has in hand stays as it is.
+    The model in the folder is opened for it anew: a detector that somebody else has in hand stays as it is.
     """
+    card = read_card(folder)
+    content = (folder / str(card.weights)).read_bytes()
 
     def opened(**how: Any) -> Detector:
-        return open_detector(model_store, card.model, "cpu", Runtime(**how))
+        return make_detector(card, content, "cpu", Runtime(**how), base=base)
 
     exact_detector = opened()
     network = isinstance(exact_detector, RunsNetwork) and "bfloat16" in exact_detector.precisions
@@ -286,11 +297,3 @@ def deviations(settings: dict[str, Any]) -> list[str]:
         "thinning": min(pairs["noisy_share"], pairs["thinning"]),
     }
     return [*DEVIATIONS, *(words for name, words in OURS.items() if ours[name])]
-
-
-def _take_log(log: Path, place: Path) -> None:
-    """Copy the log; without one, take away that of an earlier training."""
-    if log.exists():
-        shutil.copyfile(log, place)
-    else:
-        place.unlink(missing_ok=True)

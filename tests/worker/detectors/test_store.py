@@ -149,6 +149,14 @@ def test_a_model_whose_base_is_another_one_now_is_refused(model_store, network, 
         open_detector(model_store, "spicd-net/8")
 
 
+def test_a_model_stands_on_one_of_its_own_kind(model_store, network):
+    base = open_detector(model_store, "spicd-net/7")
+    other = base.card.model_copy(update={"name": "kpconv", "detector": "kpconv"})
+    with pytest.raises(ValueError, match="a kpconv cannot stand on spicd-net/7, a spicd-net"):
+        write_model(model_store / "kpconv" / "1", other, network.state_dict(), base=base)
+    assert not (model_store / "kpconv").exists()
+
+
 @pytest.mark.parametrize(
     ("error", "told", "sentence"),
     [

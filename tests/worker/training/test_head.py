@@ -195,13 +195,13 @@ def test_the_head_alone_may_be_trained_on_another_trainings_encoder(tiles, tmp_p
     assert all(kept for name, kept in same.items() if name.startswith("encoder."))
 
 
-def test_a_head_that_no_epoch_trains_begins_from_the_pool(tiles, tmp_path, network):
+@pytest.mark.parametrize("fresh", [True, False], ids=["of a checkpoint", "of nothing"])
+def test_a_head_that_no_epoch_trains_begins_from_the_pool(tiles, tmp_path, network, fresh):
     """Its first layers hear of all their inputs: without that the products of descriptors drown the statistics."""
     save_tiles(tiles, tmp_path / "tiles.npz")
     torch.save({"network": network.state_dict()}, tmp_path / "encoder.pt")
-    settings = replace(
-        SETTINGS, epochs=0, head_epochs=1, start_from=str(tmp_path / "encoder.pt"), fresh_head=True
-    )
+    start = str(tmp_path / "encoder.pt") if fresh else None
+    settings = replace(SETTINGS, epochs=0, head_epochs=1, start_from=start, fresh_head=fresh)
     begun = []
     for initialized in (True, False):
         run = replace(settings, initialize_head=initialized, head_learning_rate=0.0, final_learning_rate=0.0)

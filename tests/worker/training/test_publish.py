@@ -153,6 +153,22 @@ def test_a_model_that_others_have_in_hand_stays_as_it_is(store, tmp_path, monkey
     assert card.precision["cpu"].largest_score_difference > 0  # of float32, whatever the base computes in
 
 
+def test_a_model_that_is_not_whole_is_not_in_the_store(store, tmp_path, monkeypatch):
+    """What failed, or was killed, in the middle of writing takes nobody's place, and can be done again."""
+
+    def fails(*_):
+        raise KeyboardInterrupt
+
+    checkpoint, tiles = store.parent / "run" / "best.pt", store.parent / "tiles.npz"
+    with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
+        patched.setattr(module, "_precision", fails)
+        publish(checkpoint, tiles, tmp_path, summary="")
+    assert list(tmp_path.glob("*/*/card.json")) == []
+    folder = publish(checkpoint, tiles, tmp_path, summary="")
+    assert opened(tmp_path, "spicd-net/1").card.model == "spicd-net/1"
+    assert [path.name for path in tmp_path.iterdir()] == [folder.parent.name]
+
+
 def test_where_no_processor_computes_so_nothing_is_said_of_it(store, tmp_path, monkeypatch):
     monkeypatch.setattr(module, "has_bfloat16", lambda device: False)
     checkpoint, tiles = store.parent / "run" / "best.pt", store.parent / "tiles.npz"

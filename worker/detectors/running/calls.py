@@ -27,7 +27,16 @@ MOST = 64  #: the size of a batch where nobody says otherwise: about 1 GiB besid
 
 GPU_SHARED = 0.9  #: of the GPU's memory, that workers divide among themselves where nothing is set
 
-_FULL = re.compile("CUDA (driver )?error: (out of memory|CUBLAS_STATUS_ALLOC_FAILED)")
+#: What CUDA's libraries say where they find no room for what they keep beside torch's arrays.
+_FULL = re.compile(
+    "CUDA (driver )?error: "
+    "(out of memory|CUBLAS_STATUS_ALLOC_FAILED|CUBLAS_STATUS_NOT_INITIALIZED when calling .?cublasCreate"
+    "|insufficient resources|resource allocation failed)"
+)
+
+
+class NetworkFailed(Exception):
+    """CUDA refused something that a network asked for, and computes on: the same would fail again."""
 
 
 def _one(_: object) -> int:
@@ -101,7 +110,7 @@ class FittedRuns:
     def run(self, call: NetworkCall[I, R], items: Sequence[I]) -> list[R | OutOfMemory]:
         """Return of each item its result, or the error where it did not fit alone.
 
-        Raises what the network raises, and DeviceLost in place of an error that says so.
+        Raises what the network raises; in place of an error of CUDA DeviceLost, or NetworkFailed where it computes on.
         """
         begun = time.perf_counter()
         results: list[R | OutOfMemory] = []
@@ -127,13 +136,15 @@ class FittedRuns:
         try:
             return list(call.run(items))
         except RuntimeError as error:
-            if DeviceLost.is_told_by(error):
+            if not is_full_memory(error):
+                if not DeviceLost.is_told_by(error):
+                    raise
                 log.exception("model %s: the device fails", call.model)
                 lost = str(error).partition("\n")[0]
-            elif not is_full_memory(error):
-                raise
         # only here, for the error holds on to what the network had made
         if lost:
+            if device_answers():
+                raise NetworkFailed(f"model {call.model} fails: {lost}")
             raise DeviceLost(f"the device of model {call.model} fails: {lost}")
         self.meter.add("out_of_memory", call.model)
         log.warning("model %s: %d items at once do not fit into the GPU's memory", call.model, len(items))
@@ -143,6 +154,17 @@ class FittedRuns:
     def _remember(self, call: NetworkCall[I, R], size: int) -> None:
         with self._lock:
             self._fits[call.key] = max(1, min(size, self._fits.get(call.key, size)))
+
+
+def device_answers() -> bool:
+    """Tell whether the GPU still computes for this process: after a fault that sticks each call fails."""
+    if not torch.cuda.is_available():
+        return False
+    try:
+        torch.cuda.synchronize()
+        return bool(torch.ones(1, device="cuda").add_(1).item() == 2)
+    except RuntimeError as error:
+        return is_full_memory(error)
 
 
 def is_full_memory(error: BaseException) -> bool:

@@ -96,6 +96,7 @@ class Schedule:
         """Take the next batch, which `left_s` says is due; who came first this time is last the next."""
         call = self._next_call()
         batch: Batch = []
+        first = self._of(call)[0]
         turn, room = deque(self._of(call)), self._fitted.most(call)
         waited = self._clock() - min(request.since for request in turn)
         while turn:
@@ -107,7 +108,8 @@ class Schedule:
             request.next += 1
             if request.waiting:
                 turn.append(request)
-        self._requests.rotate(-1)
+        self._requests.remove(first)  # those of other calls keep their places
+        self._requests.append(first)
         self._drop_over()
         self._served += 1
         self._turns[call.key] = self._served

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 import torch
 
-from worker.detectors.running.calls import FittedRuns, NetworkCall
+from worker.detectors.running.calls import FittedRuns, NetworkCall, NetworkFailed, is_full_memory
 from worker.detectors.running.meter import Meter
 from worker.detectors.running.shared import SharedBatches
 from worker.errors import Cancelled, DeviceLost, OutOfMemory
@@ -311,3 +311,36 @@ def test_a_device_that_fails_is_told_to_all_of_the_batch_and_nothing_is_run_agai
             ):
                 future.result(60)
     assert len(held.batches) == 2
+
+
+def test_what_cuda_refuses_while_it_computes_on_fails_the_step_that_asked_for_it_alone(held, monkeypatch):
+    """A launch of odd shape, or no kernel for this GPU: another process would fail at it as well."""
+    monkeypatch.setattr("worker.detectors.running.calls.device_answers", lambda: True)
+    held.fails = lambda items: (
+        torch.AcceleratorError("CUDA error: invalid configuration argument")
+        if ("b", 0) in items or ("b", 1) in items
+        else None
+    )
+    batches = SharedBatches(FittedRuns(8))
+    with asking(batches) as ask:
+        first = ask(held, "a", 1)
+        held.wait_for_batch()
+        odd, other = ask(held, "b", 2), ask(held, "c", 2)
+        held.let(9)
+        with pytest.raises(NetworkFailed, match="invalid configuration argument") as told:
+            odd.result(60)
+        assert not DeviceLost.is_told_by(told.value)
+        assert len(first.result(60)) == 1
+        assert len(other.result(60)) == 2
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "CUDA error: CUBLAS_STATUS_NOT_INITIALIZED when calling `cublasCreate(handle)`",
+        "CUDA error: insufficient resources when calling `cusparseSpMM(handle)`",
+        "CUDA error: out of memory",
+    ],
+)
+def test_a_library_of_cuda_that_finds_no_room_is_full_memory(words):
+    assert is_full_memory(RuntimeError(words))
