@@ -226,9 +226,14 @@ def test_every_error_of_the_service_has_its_place_in_the_table() -> None:
     assert all(PROBLEMS[code][0] is not None for code in codes)
 
 
+def every_kind_of(error: type) -> list[type]:
+    """Return its subclasses, and theirs."""
+    return [kind for direct in error.__subclasses__() for kind in (direct, *every_kind_of(direct))]
+
+
 def test_every_error_of_the_pipeline_has_a_title() -> None:
     errors = pytest.importorskip("worker.errors")
-    kinds: list[Any] = [kind for kind in vars(errors).values() if isinstance(kind, type)]
+    kinds: list[Any] = [errors.PipelineError, *every_kind_of(errors.PipelineError)]
     assert {kind.code for kind in kinds} - {"cancelled"} <= set(PROBLEMS)
 
 
