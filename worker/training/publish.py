@@ -41,11 +41,11 @@ from worker.training.calibration import (
     figures_at,
     survey_pairs,
 )
-from worker.training.command import training_command, without_place
 from worker.training.dataset import TileSet, load_tiles, split_tiles
 from worker.training.log import HEAD_LOG, LOG
+from worker.training.options import OPTIONS
 from worker.training.pairs import PairSettings
-from worker.training.settings import TrainSettings, detector_settings, whole
+from worker.training.settings import PAPER, TrainSettings, detector_settings, whole
 
 VOXEL_SIZE, MIN_POINTS = 0.05, 512  #: paper, Table 3; the training tiles are made with the same
 
@@ -297,3 +297,28 @@ def deviations(settings: dict[str, Any]) -> list[str]:
         "thinning": min(pairs["noisy_share"], pairs["thinning"]),
     }
     return [*DEVIATIONS, *(words for name, words in OURS.items() if ours[name])]
+
+
+def training_command(settings: Mapping[str, Any]) -> str:
+    """Return the call of `spicd-worker train` that has the settings of a checkpoint, as `whole` returns them."""
+    paper = not settings["initialize_head"]
+    default = asdict(PAPER if paper else TrainSettings())
+    words = ["spicd-worker", "train", "FOLDER", *(["--paper"] if paper else [])]
+    for option in OPTIONS:
+        value, usual = (
+            _values((there["pairs"] if option.of_pairs else there)[option.name])
+            for there in (settings, default)
+        )
+        if value != usual:
+            told = [without_place(one) for one in value] if option.name == "start_from" else value
+            words += [option.flag, *([] if option.kind is bool else map(str, told))]
+    return " ".join(words)
+
+
+def without_place(path: str | None) -> str | None:
+    """Return folder and file of a path, for where on a machine these lay is nobody else's matter."""
+    return None if path is None else "/".join(Path(path).parts[-2:])
+
+
+def _values(value: Any) -> list[Any]:
+    return list(value) if isinstance(value, list | tuple) else [value]

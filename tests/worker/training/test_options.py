@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 
 from worker.training import __main__ as command
-from worker.training.command import training_command
 from worker.training.options import OPTIONS, with_options
 from worker.training.pairs import PairSettings
+from worker.training.publish import training_command
 from worker.training.settings import PAPER, TrainSettings
 
 

@@ -228,7 +228,8 @@ def test_every_error_of_the_service_has_its_place_in_the_table() -> None:
 
 def every_kind_of(error: type) -> list[type]:
     """Return its subclasses, and theirs."""
-    return [kind for direct in error.__subclasses__() for kind in (direct, *every_kind_of(direct))]
+    direct: list[type] = error.__subclasses__()
+    return [*direct, *(further for kind in direct for further in every_kind_of(kind))]
 
 
 def test_every_error_of_the_pipeline_has_a_title() -> None:
