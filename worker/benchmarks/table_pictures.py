@@ -72,7 +72,9 @@ def disturbances(rows: Sequence[Measured]) -> Figure | None:
             lost = [100 * float(share) for share in paper]
             axes.plot(lost, list(paper.values()), "D", color=PRINTED, label="paper")
         axes.set_ylim(-0.03, 1.03)
-        label(axes, kind, "F1")
+        label(axes, kind, "F1", legend=False)
+    named = {str(line.get_label()): line for axes in figure.axes for line in axes.lines}
+    figure.legend(list(named.values()), list(named), loc="outside right center", fontsize=8, frameon=False)
     return figure
 
 
