@@ -40,6 +40,23 @@ def test_a_precision_that_the_device_lacks_is_told_before_any_work(
     assert main(["check", "geometry"]) == 0
 
 
+def test_a_worker_that_is_started_again_after_its_gpu_was_lost_takes_no_step(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Who starts workers looked for the GPU once; each step would fail for good where it is gone since."""
+    monkeypatch.setenv("SPICD_DEVICE", "cuda")
+    monkeypatch.setenv("SPICD_REDIS_URL", "redis://127.0.0.1:1")
+    monkeypatch.setattr("worker.__main__.end_with_parent", lambda parent: None)
+    monkeypatch.setattr("worker.jobs.models.finds_gpu", lambda: False)
+    monkeypatch.setattr("worker.__main__.serving", Mock(side_effect=AssertionError("it began to work")))
+    before = os.umask(0o022)
+    try:
+        assert main(["inference", "--parent", "1"]) == 2
+    finally:
+        os.umask(before)
+    assert "torch finds no CUDA GPU" in capsys.readouterr().err
+
+
 def test_what_networks_counted_is_written_and_kept_where_it_cannot_be(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

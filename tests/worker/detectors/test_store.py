@@ -183,3 +183,15 @@ def test_what_the_device_says_of_itself_is_not_said_of_the_model(
     monkeypatch.setattr(SpicdNet, "run_with", fails)
     with pytest.raises(told, match=f"model spicd-net/7.*{sentence}"):
         open_detector(model_store, "spicd-net/7", "cpu", Runtime())
+
+
+def test_what_cuda_refuses_while_it_computes_on_is_said_of_the_model(model_store, monkeypatch):
+    def fails(*_: object) -> None:
+        raise RuntimeError("CUDA error: no kernel image is available for execution on the device\nmore")
+
+    monkeypatch.setattr(SpicdNet, "run_with", fails)
+    monkeypatch.setattr("worker.detectors.store.device_answers", lambda: True)
+    with pytest.raises(
+        DetectorUnavailable, match=r"no kernel image is available for execution on the device$"
+    ):
+        open_detector(model_store, "spicd-net/7", "cpu", Runtime())

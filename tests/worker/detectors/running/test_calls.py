@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import pytest
 import torch
 
-from worker.detectors.running.calls import DirectBatches, FittedRuns, NetworkCall
+from worker.detectors.running.calls import DirectBatches, FittedRuns, NetworkCall, device_answers
 from worker.detectors.running.meter import Meter
 from worker.errors import Cancelled, OutOfMemory
 
@@ -125,3 +125,20 @@ def test_what_was_counted_is_taken_once_and_can_be_given_back():
     assert meter.take() == {}
     meter.give_back(counted)
     assert meter.take() == counted
+
+
+@pytest.mark.parametrize(
+    ("error", "answers"),
+    [
+        (torch.AcceleratorError("CUDA error: an illegal memory access was encountered"), False),
+        (torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 MiB"), True),
+    ],
+)
+def test_a_device_answers_unless_it_fails_again_for_another_reason_than_room(monkeypatch, error, answers):
+    def fails() -> None:
+        raise error
+
+    assert not device_answers()  # there is none here
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "synchronize", fails)
+    assert device_answers() is answers
