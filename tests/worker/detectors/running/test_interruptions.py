@@ -6,6 +6,7 @@ import random
 import sys
 import threading
 from collections.abc import Iterator, Sequence
+from queue import SimpleQueue
 
 import pytest
 
@@ -65,30 +66,31 @@ def hasty() -> Iterator[None]:
 @pytest.mark.usefixtures("hasty")
 def test_time_limits_of_many_steps_leave_nothing_locked() -> None:
     batches, warm = SharedBatches(FittedRuns(4), wait_s=0.001), WarmModels(1 << 30)
-    served, rng = threading.Semaphore(0), random.Random(0)
+    # Not a semaphore: an error that lands in its release would leave the test itself locked.
+    served, rng = SimpleQueue[None](), random.Random(0)
 
-    def step(door: Door, began: threading.Semaphore) -> None:
+    def step(door: Door, began: SimpleQueue[None]) -> None:
         try:
             with door:
-                began.release()
+                began.put(None)
                 while True:
                     assert asked(batches, warm) == [0, 2, 4, 6, 8]
-                    served.release()
+                    served.put(None)
         except StepTimedOut:
             pass
         finally:
             door.shut()
 
     def started() -> tuple[threading.Thread, Door]:
-        door, began = Door(), threading.Semaphore(0)
+        door, began = Door(), SimpleQueue[None]()
         thread = threading.Thread(target=step, args=(door, began), daemon=True)
         thread.start()
-        assert began.acquire(timeout=WATCHDOG_S)
+        began.get(timeout=WATCHDOG_S)
         return thread, door
 
     steps = [started() for _ in range(STEPS)]
     for _ in range(TIME_LIMITS):
-        assert served.acquire(timeout=WATCHDOG_S), "nobody is served any more"
+        served.get(timeout=WATCHDOG_S)  # raises Empty where nobody is served any more
         thread, door = steps.pop(rng.randrange(STEPS))
         door.leave(StepTimedOut)
         ended(thread)
